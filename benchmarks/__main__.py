@@ -26,10 +26,10 @@ from ident_service.model.base import base_parameters
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.rigid_body import pinocchio_model
 from ident_service.motion.factory import make_arm
-from ident_service.record.kept import KeptRecording
-from ident_service.record.open import open_recording
+from ident_service.operations.commission import record_motion
+from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.open import open_recording
 from ident_service.results.parameter_file import parameters_document, write_parameters
-from ident_service.service.commission import record_motion
 
 SAMPLES = 57_656
 

@@ -20,17 +20,17 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
-from drivers.canopen.bits import exact
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link
-from drivers.canopen.python_can_link import PythonCanLink, open_bus
-from drivers.canopen.session_log import SessionLog
-from drivers.canopen.wire.host import LocalPort
-from drivers.canopen.wire.hub import Wire
-from drivers.canopen.wire.link import Connection, WireLink
-from drivers.canopen.wire.packets import Hello
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
+from drivers.can.frame_log import SessionLog
+from drivers.can.python_can_link import PythonCanLink, open_bus
+from drivers.canopen.frame_bits import exact
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanBus
+from sim_backend.can_bus.host import LocalPort
+from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.link import Connection, WireLink
+from sim_backend.can_bus.packets import Hello
 
 _ROUNDS = int(os.environ.get("IDENT_BENCH_CAN_ROUNDS", "5000"))
 _PING, _SYNC = 0x100, 0x080
@@ -135,7 +135,7 @@ def _other_side(side: str) -> Iterator[None]:
         return
     with ExitStack() as stack:
         if side in ("wire", "wire-can"):
-            stack.enter_context(_process("drivers.canopen.wire", _WIRE))
+            stack.enter_context(_process("sim_backend.can_bus", _WIRE))
         stack.enter_context(_process("benchmarks.can_links", side, _WIRE))
         yield
 

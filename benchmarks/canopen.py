@@ -23,9 +23,9 @@ import numpy as np
 import yaml
 
 from benchmarks.harness import Row, table, write
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
-from drivers.canopen.python_can_link import PythonCanLink, open_bus
+from drivers.can.can_frame import Frame
+from drivers.can.python_can_link import PythonCanLink, open_bus
+from drivers.canopen.driver import CanopenArm
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanBus
 from ident_service.config.limits import motion_limits
@@ -39,7 +39,7 @@ from ident_service.motion.factory import make_arm
 from ident_service.motion.histogram import Histogram
 from ident_service.motion.realtime import asked
 from ident_service.motion.reference import rest
-from sim_backend.pucks.build import build_emulator
+from sim_backend.emulator.build import build_emulator
 
 SECONDS = float(os.environ.get("IDENT_BENCH_CANOPEN_SECONDS", "60"))
 CYCLES, WARM_UP = 3_000, 300

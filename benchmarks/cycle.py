@@ -24,8 +24,8 @@ from ident_service.motion.deadlines import Deadlines
 from ident_service.motion.guard import Guard
 from ident_service.motion.owed import owed_ways
 from ident_service.motion.reference import PathReference
-from ident_service.record.cycle import Cycle
-from ident_service.record.ring import RingWriter, create_ring
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.ring import RingWriter, create_ring
 
 CYCLES = 20_000  # one period of the motion, which is played twice
 WARM_UP = 1_000

@@ -36,9 +36,9 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.threads import one_blas_thread
 from ident_service.motion.factory import make_arm
-from ident_service.record.open import open_recording
-from ident_service.record.part import RangeRecording
-from ident_service.service.commission import record_motion
+from ident_service.operations.commission import record_motion
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.part import RangeRecording
 
 _SEEDS = int(os.environ.get("IDENT_BENCH_SEEDS", "10"))
 _SECONDS = float(os.environ.get("IDENT_BENCH_SECONDS", "60"))

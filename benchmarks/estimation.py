@@ -23,7 +23,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import base_parameters
 from ident_service.model.information import information_of, supports
 from ident_service.model.regressor import joint_regressor
-from ident_service.record.recording import Block
+from ident_service.recordings.recording import Block
 
 _CHAINS = 5
 _LINKS = 20

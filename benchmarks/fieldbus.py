@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
-from drivers.canopen.bits import exact
-from drivers.canopen.codec import BusCodec
-from drivers.canopen.coordinates import coordinates, unwrapped
-from drivers.canopen.frame import Frame
-from drivers.canopen.profile import bus_profiles
+from drivers.can.can_frame import Frame
+from drivers.canopen.frame_bits import exact
+from drivers.canopen.motor_units import coordinates, unwrapped
+from drivers.canopen.pdo_codec import BusCodec
+from drivers.canopen.pdo_mapping import bus_profiles
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig

@@ -18,8 +18,8 @@ from ident_service.config.schema import Method, PriorPull
 from ident_service.errors import ParameterError
 from ident_service.estimation.identify import Candidate, Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.record.kept import KeptRecording
-from ident_service.record.open import open_recording
+from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.open import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
-from ident_service.record.cycle import Cycle
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.recorder_process import RecorderProcess
-from ident_service.record.ring import RingReader, RingWriter, create_ring
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.recorder_process import RecorderProcess
+from ident_service.recordings.ring import RingReader, RingWriter, create_ring
 
 _JOINTS = 7
 _SECONDS = float(os.environ.get("IDENT_BENCH_RING_SECONDS", "60"))

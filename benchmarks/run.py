@@ -16,9 +16,9 @@ from ident_service.errors import ArmFault, MotionRefused
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.record.open import open_recording
-from ident_service.service.run import run_motion
+from ident_service.operations.run import run_motion
+from ident_service.preflight.preflight import preflight
+from ident_service.recordings.open import open_recording
 
 _DRIVER = "driver: {time: real, process: separate, status: %s, watchdog: 0.05, deadline: 1.0}"
 _RATES = (1000, 500, 250)

@@ -23,11 +23,11 @@ from pathlib import Path
 
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm
-from ident_service.service.commission import simulate
-from ident_service.service.registry import jobs
-from ident_service.service.registry.arms import know_shipped
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.runs import RUNS, index_run
+from ident_service.operations.commission import simulate
+from ident_service.registry import jobs
+from ident_service.registry.arms import know_shipped
+from ident_service.registry.database import Database
+from ident_service.registry.runs import RUNS, index_run
 
 STARTS = int(os.environ.get("IDENT_BENCH_STARTS", "9"))
 RUNS_KEPT, JOBS_KEPT = 200, 500

@@ -20,8 +20,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.axis_status import AxisEvent, AxisStatus
 from drivers.clock import Clock
-from drivers.status import AxisEvent, AxisStatus
 from ident_service.errors import DriverError
 
 Vector = NDArray[np.float64]

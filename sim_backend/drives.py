@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.arm import StopKind, Vector
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from sim_backend.faults import Fault, FaultKind
 from sim_backend.imperfections import Imperfections
 

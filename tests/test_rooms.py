@@ -168,7 +168,7 @@ def test_the_verifier_needs_the_standard_library_alone() -> None:
     ("file", "source", "complaint"),
     [
         ("ident_service/model/x.py", "from ident_service.motion.run import run", "model imports motion"),
-        ("ident_service/model/x.py", "import ident_service.record.open as o", "model imports record"),
+        ("ident_service/model/x.py", "import ident_service.recordings.open as o", "model imports record"),
         ("ident_service/model/x.py", "from ident_service import estimation", "model imports estimation"),
         ("ident_service/model/x.py", "from ..excitation import plan", "model imports excitation"),
         ("ident_service/model/x.py", "from .. import results", "model imports results"),
@@ -179,7 +179,7 @@ def test_the_verifier_needs_the_standard_library_alone() -> None:
         ("ident_service/motion/x.py", "importlib.import_module(name)", "name is computed"),
         ("ident_service/record/x.py", "from ident_service.model.chain import Chain", "record imports model"),
         ("ident_service/service/x.py", "from ident_service.cli import main", "service imports cli"),
-        ("ident_service/results/x.py", "from ident_service.service.score import score", "results imports service"),
+        ("ident_service/results/x.py", "from ident_service.operations.score import score", "results imports service"),
         ("ident_service/errors.py", "from ident_service.config.schema import ArmConfig", "errors imports config"),
         ("ident_service/__init__.py", "from ident_service.errors import IdentError", "package imports errors"),
         ("drivers/x.py", "from ident_service.model.chain import Chain", "drivers imports model"),
@@ -211,7 +211,7 @@ def test_the_checker_sees_what_is_forbidden(file: str, source: str, complaint: s
             "ident_service/service/x.py",
             "import fastapi\nimport sim_backend.arm\nfrom ident_service.results import files",
         ),
-        ("ident_service/cli.py", "from ident_service.service import commission"),
+        ("ident_service/cli.py", "from ident_service.operations import commission"),
         ("ident_service/__main__.py", "from ident_service.cli import main"),
     ],
 )
@@ -242,7 +242,7 @@ def test_the_command_line_loads_no_large_library() -> None:
 
 
 def test_identification_loads_cvxpy_only_when_it_is_used() -> None:
-    loaded = loaded_after("import ident_service.estimation.identify, ident_service.service.identification")
+    loaded = loaded_after("import ident_service.estimation.identify, ident_service.operations.identification")
     assert "clarabel" in loaded
     assert "cvxpy" not in loaded
 
@@ -251,12 +251,12 @@ def test_identification_loads_cvxpy_only_when_it_is_used() -> None:
 @pytest.mark.parametrize(
     ("program", "needed"),
     [
-        ("ident_service.service.run", {"numpy", "pydantic", "pinocchio", "ruckig", "mcap"}),
+        ("ident_service.operations.run", {"numpy", "pydantic", "pinocchio", "ruckig", "mcap"}),
         ("ident_service.motion.process", {"numpy", "pydantic", "pinocchio", "ruckig"}),
         ("sim_backend.plant_process", {"numpy", "pydantic", "pinocchio"}),
-        ("ident_service.record.recorder_loop", {"numpy", "mcap"}),
-        ("ident_service.service.target_process", {"numpy", "pydantic", "mcap", "yaml"}),
-        ("ident_service.service.api.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2"}),
+        ("ident_service.recordings.recorder_loop", {"numpy", "mcap"}),
+        ("ident_service.operations.target_process", {"numpy", "pydantic", "mcap", "yaml"}),
+        ("ident_service.daemon.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2"}),
     ],
 )
 def test_what_runs_beside_an_arm_loads_no_more_than_it_needs(program: str, needed: set[str]) -> None:

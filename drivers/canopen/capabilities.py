@@ -2,7 +2,7 @@
 
 A drive's answer counts before its family (`profiles/`), the family before the file. What is indispensable and missing
 is a problem, with the object and the reason; what is optional and missing is noted with what happens instead. Of
-alternatives the first of the family's list is taken. Whether an entry can be written shows when `setup.py` writes it.
+alternatives the first of the family's list is taken. Whether an entry can be written shows when `drive_setup.py` writes it.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from drivers.canopen import dictionary as od
-from drivers.canopen.bus_errors import BusError
-from drivers.canopen.dictionary import Entry, pdo_entry
+from drivers.can.bus_errors import BusError
+from drivers.canopen import object_dictionary as od
 from drivers.canopen.families import entry_of, family_of
+from drivers.canopen.object_dictionary import Entry, pdo_entry
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
 from ident_service.config.canopen import CanopenDrive, CanopenDriver
 from ident_service.config.eds import DataSheet

@@ -11,8 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.canopen.codec import Drive
-from drivers.canopen.words import (
+from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
     RESET_FAULT,
@@ -21,6 +20,7 @@ from drivers.canopen.words import (
     DriveState,
     emergency_words,
 )
+from drivers.canopen.pdo_codec import Drive
 from ident_service.errors import DriverError
 
 SEEDED = 5  # cycles in a row with zero torque and all positions before anything is enabled

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
-from drivers.canopen.dictionary import Entry, Kind
+from drivers.canopen.object_dictionary import Entry, Kind
 from ident_service.config.family import Family, family_from
 
 _FOLDER = Path(__file__).parent / "profiles"

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.arm import Vector
-from drivers.canopen.codec import Drive
-from drivers.canopen.coordinates import Coordinates
+from drivers.canopen.motor_units import Coordinates
+from drivers.canopen.pdo_codec import Drive
 
 WINDOW = 0.01  # s
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from drivers.canopen import dictionary as od
-from drivers.canopen.dictionary import Entry, Kind
-from drivers.canopen.profile import Pdo
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.pdo_mapping import Pdo
 from drivers.canopen.sdo import READ_ONLY, Objects, SdoRefused, optional
 
 _SMALL = {0x0002: Kind.I8, 0x0005: Kind.U8}

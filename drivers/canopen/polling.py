@@ -10,10 +10,10 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from drivers.canopen.dictionary import Entry
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link
-from drivers.canopen.profile import SDO_REPLY, SDO_REQUEST
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
+from drivers.canopen.object_dictionary import Entry
+from drivers.canopen.pdo_mapping import SDO_REPLY, SDO_REQUEST
 
 Place = tuple[int, int]
 """A node of an arm: number of its bus, and node number, which another bus may have too."""

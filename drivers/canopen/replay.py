@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.kernel_frame import ERROR
-from drivers.canopen.sendable import check_sendable
+from drivers.can.can_frame import Frame
+from drivers.can.kernel_frame import ERROR
+from drivers.can.sendable import check_sendable
 from drivers.clock import Clock, VirtualClock
 from ident_service.errors import RecordingError
 

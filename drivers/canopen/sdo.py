@@ -14,11 +14,11 @@ from typing import Any, TypeVar
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
 
-from drivers.canopen.dictionary import Entry
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link
-from drivers.canopen.profile import SDO_REPLY, SDO_REQUEST, Write
-from drivers.canopen.words import abort_words
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
+from drivers.canopen.cia402 import abort_words
+from drivers.canopen.object_dictionary import Entry
+from drivers.canopen.pdo_mapping import SDO_REPLY, SDO_REQUEST, Write
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from drivers.arm import StopKind
-from drivers.canopen.buses import Buses
-from drivers.canopen.words import DISABLE_VOLTAGE, QUICK_STOP, DriveState
+from drivers.canopen.cia402 import DISABLE_VOLTAGE, QUICK_STOP, DriveState
+from drivers.canopen.sync_cycle import Buses
 
 _TRIES, _AGAIN = 75, 0.001  # s between them
 _BRAKING = 1.0  # s that drives may take for a quick stop before the arm is left to them

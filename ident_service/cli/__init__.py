@@ -145,14 +145,14 @@ def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Nam
         # Named so, for the verbs that need no registry load no SQLite.
         if type(error).__module__ != "sqlite3":
             raise
-        from ident_service.service.registry.database import FILE, registry_error
+        from ident_service.registry.database import FILE, registry_error
 
         raise registry_error(state_folder(arguments) / FILE, error) from None
 
 
 def _mistakes(arguments: argparse.Namespace) -> ConfigError | None:
     """Return the mistakes of the description that a model could not be made of, with their places; None without any."""
-    from ident_service.service.description_check import check_description
+    from ident_service.operations.description_check import check_description
 
     if not isinstance(arm := getattr(arguments, "arm", None), str) or arguments.server is not None:
         return None
@@ -173,7 +173,7 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFull(f"{place}: cannot be written: {error.strerror}; make room, then ask again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        from ident_service.service.state_folder import shut_out
+        from ident_service.operations.state_folder import shut_out
 
         hint = shut_out(state_folder(arguments))
         return UsageError(f"{place}: {error.strerror}" + (f"; {hint}" if hint else ""))

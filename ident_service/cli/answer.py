@@ -101,7 +101,7 @@ def own_state_folder(arguments: argparse.Namespace) -> Path:
     Raises:
         UsageError: as `state_folder`; or others can enter it.
     """
-    from ident_service.service.state_folder import keep_private
+    from ident_service.operations.state_folder import keep_private
 
     state = state_folder(arguments)
     keep_private(state)

@@ -1,7 +1,7 @@
 """Register and run the verbs at an arm: `watch`, `check`, `rehearse`, `run`, `stop`, `pause`, `resume` and more.
 
 `stop` needs no lease, no ticket and no confirmation, and waits for no other process. Running motions is
-`service/run.py`.
+`operations/run.py`.
 """
 
 from __future__ import annotations
@@ -119,8 +119,8 @@ def _watch(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.control_file import mover
     from ident_service.motion.factory import make_arm
     from ident_service.motion.watch import watch
-    from ident_service.service.arm_state import control_path
-    from ident_service.service.preflight import watch_document, watch_text
+    from ident_service.operations.arm_state import control_path
+    from ident_service.operations.preflight import watch_document, watch_text
 
     config = load_arm(arguments.arm)
     if (pid := mover(control_path(state_folder(arguments), config.name))) is not None:
@@ -137,13 +137,13 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.control_file import ControlFile
     from ident_service.motion.factory import make_arm
     from ident_service.motion.last_position import PositionFile
-    from ident_service.motion.preflight.check import Verdict
-    from ident_service.motion.preflight.preflight import preflight
+    from ident_service.motion.preflight_check import Verdict
     from ident_service.motion.realtime import asked
     from ident_service.motion.stoppable import StoppableArm
-    from ident_service.record.files import require_writable
-    from ident_service.service.arm_state import arm_folder, control_path, fault_file, ticket_path
-    from ident_service.service.preflight import ticket_document, ticket_text, write_ticket
+    from ident_service.operations.arm_state import arm_folder, control_path, fault_file, ticket_path
+    from ident_service.operations.preflight import ticket_document, ticket_text, write_ticket
+    from ident_service.preflight.preflight import preflight
+    from ident_service.recordings.files import require_writable
 
     config = load_arm(arguments.arm)
 
@@ -186,7 +186,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
 
 def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     """Check the position scale of each joint that a person turns by hand; nothing is energised."""
-    from ident_service.service.scale import FILE, check_scale
+    from ident_service.operations.scale import FILE, check_scale
 
     if arguments.json or not sys.stdin.isatty():
         raise UsageError("--scale asks a person at a terminal, who turns each joint by hand")
@@ -263,7 +263,7 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
 
 def _stop(arguments: argparse.Namespace) -> Answer:
     """Stop an arm, or all arms; print and note it in the audit trail only afterwards."""
-    from ident_service.service.state_folder import shut_out
+    from ident_service.operations.state_folder import shut_out
 
     os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's
     try:
@@ -275,10 +275,10 @@ def _stop(arguments: argparse.Namespace) -> Answer:
 
 
 def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
+    from ident_service.daemon.jobs.reach import stop_arms
     from ident_service.motion.control_file import ControlFile
-    from ident_service.service.arm_state import control_path, known_arms
-    from ident_service.service.jobs.reach import stop_arms
-    from ident_service.service.state_folder import leave_to_owner
+    from ident_service.operations.arm_state import control_path, known_arms
+    from ident_service.operations.state_folder import leave_to_owner
 
     if arguments.arm is None:
         reached = stop_arms(state, None)
@@ -340,7 +340,7 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
 def _let_go(arguments: argparse.Namespace) -> Answer:
     """Switch off the drives that still hold an arm after the motion process has ended."""
     from ident_service.config.load import load_arm
-    from ident_service.service.recover import let_go
+    from ident_service.operations.recover import let_go
 
     config = load_arm(arguments.arm)
     held = let_go(config, own_state_folder(arguments))
@@ -350,7 +350,7 @@ def _let_go(arguments: argparse.Namespace) -> Answer:
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.arm_state import fault_file
+    from ident_service.operations.arm_state import fault_file
 
     name = _name(arguments)
     cause = fault_file(own_state_folder(arguments), name).acknowledge(arguments.fault)
@@ -359,7 +359,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 
 
 def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
-    from ident_service.service.arm_state import control_path
+    from ident_service.operations.arm_state import control_path
 
     name = _name(arguments)
     return name, control_path(state_folder(arguments), name)
@@ -373,7 +373,7 @@ def _name(arguments: argparse.Namespace) -> str:
         ConfigError: its description has mistakes.
     """
     from ident_service.config.load import load_arm
-    from ident_service.service.arm_state import arm_folder, known_arms
+    from ident_service.operations.arm_state import arm_folder, known_arms
 
     word = str(arguments.arm)
     state = state_folder(arguments)

@@ -31,7 +31,7 @@ def add(verbs: Verbs) -> None:
 
 def _load(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.service.bus import bus_document, bus_load, bus_text
+    from ident_service.operations.bus import bus_document, bus_load, bus_text
 
     config = load_arm(arguments.arm)
     found = bus_load(config, arguments.rate)
@@ -40,7 +40,7 @@ def _load(arguments: argparse.Namespace) -> Answer:
 
 def _scan(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.service.bus_scan import bus_scan, scan_document, scan_text
+    from ident_service.operations.bus_scan import bus_scan, scan_document, scan_text
 
     config = load_arm(arguments.arm)
     found = bus_scan(config)
@@ -49,7 +49,7 @@ def _scan(arguments: argparse.Namespace) -> Answer:
 
 def _probe(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm, sheet_file
-    from ident_service.service.bus_probe import bus_probe, probe_document, probe_text
+    from ident_service.operations.bus_probe import bus_probe, probe_document, probe_text
 
     config = load_arm(arguments.arm)
     found = bus_probe(config, [sheet_file(name) for name in arguments.eds])

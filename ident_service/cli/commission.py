@@ -75,10 +75,10 @@ def add(verbs: Verbs) -> None:
 def _simulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.excitation.excitation import read_excitation
+    from ident_service.operations.commission import score_document, simulate
+    from ident_service.operations.folders import new_run_folder
+    from ident_service.operations.identification import custom_of
     from ident_service.results.summary import summary
-    from ident_service.service.commission import score_document, simulate
-    from ident_service.service.folders import new_run_folder
-    from ident_service.service.identification import custom_of
 
     config = described = load_arm(arguments.arm)
     if arguments.seed is not None and config.driver is not None:
@@ -129,9 +129,9 @@ def _few_collections() -> Iterator[None]:
 @_few_collections()
 def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
+    from ident_service.operations.folders import new_run_folder
+    from ident_service.operations.identification import Request, identify_files
     from ident_service.results.summary import summary
-    from ident_service.service.folders import new_run_folder
-    from ident_service.service.identification import Request, identify_files
 
     columns, columns_of = columns_files(arguments.columns)
     request = Request(

@@ -29,9 +29,9 @@ def add(verbs: Verbs) -> None:
 
 
 def _compare(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.comparison import KEPT, compare_files, compare_into
     from ident_service.results.comparison.document import comparison_document
     from ident_service.results.comparison.text import comparison_text
-    from ident_service.service.comparison import KEPT, compare_files, compare_into
 
     if arguments.keep:
         if len(arguments.others) != 1 or not arguments.others[0].is_dir():
@@ -46,9 +46,9 @@ def _compare(arguments: argparse.Namespace) -> Answer:
 
 
 def _payload(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.folders import new_run_folder
+    from ident_service.operations.payload import payload_files
     from ident_service.results.comparison.text import comparison_text
-    from ident_service.service.folders import new_run_folder
-    from ident_service.service.payload import payload_files
 
     folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "payloads")
     found = payload_files(arguments.run, arguments.recordings, folder, refit_offsets=arguments.refit_offsets)

@@ -25,7 +25,7 @@ def add(verbs: Verbs) -> None:
 
 
 def _new(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.new_description import new_description
+    from ident_service.operations.new_description import new_description
 
     def tell(line: str) -> None:
         print_to_person(f"{line} ...\n")
@@ -39,7 +39,7 @@ def _new(arguments: argparse.Namespace) -> Answer:
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.description_check import check_description, description_document, description_text
+    from ident_service.operations.description_check import check_description, description_document, description_text
 
     checked = check_description(arguments.file)
     document = {"file": arguments.file, **description_document(checked)}

@@ -42,9 +42,9 @@ def add(verbs: Verbs) -> None:
 
 
 def _serve(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.api.logs import log_as_json
-    from ident_service.service.api.serve import serve
-    from ident_service.service.api.settings import Settings
+    from ident_service.daemon.logs import log_as_json
+    from ident_service.daemon.serve import serve
+    from ident_service.daemon.settings import Settings
 
     state = state_folder(arguments).absolute()
     settings = Settings(
@@ -64,8 +64,8 @@ def _serve(arguments: argparse.Namespace) -> Answer:
 
 
 def _add(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.registry.database import Database
-    from ident_service.service.registry.tokens import add_token
+    from ident_service.registry.database import Database
+    from ident_service.registry.tokens import add_token
 
     with Database(own_state_folder(arguments)) as db:
         secret = add_token(db, arguments.name, arguments.role, at_terminal(arguments))
@@ -73,8 +73,8 @@ def _add(arguments: argparse.Namespace) -> Answer:
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.registry.database import Database
-    from ident_service.service.registry.tokens import tokens
+    from ident_service.registry.database import Database
+    from ident_service.registry.tokens import tokens
 
     with Database(own_state_folder(arguments)) as db:
         rows = tokens(db)
@@ -92,8 +92,8 @@ def token_line(row: Mapping[str, Any]) -> str:
 
 
 def _revoke(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.registry.database import Database
-    from ident_service.service.registry.tokens import revoke_token
+    from ident_service.registry.database import Database
+    from ident_service.registry.tokens import revoke_token
 
     with Database(own_state_folder(arguments)) as db:
         revoke_token(db, arguments.name, at_terminal(arguments))

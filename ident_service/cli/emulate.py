@@ -42,7 +42,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.control import Realtime
     from ident_service.config.load import load_arm, with_sheets
     from ident_service.motion.realtime import asked
-    from sim_backend.pucks.process import emulate
+    from sim_backend.emulator.process import emulate
 
     config = with_sheets(load_arm(arguments.arm), arguments.eds)
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")

@@ -21,8 +21,8 @@ def add(verbs: Verbs) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.folders import new_run_folder
     from ident_service.results.export.formats import export_run, known_formats
-    from ident_service.service.folders import new_run_folder
 
     formats = known_formats(arguments.format)
     folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "exports")

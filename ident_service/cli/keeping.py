@@ -55,8 +55,8 @@ def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any
     """
     import sqlite3
 
-    from ident_service.service.registry.audit import enter_waiting, note, note_later
-    from ident_service.service.registry.database import FILE, Database, registry_error
+    from ident_service.registry.audit import enter_waiting, note, note_later
+    from ident_service.registry.database import FILE, Database, registry_error
 
     state = state_folder(arguments)
     try:
@@ -112,9 +112,9 @@ def add(verbs: Verbs) -> None:
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.acceptance import CURRENT, PARAMETERS, accept
-    from ident_service.service.arm_state import arm_folder
-    from ident_service.service.registry.database import Database
+    from ident_service.operations.acceptance import CURRENT, PARAMETERS, accept
+    from ident_service.operations.arm_state import arm_folder
+    from ident_service.registry.database import Database
 
     state = own_state_folder(arguments)
     with Database(state) as db:
@@ -124,9 +124,9 @@ def _accept(arguments: argparse.Namespace) -> Answer:
 
 
 def _rollback(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.acceptance import CURRENT, PARAMETERS, rollback
-    from ident_service.service.arm_state import arm_folder
-    from ident_service.service.registry.database import Database
+    from ident_service.operations.acceptance import CURRENT, PARAMETERS, rollback
+    from ident_service.operations.arm_state import arm_folder
+    from ident_service.registry.database import Database
 
     state = own_state_folder(arguments)
     with Database(state) as db:
@@ -137,9 +137,9 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
 
 
 def _import(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.import_run import import_run
-    from ident_service.service.registry.database import Database
-    from ident_service.service.registry.runs import RUNS
+    from ident_service.operations.import_run import import_run
+    from ident_service.registry.database import Database
+    from ident_service.registry.runs import RUNS
 
     state = own_state_folder(arguments)
     with Database(state) as db:
@@ -156,9 +156,9 @@ def _import(arguments: argparse.Namespace) -> Answer:
 
 
 def _prune(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.registry.database import Database
-    from ident_service.service.registry.runs import rebuild_runs
-    from ident_service.service.retention import expendable, let_go
+    from ident_service.operations.retention import expendable, let_go
+    from ident_service.registry.database import Database
+    from ident_service.registry.runs import rebuild_runs
 
     state = own_state_folder(arguments)
     with Database(state) as db:
@@ -178,8 +178,8 @@ def _prune(arguments: argparse.Namespace) -> Answer:
 
 
 def _delete(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service import deletion
-    from ident_service.service.registry.database import Database
+    from ident_service.operations import deletion
+    from ident_service.registry.database import Database
 
     kind, state = arguments.word.rpartition(" ")[2], own_state_folder(arguments)
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
@@ -190,7 +190,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
 
 
 def _backup(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.backup import back_up
+    from ident_service.operations.backup import back_up
 
     made = back_up(own_state_folder(arguments), arguments.file, recordings=not arguments.without_recordings)
     note_act(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
@@ -198,7 +198,7 @@ def _backup(arguments: argparse.Namespace) -> Answer:
 
 
 def _restore(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.backup import restore
+    from ident_service.operations.backup import restore
 
     state = own_state_folder(arguments)
     done = restore(arguments.file, state, at_terminal(arguments), replace=arguments.replace)

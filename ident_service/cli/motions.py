@@ -14,7 +14,7 @@ from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
     from ident_service.excitation.search import Progress
-    from ident_service.service.design import Knowledge
+    from ident_service.operations.design import Knowledge
 
 _UNFINISHED = "the search ended before its first start was finished; more time will find a better motion"
 _CRITERIA = ("d_optimal", "condition_number", "a_optimal")
@@ -77,7 +77,7 @@ def _know(sub: Parser) -> None:
 
 
 def _knowledge(arguments: argparse.Namespace) -> Knowledge:
-    from ident_service.service.design import Knowledge
+    from ident_service.operations.design import Knowledge
 
     return Knowledge(arguments.model, arguments.noise, tuple(arguments.after))
 
@@ -87,10 +87,10 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
     from ident_service.config.load import load_arm
     from ident_service.excitation.search import Budget
-    from ident_service.service.design import FILES, DesignRequest, design_files
-    from ident_service.service.folders import new_run_folder
-    from ident_service.service.preview import preview_document
-    from ident_service.service.preview_text import preview_text
+    from ident_service.operations.design import FILES, DesignRequest, design_files
+    from ident_service.operations.folders import new_run_folder
+    from ident_service.operations.preview import preview_document
+    from ident_service.operations.preview_text import preview_text
 
     keys = (*_FAMILY, *_MARGINS)
     changes: dict[str, Any] = {key: value for key in keys if (value := getattr(arguments, key)) is not None}
@@ -157,9 +157,9 @@ def _progress_end(arguments: argparse.Namespace) -> None:
 
 
 def _preview(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.design import preview_files
-    from ident_service.service.preview import preview_document
-    from ident_service.service.preview_text import preview_text
+    from ident_service.operations.design import preview_files
+    from ident_service.operations.preview import preview_document
+    from ident_service.operations.preview_text import preview_text
 
     seen = preview_files(arguments.arm, arguments.motion, _knowledge(arguments), arguments.out)
     text = preview_text(seen)

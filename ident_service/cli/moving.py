@@ -134,10 +134,10 @@ def moved(
         As `service.run.run_motion`; MotionRefused without a ticket.
     """
     from ident_service.motion.controls import LEASE_SECONDS
-    from ident_service.motion.preflight.ticket import read_ticket
-    from ident_service.service.arm_state import ticket_path
-    from ident_service.service.folders import new_run_folder
-    from ident_service.service.run import run_motion
+    from ident_service.motion.ticket import read_ticket
+    from ident_service.operations.arm_state import ticket_path
+    from ident_service.operations.folders import new_run_folder
+    from ident_service.operations.run import run_motion
 
     state = own_state_folder(arguments)
     path = ticket_path(state, config.name)
@@ -180,7 +180,7 @@ def moved(
 
 def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
     """Add to an error the faults, recording and files that the run has left."""
-    from ident_service.service.arm_state import fault_file
+    from ident_service.operations.arm_state import fault_file
 
     faults = [{"code": code, "cause": cause} for code, cause in fault_file(state, arm).latched().items()]
     files = _files(folder)

@@ -65,7 +65,7 @@ def _base(arguments: argparse.Namespace) -> Answer:
 
 
 def _feasible(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.parameters import check_file
+    from ident_service.operations.parameters import check_file
 
     tested = check_file(arguments.file, arguments.feasible_set, arguments.arm, arguments.notation)
     result = tested.result
@@ -86,7 +86,7 @@ def _feasible(arguments: argparse.Namespace) -> Answer:
 
 
 def _correct(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.parameters import correct_file
+    from ident_service.operations.parameters import correct_file
 
     corrected = correct_file(
         arguments.file, arguments.out, arguments.feasible_set, arguments.arm, arguments.metric, arguments.notation
@@ -110,7 +110,7 @@ def _correct(arguments: argparse.Namespace) -> Answer:
 
 def _verify(arguments: argparse.Namespace) -> Answer:
     from ident_service.certificate_verifier import answer_text
-    from ident_service.service.verify import verify_file
+    from ident_service.operations.verify import verify_file
 
     result = verify_file(arguments.file, arguments.arm)
     if result.verdict == "failed" and result.message.startswith("not a parameter file"):

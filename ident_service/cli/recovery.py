@@ -19,7 +19,7 @@ from ident_service.errors import MotionRefused, UsageError
 if TYPE_CHECKING:
     from ident_service.config.schema import ArmConfig
     from ident_service.motion.plans import Destination
-    from ident_service.service.recover import Recovery
+    from ident_service.operations.recover import Recovery
 
 _HELP_ARM = "description file, or the name of a shipped one"
 _HELP_OUT = "run folder; must not exist (default: below the state folder)"
@@ -68,7 +68,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
     from ident_service.cli.keeping import note_act
     from ident_service.motion.control_file import ControlFile, in_use
     from ident_service.motion.controls import LEASE_SECONDS, Homing
-    from ident_service.service.arm_state import control_path
+    from ident_service.operations.arm_state import control_path
 
     path = control_path(state_folder(arguments), config.name)
     if not in_use(path):
@@ -102,7 +102,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     from ident_service.config.canopen import CanopenDriver
-    from ident_service.service.zeroing import home_posture, take_home
+    from ident_service.operations.zeroing import home_posture, take_home
 
     posture, lease = home_posture(config), asked_lease(arguments, config)
     tell(arguments, f"{config.name}: nothing will move. From now on the arm stands, by what you say, in this posture:")
@@ -130,8 +130,8 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
 def _recover(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.service.preflight import watch_document
-    from ident_service.service.recover import recover
+    from ident_service.operations.preflight import watch_document
+    from ident_service.operations.recover import recover
 
     config = load_arm(arguments.arm)
     if arguments.leave_limit:
@@ -178,7 +178,7 @@ def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Desti
 
 
 def _text(found: Recovery) -> str:
-    from ident_service.service.preflight import watch_text
+    from ident_service.operations.preflight import watch_text
 
     lines = [f"{found.arm}: {'usable' if found.usable else 'NOT USABLE YET'}", ""]
     for one in found.faults:

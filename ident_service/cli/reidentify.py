@@ -47,11 +47,11 @@ def add(verbs: Verbs) -> None:
 
 def _reidentify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
-    from ident_service.service.acceptance import ARM, PARAMETERS, accepted_set
-    from ident_service.service.maintenance.reidentification import enter_concluded, require_comparable
-    from ident_service.service.maintenance.verdict import verdict_of
-    from ident_service.service.registry.motions import new_id
-    from ident_service.service.registry.runs import RUNS, index_run
+    from ident_service.daemon.maintenance.reidentification import enter_concluded, require_comparable
+    from ident_service.operations.acceptance import ARM, PARAMETERS, accepted_set
+    from ident_service.operations.drift_verdict import verdict_of
+    from ident_service.registry.motions import new_id
+    from ident_service.registry.runs import RUNS, index_run
 
     state, config, begun = own_state_folder(arguments), load_arm(arguments.arm), time.time()
     who = at_terminal(arguments)

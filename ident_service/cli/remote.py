@@ -378,8 +378,8 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
 
 def _client(arguments: argparse.Namespace) -> IdentClient:
     from ident_service.client import IdentClient
-    from ident_service.service.registry.tokens import TOKEN_FILE, read_token
-    from ident_service.service.state_folder import shut_out
+    from ident_service.operations.state_folder import shut_out
+    from ident_service.registry.tokens import TOKEN_FILE, read_token
 
     state, url = state_folder(arguments), arguments.server
     if url is None:

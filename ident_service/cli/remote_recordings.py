@@ -28,7 +28,7 @@ def recording(
         path: `FILE`, `RUN` or `RUN/NAME`, each with or without `@START:END`.
         columns: says how a file is laid out.
     """
-    from ident_service.record.files import split_range
+    from ident_service.recordings.files import split_range
 
     file = file_of(path)
     seconds = None if path.is_file() else split_range(str(path))[1]
@@ -73,7 +73,7 @@ def word_of_address(word: str) -> str:
 
 def file_of(path: Path) -> Path:
     """Return the file that `FILE@START:END` names, without the range, unless a file has that whole name."""
-    from ident_service.record.files import split_range
+    from ident_service.recordings.files import split_range
 
     return path if path.is_file() else Path(split_range(str(path))[0])
 

@@ -28,8 +28,8 @@ def _ticket(values: Any) -> str:
     """The table of a preflight, as the command at the arm prints it; nothing where there is none that can be read."""
     if not isinstance(values, dict):
         return ""
-    from ident_service.motion.preflight.ticket import ticket_from_json
-    from ident_service.service.preflight import ticket_text
+    from ident_service.motion.ticket import ticket_from_json
+    from ident_service.operations.preflight import ticket_text
 
     try:
         return "\n" + ticket_text(ticket_from_json(json.dumps(values)))

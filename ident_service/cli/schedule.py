@@ -16,7 +16,7 @@ from ident_service.cli.keeping import add_by, at_terminal
 from ident_service.cli.words import Parser, Verbs, count
 
 if TYPE_CHECKING:
-    from ident_service.service.registry.database import Database, Row
+    from ident_service.registry.database import Database, Row
 
 
 def add(verbs: Verbs) -> None:
@@ -57,8 +57,8 @@ def add(verbs: Verbs) -> None:
 
 def registry(arguments: argparse.Namespace) -> Database:
     """Open the registry of the state folder, with the shipped arms entered."""
-    from ident_service.service.registry.arms import know_shipped
-    from ident_service.service.registry.database import Database
+    from ident_service.registry.arms import know_shipped
+    from ident_service.registry.database import Database
 
     db = Database(own_state_folder(arguments))
     know_shipped(db)
@@ -76,13 +76,13 @@ def _remark(sub: Parser) -> None:
 
 
 def _known(db: Database, arguments: argparse.Namespace) -> str:
-    from ident_service.service.registry.arms import known_arm
+    from ident_service.registry.arms import known_arm
 
     return known_arm(db, state_folder(arguments), arguments.arm).name
 
 
 def _add(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.schedules import When, add_schedule
+    from ident_service.operations.maintenance_schedule import When, add_schedule
 
     when = When(arguments.cron, arguments.hours, arguments.maintenance)
     with registry(arguments) as db:
@@ -92,7 +92,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.schedules import schedules
+    from ident_service.operations.maintenance_schedule import schedules
 
     with registry(arguments) as db:
         rows = schedules(db, arguments.arm)
@@ -104,7 +104,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
 
 def _remove(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.schedules import remove_schedule
+    from ident_service.operations.maintenance_schedule import remove_schedule
 
     with registry(arguments) as db:
         remove_schedule(db, arguments.number, at_terminal(arguments))
@@ -120,7 +120,7 @@ def _disable(arguments: argparse.Namespace) -> Answer:
 
 
 def _enabled(arguments: argparse.Namespace, *, enabled: bool) -> Answer:
-    from ident_service.service.maintenance.schedules import enable_schedule
+    from ident_service.operations.maintenance_schedule import enable_schedule
 
     with registry(arguments) as db:
         row = enable_schedule(db, arguments.number, at_terminal(arguments), time.time(), enabled=enabled)
@@ -128,7 +128,7 @@ def _enabled(arguments: argparse.Namespace, *, enabled: bool) -> Answer:
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.schedules import add_event, dues
+    from ident_service.operations.maintenance_schedule import add_event, dues
 
     with registry(arguments) as db:
         name = _known(db, arguments)
@@ -141,7 +141,7 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.schedules import dues
+    from ident_service.operations.maintenance_schedule import dues
 
     with registry(arguments) as db:
         rows = dues(db, arguments.arm)
@@ -149,7 +149,7 @@ def _due(arguments: argparse.Namespace) -> Answer:
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.schedules import dismiss
+    from ident_service.operations.maintenance_schedule import dismiss
 
     with registry(arguments) as db:
         dismiss(db, arguments.number, arguments.note, at_terminal(arguments), time.time())
@@ -157,7 +157,7 @@ def _dismiss(arguments: argparse.Namespace) -> Answer:
 
 
 def _alarms(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.alarms import alarms
+    from ident_service.operations.drift_alarms import alarms
 
     with registry(arguments) as db:
         rows = alarms(db, arguments.arm)
@@ -165,7 +165,7 @@ def _alarms(arguments: argparse.Namespace) -> Answer:
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
-    from ident_service.service.maintenance.alarms import acknowledge_alarm
+    from ident_service.operations.drift_alarms import acknowledge_alarm
 
     with registry(arguments) as db:
         row = acknowledge_alarm(db, arguments.number, arguments.note, at_terminal(arguments), time.time())

@@ -53,7 +53,7 @@ class MotorLimits:
         """Return joint torque within the motors' limits [N m or N], shape (joints,).
 
         Joints that share motors are scaled by one factor, so that no joint is pushed the other way, as drives do that
-        are asked for too much (`drivers/canopen/coordinates.py`).
+        are asked for too much (`drivers/canopen/motor_units.py`).
         """
         return np.asarray(torque / np.maximum(self.used_of_joints(torque), 1.0))
 

@@ -27,7 +27,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, supports, triangle
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 
 _SETTLED = 1e-6  # s
 _MOST_ROUNDS = 30

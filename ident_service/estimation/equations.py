@@ -27,8 +27,8 @@ from ident_service.model.information import Information, information_of, support
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.threads import one_blas_thread
 from ident_service.model.zero_phase import low_pass
-from ident_service.record.grid import grid
-from ident_service.record.recording import Recording
+from ident_service.recordings.grid import grid
+from ident_service.recordings.recording import Recording
 
 MAX_BLOCKS = 256
 LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known

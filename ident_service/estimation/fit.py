@@ -34,8 +34,8 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
-from ident_service.record.grid import grid
-from ident_service.record.recording import Recording
+from ident_service.recordings.grid import grid
+from ident_service.recordings.recording import Recording
 
 SAME = 0.01  # share of its deviation; a parameter that changes by less counts as unchanged
 

@@ -32,7 +32,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL, NO_STRIBECK
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 
 # No gear gives by more than three degrees before it slips; a Stribeck velocity is a small share of full speed.
 _GRIDS: dict[str, Array] = {

@@ -5,7 +5,7 @@ curve. All others, and the torque, are kept as a table X with products `X^T X`, 
 Equations with new columns F then have the products `[[X^T X, X^T F], [F^T X, F^T F]]`.
 
 The direction at a sample needs no look at the samples before it: between two reversals it is an exponential in the
-distance travelled since (`direction.py`), so the distances of reversals and of samples are all that is kept.
+distance travelled since (`model/coulomb_direction.py`), so the distances of reversals and of samples are all that is kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information, supports, triangle
 from ident_service.model.threads import one_blas_thread
 from ident_service.model.zero_phase import low_pass
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 
 FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...

@@ -27,7 +27,7 @@ from ident_service.model.base import base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.information import empty_information, information_of, supports
 from ident_service.model.threads import one_blas_thread
-from ident_service.record.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
+from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
 
 _FIRST = 2.0  # s, length of the first window; it grows where the filter needs more
 _LONGEST = 60.0  # s

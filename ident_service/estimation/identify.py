@@ -41,8 +41,8 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.likely_bodies import Source, likely_bodies
 from ident_service.model.threads import one_blas_thread
-from ident_service.record.part import overlap
-from ident_service.record.recording import Recording
+from ident_service.recordings.part import overlap
+from ident_service.recordings.recording import Recording
 
 _HELD_OUT = 1.0 / 3.0
 _WEIGHTS = (0.0, *(10.0**k for k in range(-3, 5)))

@@ -44,9 +44,9 @@ from ident_service.model.chain import Array
 from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.information import supports
 from ident_service.model.zero_phase import low_pass
-from ident_service.record.grid import grid
-from ident_service.record.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
-from ident_service.record.segments import uniform
+from ident_service.recordings.grid import grid
+from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
+from ident_service.recordings.segments import uniform
 
 SETTLED = 0.02  # standard deviations; smaller changes count as settled
 _MOST_ROUNDS = 10

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
-from ident_service.estimation.direction import direction
 from ident_service.estimation.smoothing import Motion
 from ident_service.estimation.spectra import with_filter
+from ident_service.model.coulomb_direction import direction
 from ident_service.model.zero_phase import widened
-from ident_service.record.grid import grid
-from ident_service.record.recording import Recording
-from ident_service.record.segments import uniform
+from ident_service.recordings.grid import grid
+from ident_service.recordings.recording import Recording
+from ident_service.recordings.segments import uniform
 
 Array = NDArray[np.float64]
 _WHOLE = 1e-3  # how far, in samples, a period may be from a whole number of them after all periods

@@ -18,7 +18,7 @@ from ident_service.estimation.feasible.feasibility import constrained_least_squa
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
 from ident_service.model.arm_model import ArmModel
-from ident_service.record.quality import JointQuality
+from ident_service.recordings.quality import JointQuality
 
 LARGEST_ERROR = 30.0  # percent of the torque (eq. 84): a controller is better off without such a model
 MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and percent from which that counts

@@ -21,7 +21,7 @@ from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import supports
 from ident_service.model.threads import one_blas_thread
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 
 _TUNING = 1.345  # 95 % efficiency where the noise is normal after all
 _CONSISTENT = 1.4826  # standard deviation over median absolute deviation, for normal noise

@@ -24,7 +24,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import supports
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 
 _STEP = 1e-3  # of a number's logarithm
 _RANK_TOLERANCE = 1e-10

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
 from ident_service.errors import RecordingError
-from ident_service.estimation.direction import direction
 from ident_service.estimation.spectra import with_filter
+from ident_service.model.coulomb_direction import direction
 from ident_service.model.zero_phase import local_polynomial, low_pass, widened
-from ident_service.record.grid import Grid, grid
-from ident_service.record.kept import memory_of
-from ident_service.record.recording import Block, Recording, cut, join
-from ident_service.record.segments import Piece, uniform
+from ident_service.recordings.grid import Grid, grid
+from ident_service.recordings.kept import memory_of
+from ident_service.recordings.recording import Block, Recording, cut, join
+from ident_service.recordings.segments import Piece, uniform
 
 Array = NDArray[np.float64]
 _WINDOW = 16384

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Identification
 from ident_service.model.arm_model import ArmModel
-from ident_service.record.grid import grid
-from ident_service.record.recording import Recording
-from ident_service.record.segments import uniform
+from ident_service.recordings.grid import grid
+from ident_service.recordings.recording import Recording
+from ident_service.recordings.segments import uniform
 
 Array = NDArray[np.float64]
 USUAL = 8.0  # Hz; lower, and filtered friction would not turn round where the velocity does

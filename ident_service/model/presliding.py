@@ -1,6 +1,6 @@
 """Advance the pre-sliding state of dry friction by the distance travelled (Dahl 1968).
 
-`estimation/direction.py` has it for a whole recording; this is one step of the same solution. Where the drive moves by
+`model/coulomb_direction.py` has it for a whole recording; this is one step of the same solution. Where the drive moves by
 `step` without turning round, the direction s goes to
 
     s' = sign(step) + (s - sign(step)) exp(-|step| / x0)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.arm import Counts, Flags, Sample, Vector
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from ident_service.config.limits import MotionLimits
 
 MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone, where its driver does not say (FIELDBUS.md)

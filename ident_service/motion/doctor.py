@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm import Vector, Watchdog
-from drivers.canopen.bus_errors import BusError
-from drivers.canopen.kernel_interface import check_interface
+from drivers.can.bus_errors import BusError
+from drivers.can.kernel_interface import check_interface
 from drivers.clock import Clock, RealClock
 from ident_service.config.canopen import CanBus, CanopenDriver
 from ident_service.config.control import Realtime

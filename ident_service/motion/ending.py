@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.record.files import write_atomically
+from ident_service.recordings.files import write_atomically
 
 ENDED: Final = "ended.json"
 

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.motion.control_file import in_use
-from ident_service.record.files import write_atomically
+from ident_service.recordings.files import write_atomically
 
 CONTROLS: Final = "control"  # the arm's control file, in its folder
 UNFINISHED: Final = "motion_process"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from drivers.arm import Counts, Flags, Sample, Vector
-from drivers.status import TRIPPED, AxisStatus
+from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.config.limits import MotionLimits
 from ident_service.model.contact import Contact
 from ident_service.motion.checks import (

@@ -22,7 +22,7 @@ from drivers.arm import Arm, Vector
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import IdentError, MotionRefused, UsageError
 from ident_service.motion.watch import watch
-from ident_service.record.files import write_atomically
+from ident_service.recordings.files import write_atomically
 
 FILE: Final = "position.json"  # in the arm's folder
 TURN: Final = 0.03  # of a motor turn by which one that is lost may differ from a whole number

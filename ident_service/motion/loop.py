@@ -32,7 +32,7 @@ from ident_service.motion.lowering import MEANT, Anchor, Lowering
 from ident_service.motion.reference import Setpoint, rest
 from ident_service.motion.sink import Sink
 from ident_service.motion.states import State, States
-from ident_service.record.cycle import Cycle
+from ident_service.recordings.cycle import Cycle
 
 KEPT_SAMPLES: Final = 100
 REST_SPEED: Final = 0.05  # of the velocity limit, below which a joint counts as at rest

@@ -38,12 +38,12 @@ from ident_service.motion.latch import Latch
 from ident_service.motion.lifeline import Lifeline
 from ident_service.motion.loop import LOWERS, WAITS
 from ident_service.motion.plans import Destination, Excite, GoTo, Plan
-from ident_service.motion.preflight.ticket import subject_of, ticket_from_json
 from ident_service.motion.realtime import ask
 from ident_service.motion.run import RunReport, follow
 from ident_service.motion.states import State
-from ident_service.record.cycle import Cycle
-from ident_service.record.ring_sink import RingSink, SinkEnds
+from ident_service.motion.ticket import subject_of, ticket_from_json
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.ring_sink import RingSink, SinkEnds
 
 FRAMES = "can.log"  # in the run folder, where they were asked for
 _STATES = frozenset(state.value for state in State)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ident_service.record.cycle import Cycle
+from ident_service.recordings.cycle import Cycle
 
 
 class Sink(Protocol):

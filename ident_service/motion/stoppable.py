@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from ident_service.errors import DriverError
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from drivers.status import AxisEvent
+from drivers.axis_status import AxisEvent
 from ident_service.motion.faults import Fault, Findings
 
 

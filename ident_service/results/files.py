@@ -11,7 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ident_service.errors import UsageError
-from ident_service.record.files import write_atomically as write_atomically  # what motion writes, too, appears whole
+from ident_service.recordings.files import (
+    write_atomically as write_atomically,  # what motion writes, too, appears whole
+)
 
 _EXCHANGE = 2  # RENAME_EXCHANGE
 

@@ -19,10 +19,10 @@ from ident_service import __version__
 from ident_service.certificate_verifier import INERTIAL, JOINT_TERMS, VerificationError, split_name
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ParameterError, UsageError
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import TorqueError
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.base import BaseParameters, base_from_expressions
 from ident_service.model.chain import Array
 from ident_service.model.expressions import parse_expression

@@ -14,13 +14,13 @@ import numpy as np
 from ident_service import __version__
 from ident_service.config.schema import ArmConfig, Body, FeasibleSetName, Mass
 from ident_service.errors import ParameterError
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.doubt import negligible, verdicts
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasibility import feasibility_test
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares
 from ident_service.estimation.payload import KnownArm, Payload, Word, center_of_mass, loaded_covariance
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.chain import Array
 from ident_service.model.layout import INERTIAL
 from ident_service.results.files import write_atomically

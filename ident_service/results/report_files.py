@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
 from ident_service.results.evidence.making import gather_evidence

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.canopen.wire.host import WireThread
-from drivers.canopen.wire.hub import Wire
+from sim_backend.can_bus.host import WireThread
+from sim_backend.can_bus.hub import Wire
 
 _WIRES = iter(range(10**9))
 

@@ -12,13 +12,13 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.sendable import FD_LENGTHS
-from drivers.canopen.wire.hub import Wire
-from drivers.canopen.wire.link import Connection, WireLink
-from drivers.canopen.wire.packets import Hello
+from drivers.can.can_frame import Frame
+from drivers.can.sendable import FD_LENGTHS
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
+from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.link import Connection, WireLink
+from sim_backend.can_bus.packets import Hello
 
 PATIENCE = 30.0
 

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_bench import frames
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.kernel_frame import MAX_PACKET_BYTES, from_kernel, pack_frames, to_kernel, unpack_frames
-from drivers.canopen.sendable import check_sendable
-from drivers.canopen.wire import packets
+from drivers.can.can_frame import Frame
+from drivers.can.kernel_frame import MAX_PACKET_BYTES, from_kernel, pack_frames, to_kernel, unpack_frames
+from drivers.can.sendable import check_sendable
 from ident_service.errors import DriverError
+from sim_backend.can_bus import packets
 
 
 @given(frames(errors=True))

@@ -11,16 +11,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, soon, wait_for
 
-from drivers.canopen.bits import exact
-from drivers.canopen.bus_errors import BUS_OFF, BusError
-from drivers.canopen.frame import Frame
-from drivers.canopen.kernel_frame import pack_frames, unpack_frames
-from drivers.canopen.link import open_links
-from drivers.canopen.sendable import FD_LENGTHS
-from drivers.canopen.wire.host import WireThread
-from drivers.canopen.wire.hub import ERROR_BITS, Wire
-from drivers.canopen.wire.medium import Medium, Port
+from drivers.can.bus_errors import BUS_OFF, BusError
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import open_links
+from drivers.can.kernel_frame import pack_frames, unpack_frames
+from drivers.can.sendable import FD_LENGTHS
+from drivers.canopen.frame_bits import exact
 from ident_service.errors import DriverError
+from sim_backend.can_bus.host import WireThread
+from sim_backend.can_bus.hub import ERROR_BITS, Wire
+from sim_backend.can_bus.medium import Medium, Port
 
 SLOW, FAST = 500_000, 2_000_000
 

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_bench import frames
 
-from drivers.canopen.bits import exact
-from drivers.canopen.bus_errors import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
-from drivers.canopen.frame import Frame
-from drivers.canopen.heard import HEARD
-from drivers.canopen.wire.hub import ERROR_BITS
-from drivers.canopen.wire.medium import INBOX, QUEUE, Medium, Port, priority
+from drivers.can.bus_errors import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
+from drivers.can.can_frame import Frame
+from drivers.can.receive_filter import HEARD
+from drivers.canopen.frame_bits import exact
+from sim_backend.can_bus.hub import ERROR_BITS
+from sim_backend.can_bus.medium import INBOX, QUEUE, Medium, Port, priority
 
 
 def bits_of(frame: Frame) -> str:

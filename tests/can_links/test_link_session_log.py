@@ -12,11 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import frames, process, wait_for
 
-from drivers.canopen.bus_errors import BUS_OFF
-from drivers.canopen.frame import Frame
+from drivers.can.bus_errors import BUS_OFF
+from drivers.can.can_frame import Frame
+from drivers.can.frame_log import SessionLog
+from drivers.can.frame_log_process import OrderedLog
 from drivers.canopen.replay import LoggedFrame, ReplayLink, read_session
-from drivers.canopen.session_log import SessionLog
-from drivers.canopen.session_log_process import OrderedLog
 from drivers.clock import RealClock, VirtualClock
 from ident_service.errors import DriverError, RecordingError
 
@@ -130,8 +130,8 @@ def test_an_error_frame_keeps_its_kind_where_the_format_can(tmp_path: Path) -> N
 
 _LOGGER = """
 import sys, time
-from drivers.canopen.frame import Frame
-from drivers.canopen.session_log import SessionLog
+from drivers.can.can_frame import Frame
+from drivers.can.frame_log import SessionLog
 from drivers.clock import RealClock
 clock = RealClock()
 log = SessionLog(sys.argv[1], clock)

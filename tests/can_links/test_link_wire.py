@@ -18,16 +18,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, greeted, process, soon
 
-from drivers.canopen.bus_errors import BUS_OFF, CONTROLLER, RESTARTED, RX_OVERFLOW, BusError
-from drivers.canopen.frame import Frame
-from drivers.canopen.kernel_frame import MAX_PACKET_BYTES, pack_frames
-from drivers.canopen.link import open_links
-from drivers.canopen.wire import address, packets
-from drivers.canopen.wire.host import LocalPort, WireThread
-from drivers.canopen.wire.hub import MOST_ENDS, Wire
-from drivers.canopen.wire.link import Connection, WireLink
-from drivers.canopen.wire.packets import Hello
+from drivers.can.bus_errors import BUS_OFF, CONTROLLER, RESTARTED, RX_OVERFLOW, BusError
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import open_links
+from drivers.can.kernel_frame import MAX_PACKET_BYTES, pack_frames
 from ident_service.errors import DriverError
+from sim_backend.can_bus import address, packets
+from sim_backend.can_bus.host import LocalPort, WireThread
+from sim_backend.can_bus.hub import MOST_ENDS, Wire
+from sim_backend.can_bus.link import Connection, WireLink
+from sim_backend.can_bus.packets import Hello
 
 
 @given(drawn=st.lists(frames(), min_size=1, max_size=30))
@@ -128,7 +128,7 @@ def test_a_name_that_cannot_be_one_is_refused(channel: str) -> None:
 
 def test_a_socket_file_is_its_owners_alone_and_does_not_outlive_its_wire_in_the_way(tmp_path: Path) -> None:
     path = tmp_path / "wire"
-    with process("-m", "drivers.canopen.wire", str(path)) as child:
+    with process("-m", "sim_backend.can_bus", str(path)) as child:
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
         end_of(str(path)).close()
         child.kill()
@@ -144,7 +144,7 @@ def test_a_socket_file_is_its_owners_alone_and_does_not_outlive_its_wire_in_the_
 
 
 def test_a_wire_that_is_killed_is_gone_and_another_one_takes_its_place(name: str) -> None:
-    with process("-m", "drivers.canopen.wire", name) as child:
+    with process("-m", "sim_backend.can_bus", name) as child:
         link = end_of(name)
         child.kill()
         child.wait()
@@ -154,7 +154,7 @@ def test_a_wire_that_is_killed_is_gone_and_another_one_takes_its_place(name: str
         with pytest.raises(BusError):
             link.send(Frame(0x080))
         link.close()
-    with process("-m", "drivers.canopen.wire", name) as child:
+    with process("-m", "sim_backend.can_bus", name) as child:
         one, other = end_of(name), end_of(name)
         one.send(Frame(0x123))
         assert content(other.receive(soon())) == Frame(0x123)
@@ -166,9 +166,9 @@ def test_a_wire_that_is_killed_is_gone_and_another_one_takes_its_place(name: str
 
 _TALKER = """
 import sys, time
-from drivers.canopen.frame import Frame
-from drivers.canopen.wire.link import Connection, WireLink
-from drivers.canopen.wire.packets import Hello
+from drivers.can.can_frame import Frame
+from sim_backend.can_bus.link import Connection, WireLink
+from sim_backend.can_bus.packets import Hello
 link = WireLink(Connection(sys.argv[1], Hello("talker")))
 print("ready", flush=True)
 k = 0
@@ -339,7 +339,7 @@ def test_a_connection_is_of_one_user_only(name: str) -> None:
         pytest.skip("only root can become somebody else")
     with WireThread(Wire(name)) as thread:
         code = (
-            "import os, sys; from drivers.canopen.wire import address\n"
+            "import os, sys; from sim_backend.can_bus import address\n"
             "where = address.address_of(sys.argv[1]); import socket; os.setuid(65534)\n"
             "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); s.settimeout(30); s.connect(where)\n"
             "sys.exit(0 if s.recv(100) == b'' else 3)"

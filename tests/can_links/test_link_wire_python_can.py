@@ -12,8 +12,8 @@ import canopen
 import pytest
 from link_bench import PATIENCE, content, end_of, soon
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.wire.hub import Wire
+from drivers.can.can_frame import Frame
+from sim_backend.can_bus.hub import Wire
 
 
 def test_python_can_talks_over_the_wire(wire: Wire) -> None:

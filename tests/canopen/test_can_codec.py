@@ -10,12 +10,12 @@ from can_arms import wam_driver
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.canopen.bus_event import HOST, Event, EventCode
-from drivers.canopen.codec import BusCodec
-from drivers.canopen.controller import ControllerState
-from drivers.canopen.frame import Frame
-from drivers.canopen.profile import bus_profiles
-from drivers.canopen.words import DriveState, NmtCommand, NmtState
+from drivers.can.bus_event import HOST, Event, EventCode
+from drivers.can.can_frame import Frame
+from drivers.can.controller_state import ControllerState
+from drivers.canopen.cia402 import DriveState, NmtCommand, NmtState
+from drivers.canopen.pdo_codec import BusCodec
+from drivers.canopen.pdo_mapping import bus_profiles
 from ident_service.errors import DriverError
 
 TORQUES = [1, -2, 300, -400, 5000, -6000, 32_767]

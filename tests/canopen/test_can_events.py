@@ -7,11 +7,11 @@ import struct
 import pytest
 from can_arms import wam_driver
 
-from drivers.canopen.codec import BusCodec
-from drivers.canopen.events import axis_events
-from drivers.canopen.frame import Frame
-from drivers.canopen.profile import bus_profiles
-from drivers.status import AxisEventCode
+from drivers.axis_status import AxisEventCode
+from drivers.can.can_frame import Frame
+from drivers.canopen.axis_events import axis_events
+from drivers.canopen.pdo_codec import BusCodec
+from drivers.canopen.pdo_mapping import bus_profiles
 
 JOINTS = {node: node - 1 for node in range(1, 8)}
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen import dictionary as od
-from drivers.canopen.frame import Frame
+from drivers.can.can_frame import Frame
+from drivers.canopen import object_dictionary as od
 from drivers.canopen.polling import BURST, Answers, poll, upload_request
 from drivers.clock import VirtualClock
 

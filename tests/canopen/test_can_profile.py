@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from can_arms import wam_driver
 
-from drivers.canopen import dictionary as od
-from drivers.canopen.profile import BusProfile, Write, bus_profiles, restricted
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.pdo_mapping import BusProfile, Write, bus_profiles, restricted
 from ident_service.config.canopen import CanopenDriver
 
 

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.canopen.words import (
+from drivers.axis_status import AxisStatus
+from drivers.canopen.cia402 import (
     ABORTS,
     DISABLE_VOLTAGE,
     EMERGENCIES,
@@ -23,7 +24,6 @@ from drivers.canopen.words import (
     nmt_words,
     state_of,
 )
-from drivers.status import AxisStatus
 
 # CiA 402-2, table of states: bits 6, 5, 3, 2, 1, 0 of the status word; x for either.
 STATES = {

@@ -12,15 +12,15 @@ import pytest
 from helpers.emulated_arms import EDS, Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
-from drivers.canopen.words import DISABLE_VOLTAGE, ENABLE, SHUTDOWN, SWITCH_ON
-from drivers.status import AxisEventCode
+from drivers.axis_status import AxisEventCode
+from drivers.can.can_frame import Frame
+from drivers.canopen.cia402 import DISABLE_VOLTAGE, ENABLE, SHUTDOWN, SWITCH_ON
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
-from sim_backend.canopen.drive import CanopenDrive
-from sim_backend.pucks.faults import PuckFault
-from sim_backend.pucks.lock_step import LockStepArm
+from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.lock_step import LockStepArm
 
 ZERO = np.zeros(2)
 DRIVE = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}

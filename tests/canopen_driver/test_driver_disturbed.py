@@ -17,10 +17,10 @@ import pytest
 from helpers.emulated_arms import Tapped, tapped, weightless_config
 
 from drivers.arm import Sample
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
-from drivers.status import AxisEventCode
-from sim_backend.pucks.lock_step import LockStepArm
+from drivers.axis_status import AxisEventCode
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
+from sim_backend.emulator.lock_step import LockStepArm
 
 Array = np.ndarray
 EACH = 10  # frames a cycle, of which a bus of 1 Mbit/s has room for about as many

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from drivers.canopen.lock import BusLock
+from drivers.can.bus_lock import BusLock
 from ident_service.config.canopen import CanBus
 from ident_service.errors import DriverError
 
 HOLDER = """
 import sys
-from drivers.canopen.lock import BusLock
+from drivers.can.bus_lock import BusLock
 from ident_service.config.canopen import CanBus
 lock = BusLock(CanBus(interface=sys.argv[1], channel=sys.argv[2]))
 print("held", flush=True)

@@ -10,10 +10,10 @@ from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of
 from test_driver_watchdogs import Bench as HeldBench
 
 from drivers.arm import StopKind
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
-from ident_service.motion.preflight.check import Verdict
+from ident_service.motion.preflight_check import Verdict
 
 ZERO = np.zeros(2)
 PROVEN = {"maxon_epos4_50-5_0170h.eds", "elmo_gold_V002.dcf", "elmo_simpliq.dcf"}

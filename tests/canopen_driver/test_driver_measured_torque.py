@@ -10,21 +10,21 @@ import pytest
 from helpers.emulated_arms import EDS, weightless_config
 
 from drivers.arm import Sample
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.budget import budget
+from drivers.canopen.bus_load import budget
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.canopen_checks import disagreements
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import RecordingError
-from ident_service.record.cycle import Cycle
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.measured import MeasuredRecording
-from ident_service.record.open import open_recording
-from ident_service.record.recording import join
-from ident_service.record.writer import RecordingWriter
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.measured import MeasuredRecording
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.recording import join
+from ident_service.recordings.writer import RecordingWriter
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth
-from sim_backend.pucks.faults import parse_fault
-from sim_backend.pucks.lock_step import LockStepArm
 
 JOINTS = ("turn", "slide")
 PUSH = np.array([3.0, 1.0])

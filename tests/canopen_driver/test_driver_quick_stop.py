@@ -7,17 +7,17 @@ import pytest
 from helpers.emulated_arms import Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.bus_errors import BusError
-from drivers.canopen.frame import Frame
+from drivers.can.bus_errors import BusError
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
-from sim_backend.canopen.drive import CanopenDrive
-from sim_backend.canopen.power import PowerState
+from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.canopen_device.power import PowerState
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm
+from sim_backend.emulator.motor import Power
 from sim_backend.machine import Truth
-from sim_backend.pucks.faults import parse_fault
-from sim_backend.pucks.lock_step import LockStepArm
-from sim_backend.pucks.motor import Power
 
 PUSH = np.array([5.0, 2.0])
 CYCLES = 50

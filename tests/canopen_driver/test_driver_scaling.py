@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from helpers.emulated_arms import EDS, weightless_config
 
-from drivers.canopen.arm import CanopenArm
+from drivers.canopen.driver import CanopenArm
 from ident_service.errors import DriverError
-from sim_backend.pucks.lock_step import LockStepArm
+from sim_backend.emulator.lock_step import LockStepArm
 
 DRIVE = {"rated_torque": 1.0, "max_speed": 6000.0, "max_torque": 5.0}
 GEAR = """

@@ -9,10 +9,10 @@ import pytest
 from helpers.emulated_arms import Tapped, tapped, weightless_config
 from pydantic import ValidationError
 
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
-from drivers.status import AxisEvent, AxisEventCode
-from sim_backend.pucks.lock_step import LockStepArm
+from drivers.axis_status import AxisEvent, AxisEventCode
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
+from sim_backend.emulator.lock_step import LockStepArm
 
 ZERO = np.zeros(2)
 PERIOD = 0.002  # s, of a cycle

@@ -10,11 +10,11 @@ import pytest
 from helpers.emulated_arms import EDS, Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
-from drivers.canopen import dictionary as od
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.budget import budget
-from drivers.canopen.dictionary import Entry, Kind
-from drivers.canopen.profile import HEARTBEAT, Write
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.bus_load import budget
+from drivers.canopen.driver import CanopenArm
+from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.pdo_mapping import HEARTBEAT, Write
 from ident_service.config.canopen import CanopenDrive, CanopenDriver, quick_stop_decelerations
 from ident_service.config.canopen_checks import disagreements
 from ident_service.config.limits import motion_limits
@@ -22,12 +22,12 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.expected_friction import expected_friction
-from ident_service.motion.preflight.check import Verdict
-from ident_service.motion.preflight.session import Session
-from ident_service.motion.preflight.watchdog import watchdog_check
+from ident_service.motion.preflight_check import Verdict
 from ident_service.motion.reference import hold
-from sim_backend.pucks.faults import parse_fault
-from sim_backend.pucks.lock_step import LockStepArm
+from ident_service.preflight.session import Session
+from ident_service.preflight.watchdog import watchdog_check
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm
 
 DRIVE = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
 PERIOD = 2e-3

@@ -10,16 +10,16 @@ import pytest
 from helpers.emulated_arms import EDS, Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.dictionary import ZERO_COUNTS, ZERO_MARK
-from drivers.canopen.frame import Frame
-from drivers.canopen.profile import SDO_REQUEST
-from drivers.canopen.zero import Zeros
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
+from drivers.canopen.object_dictionary import ZERO_COUNTS, ZERO_MARK
+from drivers.canopen.pdo_mapping import SDO_REQUEST
+from drivers.canopen.stored_zero import Zeros
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
-from sim_backend.canopen.drive import CanopenDrive
-from sim_backend.pucks.faults import PuckFault
-from sim_backend.pucks.lock_step import LockStepArm
+from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.lock_step import LockStepArm
 
 HOME = np.array([0.5, 0.4])
 # Both motors turn both joints, so that a joint's position depends on both zeros.

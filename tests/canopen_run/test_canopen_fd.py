@@ -26,15 +26,15 @@ from canopen_run_bench import (
     write,
 )
 
-from drivers.canopen.bits import unstuffed
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link, open_links
-from drivers.canopen.profile import SDO_REPLY, SDO_REQUEST, SYNC
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link, open_links
+from drivers.canopen.frame_bits import unstuffed
+from drivers.canopen.pdo_mapping import SDO_REPLY, SDO_REQUEST, SYNC
 from ident_service.cli import main
 from ident_service.config.load import load_arm
-from ident_service.record.open import open_recording
-from sim_backend.pucks.lock_step import LockStepArm
-from sim_backend.pucks.process import Emulated, emulate
+from ident_service.recordings.open import open_recording
+from sim_backend.emulator.lock_step import LockStepArm
+from sim_backend.emulator.process import Emulated, emulate
 
 RATE, KP, KD = 250.0, 225.0, 30.0
 BITRATE, DATA = 500_000, 2_000_000

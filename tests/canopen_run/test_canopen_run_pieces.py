@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from canopen_run_bench import PATIENCE, canopen, channel, described, write
 
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.bus_errors import BusError
-from drivers.canopen.frame import Frame
-from drivers.canopen.wire.link import Connection, WireLink
-from drivers.canopen.wire.packets import Hello
+from drivers.can.bus_errors import BusError
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
-from sim_backend.pucks.lock_step import LockStepArm
-from sim_backend.pucks.process import Emulated, emulate
+from sim_backend.can_bus.link import Connection, WireLink
+from sim_backend.can_bus.packets import Hello
+from sim_backend.emulator.lock_step import LockStepArm
+from sim_backend.emulator.process import Emulated, emulate
 
 IDENTITY = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
 

@@ -11,7 +11,7 @@ import pytest
 from canopen_run_bench import canopen, checked, described, simulated, write
 
 from ident_service.cli import main
-from ident_service.record.open import open_recording
+from ident_service.recordings.open import open_recording
 
 SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
 RATE, KP, KD = 250.0, 225.0, 30.0

@@ -15,20 +15,20 @@ import pytest
 from canopen_run_bench import canopen, channel, described, write
 from motion.motion_bench import Story
 
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
-from drivers.canopen.profile import SYNC
-from drivers.canopen.wire.link import Connection
-from drivers.canopen.wire.packets import Hello
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
+from drivers.canopen.pdo_mapping import SYNC
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, ConfigError, DriverError
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.controls import StopWhen
 from ident_service.motion.run import RunReport, run
-from sim_backend.pucks.faults import parse_fault
-from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
-from sim_backend.pucks.process import emulate
+from sim_backend.can_bus.link import Connection
+from sim_backend.can_bus.packets import Hello
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
+from sim_backend.emulator.process import emulate
 
 RATE = 500.0
 MS = 1_000_000

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.schema import ArmConfig
-from ident_service.estimation.proof.certificate import Certificate
+from ident_service.estimation.certificate import Certificate
 from ident_service.model.base import BaseParameters, base_from_expressions
 from ident_service.model.layout import INERTIAL
 

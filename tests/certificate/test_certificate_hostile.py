@@ -13,11 +13,11 @@ from certificate_samples import parameter_file, table_1, text
 
 from ident_service.certificate_verifier import verify
 from ident_service.errors import UsageError
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.base import base_from_expressions
 from ident_service.model.layout import INERTIAL
-from ident_service.service.verify import verify_file
+from ident_service.operations.verify import verify_file
 
 NAMES = tuple(f"{symbol}1" for symbol in INERTIAL)
 
@@ -122,7 +122,7 @@ def test_verification_needs_no_numerical_package(wam7_data: Path, tmp_path: Path
         "    sys.modules[name] = None\n"
         "import json\n"
         "from pathlib import Path\n"
-        "from ident_service.service.verify import verify_file\n"
+        "from ident_service.operations.verify import verify_file\n"
         "print(json.dumps([verify_file(Path(path)).verdict for path in sys.argv[1:]]))\n"
     )
     command = [sys.executable, "-c", script, str(tmp_path / "r1.json"), str(tmp_path / "r2.json")]

@@ -17,8 +17,8 @@ import pytest
 from certificate_samples import parameter_file, random_bodies, random_config, text
 
 from ident_service.certificate_verifier import verify
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import BaseParameters, base_parameters
 

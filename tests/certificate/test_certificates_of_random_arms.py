@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.certificate_verifier import verify
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_from_expressions, base_parameters
 from ident_service.model.layout import INERTIAL

@@ -23,9 +23,9 @@ from ident_service.certificate_verifier import INERTIAL, Arm, rational_text, ver
 from ident_service.cli import main
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.schema import Ellipsoid
+from ident_service.estimation.certificate import certify, stated_arm
+from ident_service.estimation.certificate_rounding import exact_block
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.estimation.proof.certificate import certify, stated_arm
-from ident_service.estimation.proof.certificate_rounding import exact_block
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_parameters
 

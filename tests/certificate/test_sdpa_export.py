@@ -15,8 +15,8 @@ from ident_service.estimation.feasible.feasibility import (
     feasibility_test,
 )
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.estimation.proof.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import BaseParameters, base_parameters
 from ident_service.model.information import Information

@@ -33,7 +33,7 @@ from ident_service.certificate_verifier import (
     verify,
 )
 from ident_service.errors import UsageError
-from ident_service.service import verify as service
+from ident_service.operations import verify as service
 
 Document = dict[str, Any]
 BODY = {"Lxx1": 0.5, "Lxy1": 0.0, "Lxz1": 0.0, "Lyy1": 0.5, "Lyz1": 0.0, "Lzz1": 0.5}

@@ -14,8 +14,8 @@ from certificate_samples import parameter_file, text
 
 from ident_service import certificate_verifier
 from ident_service.config.load import load_arm
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base import base_parameters
 from ident_service.model.layout import INERTIAL, TERM_SYMBOLS

@@ -16,7 +16,7 @@ from helpers.once import made_once
 
 from ident_service.cli import main
 from ident_service.config.load import shipped_arms
-from ident_service.record.open import open_recording
+from ident_service.recordings.open import open_recording
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ident_service.motion.control_file import ControlFile
 from ident_service.motion.controls import Homing
 from ident_service.motion.factory import make_arm
 from ident_service.motion.stoppable import StoppableArm
-from ident_service.service.arm_state import control_path, fault_file
+from ident_service.operations.arm_state import control_path, fault_file
 
 
 @pytest.mark.parametrize("verb", ["check", "watch"])
@@ -61,7 +61,9 @@ def test_drives_that_hold_an_arm_are_not_told_to_let_go_without_its_name(
     ident: Ident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     let_go: list[str] = []
-    monkeypatch.setattr("ident_service.service.recover.let_go", lambda config, _: let_go.append(config.name) or ("j1",))
+    monkeypatch.setattr(
+        "ident_service.operations.recover.let_go", lambda config, _: let_go.append(config.name) or ("j1",)
+    )
     assert ident("supported", "planar2").code == 2
     assert let_go == []
     assert ident("supported", "planar2", "--confirm", "planar2").code == 0

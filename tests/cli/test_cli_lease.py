@@ -11,7 +11,7 @@ import pytest
 from cli.conftest import COARSE, Ident, quick_arm
 
 from ident_service.motion.control_file import in_use
-from ident_service.service.arm_state import control_path
+from ident_service.operations.arm_state import control_path
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ import pytest
 from cli.conftest import Commissioned, Ended, Ident, Samples, left_over, quick_arm
 
 from ident_service.config.load import shipped_arms
-from ident_service.record.open import open_recording
+from ident_service.recordings.open import open_recording
 from ident_service.results.parameter_file import read_parameters
 
 RUN_FILES = [

@@ -25,7 +25,7 @@ from ident_service.model.outline import capsule_around
 from ident_service.model.rigid_body import InverseDynamics, inertia_from_delta
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.reference import rest
-from ident_service.service.urdf_says import arm_part
+from ident_service.operations.urdf_says import arm_part
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -28,12 +28,12 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.rigid_body import InverseDynamics, joint_frame_inertias
 from ident_service.motion.factory import make_arm
 from ident_service.motion.states import State
-from ident_service.record.open import open_recording
+from ident_service.operations.commission import record_motion
+from ident_service.operations.score import true_parameters
+from ident_service.recordings.open import open_recording
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.report_files import read_evidence_of
 from ident_service.results.run_folder import read_results
-from ident_service.service.commission import record_motion
-from ident_service.service.score import true_parameters
 
 # A busy machine may take several times as long as a free one.
 pytestmark = pytest.mark.timeout(600)

@@ -18,12 +18,12 @@ from helpers.once import made_once
 from helpers.tickets import write_checked_ticket
 
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.service.api.app import create_app
-from ident_service.service.api.asking import Service
-from ident_service.service.api.settings import Settings
-from ident_service.service.commission import simulate
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.tokens import add_token
+from ident_service.daemon.app import create_app
+from ident_service.daemon.dependencies import Service
+from ident_service.daemon.settings import Settings
+from ident_service.operations.commission import simulate
+from ident_service.registry import jobs as rows
+from ident_service.registry.tokens import add_token
 
 Until = Callable[[dict[str, Any]], bool]
 URL = "http://127.0.0.1:8470"

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from ident_service.config.load import arm_from_json
+from ident_service.daemon.jobs.commands import accepted_description
 from ident_service.errors import ParameterError, UnknownId, UsageError
-from ident_service.results.manifest import MANIFEST, write_manifest
-from ident_service.service.acceptance import accept, acceptances, rollback, settle
-from ident_service.service.import_run import import_run
-from ident_service.service.jobs.commands import accepted_description
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.runs import (
+from ident_service.operations.acceptance import accept, acceptances, rollback, settle
+from ident_service.operations.import_run import import_run
+from ident_service.operations.retention import expendable, let_go
+from ident_service.registry import jobs as rows
+from ident_service.registry.database import Database
+from ident_service.registry.runs import (
     index_run,
     known_run,
     parameter_set,
@@ -26,7 +26,7 @@ from ident_service.service.registry.runs import (
     run_file,
     run_files,
 )
-from ident_service.service.retention import expendable, let_go
+from ident_service.results.manifest import MANIFEST, write_manifest
 
 pytestmark = pytest.mark.slow
 

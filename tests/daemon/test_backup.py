@@ -23,13 +23,13 @@ from hypothesis import strategies as st
 from ident_service.cli import main
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.motion.control_file import ControlFile
-from ident_service.service import backup
-from ident_service.service.arm_state import control_path
-from ident_service.service.backup import back_up, restore
-from ident_service.service.registry.audit import note, trail
-from ident_service.service.registry.database import FILE, Database
-from ident_service.service.registry.tokens import Access, access, add_token, first_token
-from ident_service.service.state_folder import RESTORING, single_instance
+from ident_service.operations import backup
+from ident_service.operations.arm_state import control_path
+from ident_service.operations.backup import back_up, restore
+from ident_service.operations.state_folder import RESTORING, single_instance
+from ident_service.registry.audit import note, trail
+from ident_service.registry.database import FILE, Database
+from ident_service.registry.tokens import Access, access, add_token, first_token
 
 RUN = "runs/20261101T080000-quick"
 
@@ -343,7 +343,7 @@ def test_the_one_file_has_everything_when_nobody_writes(
     while registry.with_name(f"{FILE}-wal").stat().st_size and time.monotonic() < until:
         time.sleep(0.1)
     assert registry.with_name(f"{FILE}-wal").stat().st_size == 0
-    monkeypatch.setattr("ident_service.service.registry.database._IDLE", 0.0)
+    monkeypatch.setattr("ident_service.registry.database._IDLE", 0.0)
     note(db, "me", "did", "x")
     with closing(sqlite3.connect(registry)) as other:
         other.execute("BEGIN IMMEDIATE")

@@ -38,9 +38,9 @@ from ident_service.errors import (
     UsageError,
 )
 from ident_service.motion.control_file import in_use
-from ident_service.service.arm_state import control_path
-from ident_service.service.registry.audit import note
-from ident_service.service.registry.database import Database
+from ident_service.operations.arm_state import control_path
+from ident_service.registry.audit import note
+from ident_service.registry.database import Database
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]

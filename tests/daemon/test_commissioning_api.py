@@ -12,11 +12,11 @@ import pytest
 from daemon.conftest import Asked, checked_before, patient_text, quick_text, serving
 from daemon.verbs_bench import with_run
 
+from ident_service.daemon.jobs.requests import Run
 from ident_service.motion.control_file import ControlFile, in_use
-from ident_service.service.arm_state import control_path
-from ident_service.service.jobs.asked import Run
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.audit import trail
+from ident_service.operations.arm_state import control_path
+from ident_service.registry import jobs as rows
+from ident_service.registry.audit import trail
 
 pytestmark = pytest.mark.slow
 ARM = "quick"

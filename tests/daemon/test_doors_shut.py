@@ -12,15 +12,15 @@ import pytest
 from daemon.conftest import URL, Asked, serving
 
 from ident_service.config.load import shipped_arms
+from ident_service.daemon.authentication import CHALLENGE_SECONDS, SESSION_SECONDS, Gate, Throttle, Throttled
+from ident_service.daemon.request_guard import MOST_BODY, MOST_UPLOAD
+from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.motion.control_file import ControlFile
-from ident_service.service.api.doors import MOST_BODY, MOST_UPLOAD
-from ident_service.service.api.gate import CHALLENGE_SECONDS, SESSION_SECONDS, Gate, Throttle, Throttled
-from ident_service.service.api.settings import Settings
-from ident_service.service.arm_state import control_path
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.tokens import add_token, revoke_token
+from ident_service.operations.arm_state import control_path
+from ident_service.registry.audit import trail
+from ident_service.registry.database import Database
+from ident_service.registry.tokens import add_token, revoke_token
 
 OPEN = {("GET", "/healthz"), ("POST", "/api/v1/login"), ("POST", "/api/v1/logout")}
 STOPS = {("POST", "/api/v1/stop"), ("POST", "/api/v1/arms/{arm}/stop")}

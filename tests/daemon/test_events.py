@@ -13,10 +13,10 @@ from daemon.conftest import Asked, checked_before, quick_text, serving
 from daemon.served import daemon_process
 
 from ident_service.client import Event, IdentClient
+from ident_service.daemon.news import LOOK, Watch
 from ident_service.motion.control_file import ControlFile
-from ident_service.service.arm_state import control_path, fault_file
-from ident_service.service.news import LOOK, Watch
-from ident_service.service.registry.audit import note, trail
+from ident_service.operations.arm_state import control_path, fault_file
+from ident_service.registry.audit import note, trail
 
 
 class Clock:
@@ -55,7 +55,7 @@ def test_what_happens_is_told_once_and_in_order(daemon: Asked, watch: Watch) -> 
 
 
 def test_who_is_far_behind_reads_the_registry(daemon: Asked, watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ident_service.service.news._PAGE", 7)
+    monkeypatch.setattr("ident_service.daemon.news._PAGE", 7)
     db = daemon.service.db
     for number in range(40):
         note(db, "me", "did", str(number))

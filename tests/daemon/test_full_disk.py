@@ -21,13 +21,13 @@ from daemon.conftest import Asked, checked_before, patient_text, serving
 from daemon.served import daemon_process
 
 from ident_service.cli import main
+from ident_service.daemon.jobs.reach import held_arm
 from ident_service.errors import ArmError, ArmFault, UsageError
 from ident_service.motion.control_file import ControlFile
-from ident_service.service.arm_state import control_path
-from ident_service.service.jobs.reach import held_arm
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.audit import note, trail
-from ident_service.service.registry.database import FILE, Database
+from ident_service.operations.arm_state import control_path
+from ident_service.registry import jobs as rows
+from ident_service.registry.audit import note, trail
+from ident_service.registry.database import FILE, Database
 
 
 @pytest.mark.slow
@@ -40,7 +40,7 @@ def test_the_end_of_a_job_waits_for_room(daemon: Asked, monkeypatch: pytest.Monk
         return ended(*arguments)
 
     monkeypatch.setattr(rows, "ended", without_room)
-    monkeypatch.setattr("ident_service.service.jobs.engine._AGAIN", 0.05)
+    monkeypatch.setattr("ident_service.daemon.jobs.queue._AGAIN", 0.05)
     assert daemon.get("/healthz").status_code == 200
     job = daemon.begin({"kind": "base", "arm": "planar2"})
     until = time.monotonic() + 60.0

@@ -26,14 +26,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ident_service.client import IdentClient
-from ident_service.service import deletion, uploads
-from ident_service.service.api.app import ROUTERS
-from ident_service.service.api.asking import while_known
-from ident_service.service.api.connections import ANSWER_SECONDS, HEADER_SECONDS, Connections
-from ident_service.service.news import LOOK
-from ident_service.service.registry import arms
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.tokens import add_token, revoke_token
+from ident_service.daemon import uploads
+from ident_service.daemon.app import ROUTERS
+from ident_service.daemon.connections import ANSWER_SECONDS, HEADER_SECONDS, Connections
+from ident_service.daemon.dependencies import while_known
+from ident_service.daemon.news import LOOK
+from ident_service.operations import deletion
+from ident_service.registry import arms
+from ident_service.registry.database import Database
+from ident_service.registry.tokens import add_token, revoke_token
 
 
 def test_one_address_leaves_places_for_its_own_stops() -> None:

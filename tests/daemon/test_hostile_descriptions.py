@@ -9,9 +9,9 @@ import pytest
 from daemon.conftest import Asked
 from daemon.served import daemon_process
 
+from ident_service.daemon.routes.checks import MOST_CHECKS
 from ident_service.errors import ConfigError
-from ident_service.service.api.checks import MOST_CHECKS
-from ident_service.service.registry.arms import add_arm
+from ident_service.registry.arms import add_arm
 
 ARM = "format: ident-arm\nversion: 1\nname: spy\nkinematics: {{{kind}: arm.xml}}\n"
 INERTIAL = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'

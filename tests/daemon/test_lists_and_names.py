@@ -12,10 +12,10 @@ import pytest
 from daemon.conftest import Asked, quick_text
 from daemon.test_doors_shut import refusal
 
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.audit import note, trail
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.tokens import add_token
+from ident_service.registry import jobs as rows
+from ident_service.registry.audit import note, trail
+from ident_service.registry.database import Database
+from ident_service.registry.tokens import add_token
 
 COUNT = 12
 

@@ -9,10 +9,10 @@ import pytest
 from daemon.conftest import Asked
 from prometheus_client.parser import text_string_to_metric_families
 
+from ident_service.daemon.jobs.outcome import lateness_of
+from ident_service.daemon.jobs.requests import Run
+from ident_service.daemon.metrics import Metrics
 from ident_service.motion.histogram import Histogram
-from ident_service.service.jobs.asked import Run
-from ident_service.service.jobs.outcome import lateness_of
-from ident_service.service.metrics import Metrics
 
 
 def figures(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:

@@ -20,7 +20,7 @@ from daemon.served import daemon_process, started
 from daemon.test_daemon_killed import ARM, begin, checked, excited
 
 from ident_service.motion.control_file import in_use
-from ident_service.service.arm_state import control_path
+from ident_service.operations.arm_state import control_path
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

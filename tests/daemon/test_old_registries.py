@@ -13,9 +13,9 @@ import pytest
 from daemon.conftest import serving
 
 from ident_service.config.shipped import shipped_arms
-from ident_service.service.registry.database import FILE, Database
-from ident_service.service.registry.migrations import MIGRATIONS
-from ident_service.service.registry.tokens import add_token
+from ident_service.registry.database import FILE, Database
+from ident_service.registry.migrations import MIGRATIONS
+from ident_service.registry.tokens import add_token
 
 SAMPLES = sorted((Path(__file__).parent / "old_registries").glob("*.sql"))
 RUN = "20261101T080000-bench2"

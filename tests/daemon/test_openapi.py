@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from ident_service.service.api.description import EXAMPLES
-from ident_service.service.api.doors import MOST_BODY
+from ident_service.daemon.openapi import EXAMPLES
+from ident_service.daemon.request_guard import MOST_BODY
 
 FAILURE = {"$ref": "#/components/schemas/Failure"}
 

@@ -17,14 +17,14 @@ from daemon.conftest import quick_text
 from daemon.served import daemon_process
 
 from ident_service.cli import main
+from ident_service.daemon.serve import serve
+from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.motion.control_file import ControlFile
-from ident_service.service.api.serve import serve
-from ident_service.service.api.settings import Settings
-from ident_service.service.arm_state import control_path
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.database import FILE, Database
-from ident_service.service.registry.tokens import add_token
+from ident_service.operations.arm_state import control_path
+from ident_service.registry.audit import trail
+from ident_service.registry.database import FILE, Database
+from ident_service.registry.tokens import add_token
 
 
 @pytest.fixture(autouse=True)

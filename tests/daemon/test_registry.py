@@ -11,21 +11,13 @@ from typing import Any
 
 import pytest
 
+from ident_service.daemon.jobs.outcome import Said, outcome
 from ident_service.errors import UnknownId, UsageError
-from ident_service.service.jobs.outcome import Said, outcome
-from ident_service.service.registry import jobs
-from ident_service.service.registry.audit import note, trail
-from ident_service.service.registry.database import FILE, Database
-from ident_service.service.registry.migrations import MIGRATIONS
-from ident_service.service.registry.tokens import (
-    TOKEN_FILE,
-    access,
-    add_token,
-    first_token,
-    read_token,
-    revoke_token,
-    tokens,
-)
+from ident_service.registry import jobs
+from ident_service.registry.audit import note, trail
+from ident_service.registry.database import FILE, Database
+from ident_service.registry.migrations import MIGRATIONS
+from ident_service.registry.tokens import TOKEN_FILE, access, add_token, first_token, read_token, revoke_token, tokens
 
 
 def test_a_database_is_migrated_step_by_step_and_keeps_what_it_had(tmp_path: Path) -> None:
@@ -107,8 +99,8 @@ def test_threads_do_not_lose_each_others_rows(tmp_path: Path) -> None:
 def test_what_was_written_survives_a_kill(tmp_path: Path) -> None:
     script = (
         "import os, sys; from pathlib import Path\n"
-        "from ident_service.service.registry.database import Database\n"
-        "from ident_service.service.registry.audit import note\n"
+        "from ident_service.registry.database import Database\n"
+        "from ident_service.registry.audit import note\n"
         "db = Database(Path(sys.argv[1]))\n"
         "note(db, 'me', 'written', 'x')\n"
         "with db.transaction():\n"

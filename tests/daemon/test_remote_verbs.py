@@ -28,7 +28,7 @@ from ident_service.cli.remote_words import lines_of
 from ident_service.cli.words import Parser
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError
-from ident_service.service.arm_state import fault_file
+from ident_service.operations.arm_state import fault_file
 
 RUN = "20260101T000000Z-quick"
 SINGULAR = "20260103T000000Z-quick"

@@ -19,12 +19,12 @@ from daemon.served import daemon_process
 
 from ident_service.cli import main
 from ident_service.client import IdentClient
+from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
+from ident_service.daemon.jobs.socket_activation import taken
+from ident_service.daemon.service_manager import tell_manager, watchdog_seconds
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.control_file import ControlFile
-from ident_service.service.api.notify import tell_manager, watchdog_seconds
-from ident_service.service.arm_state import control_path
-from ident_service.service.jobs.child import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
-from ident_service.service.jobs.door import taken
+from ident_service.operations.arm_state import control_path
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
@@ -208,7 +208,7 @@ def door(folder: Path, request: dict[str, Any], more: bytes = b"") -> tuple[int,
     ours, theirs = socket.socketpair()
     with ours, theirs:
         process = subprocess.Popen(
-            [sys.executable, "-m", "ident_service.service.jobs.door"],
+            [sys.executable, "-m", "ident_service.daemon.jobs.socket_activation"],
             stdin=theirs,
             stdout=theirs,
             stderr=subprocess.PIPE,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ident_service.service.api.connections import most_connections
+from ident_service.daemon.connections import most_connections
 
 UNITS = Path(__file__).parents[2] / "configs" / "systemd"
 NAMES = ("ident.service", "ident-motion.socket", "ident-motion@.service")

@@ -23,11 +23,11 @@ from helpers.forks import fork
 
 from ident_service.cli import main
 from ident_service.client import IdentClient
-from ident_service.record.open import open_recording
-from ident_service.service import uploads
-from ident_service.service.backup import back_up, restore
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.runs import index_run
+from ident_service.daemon import uploads
+from ident_service.operations.backup import back_up, restore
+from ident_service.recordings.open import open_recording
+from ident_service.registry.database import Database
+from ident_service.registry.runs import index_run
 
 COLUMNS = "columns:\n  t: {column: stamp, unit: ms}\n  q1: a\n  q2: b\n  tau1: {column: u, unit: mNm}\n  tau2: v\n"
 

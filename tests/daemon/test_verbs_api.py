@@ -11,13 +11,13 @@ from daemon.conftest import Asked, quick_text, serving
 from daemon.test_doors_shut import refusal
 from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, singular_copy, unstable_text, with_arms, with_run
 
-from ident_service.service.acceptance import accept
-from ident_service.service.api.doors import MOST_UPLOAD
-from ident_service.service.jobs.asked import BusScan, Zero
-from ident_service.service.jobs.commands import command
-from ident_service.service.registry.arms import known_arm, resources
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.tokens import add_token
+from ident_service.daemon.jobs.commands import command
+from ident_service.daemon.jobs.requests import BusScan, Zero
+from ident_service.daemon.request_guard import MOST_UPLOAD
+from ident_service.operations.acceptance import accept
+from ident_service.registry.arms import known_arm, resources
+from ident_service.registry.audit import trail
+from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -18,7 +18,7 @@ from ident_service.config.load import load_arm, load_recording_format
 from ident_service.config.recording import Column, RecordingFormat
 from ident_service.errors import ConfigError, ModelError, RecordingError
 from ident_service.model.arm_model import arm_model
-from ident_service.record.open import open_recording
+from ident_service.recordings.open import open_recording
 
 PLAIN: dict[str, Any] = {"t": "t", "q1": "q1", "tau1": "tau1"}
 

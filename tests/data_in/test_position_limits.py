@@ -11,7 +11,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig, Joint
 from ident_service.estimation.plausibility import reasons_in_recording, remarks_on_limits
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.record.quality import JointQuality, quality
+from ident_service.recordings.quality import JointQuality, quality
 
 PERIOD_NS = 5_000_000
 

@@ -14,13 +14,13 @@ from ident_service.config.quantities import TextFile
 from ident_service.config.recording import RecordingFormat
 from ident_service.model.arm_model import arm_model
 from ident_service.model.rigid_body import read_urdf
-from ident_service.record.csv_file import CsvRecording
-from ident_service.record.grid import grid
-from ident_service.record.kept import KeptRecording
-from ident_service.record.open import open_recording
-from ident_service.record.quality import Quality, quality
-from ident_service.record.recording import Recording
-from ident_service.record.segments import uniform
+from ident_service.recordings.csv_file import CsvRecording
+from ident_service.recordings.grid import grid
+from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.quality import Quality, quality
+from ident_service.recordings.recording import Recording
+from ident_service.recordings.segments import uniform
 
 RECORDINGS = [
     ("kuka_lwr4", "kuka_lwr4/recording_1.csv.gz"),

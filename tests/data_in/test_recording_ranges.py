@@ -17,15 +17,15 @@ from ident_service.client import IdentClient
 from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import ArmConfig
+from ident_service.daemon.jobs.commands import range_words
+from ident_service.daemon.jobs.requests import RecordingOf
 from ident_service.errors import RecordingError, UsageError
 from ident_service.model.arm_model import arm_model
-from ident_service.record.files import split_range
-from ident_service.record.open import open_recording
-from ident_service.record.part import RangeRecording, overlap, without_standstill
-from ident_service.service.identification import Request, identify_files
-from ident_service.service.jobs.asked import RecordingOf
-from ident_service.service.jobs.commands import range_words
-from ident_service.service.recordings import file_and_range, open_for, own_formats
+from ident_service.operations.identification import Request, identify_files
+from ident_service.operations.recordings import file_and_range, open_for, own_formats
+from ident_service.recordings.files import split_range
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.part import RangeRecording, overlap, without_standstill
 
 PERIOD = 0.005
 EDGES = 200  # rows at both ends that are not used, 0.5 s each

@@ -18,7 +18,7 @@ from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.fit import Fit, prepare, unconstrained
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import BaseParameters, base_parameters
-from ident_service.service.score import true_parameters
+from ident_service.operations.score import true_parameters
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RATE = 100.0

@@ -97,11 +97,11 @@ def relative(faults: Sequence[dict[str, Any]] = ()) -> Bench:
 
 def canopen(faults: Sequence[dict[str, Any]] = (), config: ArmConfig | None = None) -> Bench:
     """Two emulated drives; opening takes cycles too, so that faults are counted from the end of enabling here."""
-    from drivers.canopen.arm import CanopenArm
+    from drivers.canopen.driver import CanopenArm
     from ident_service.config.simulation import SimulatedFault
+    from sim_backend.emulator.faults import configured
+    from sim_backend.emulator.lock_step import LockStepArm
     from sim_backend.machine import Truth
-    from sim_backend.pucks.faults import configured
-    from sim_backend.pucks.lock_step import LockStepArm
 
     config = config or canopen_config()
     behind = LockStepArm(config)

@@ -8,7 +8,7 @@ from contract_bench import BACKENDS, PERIOD_NS, canopen, relative_config
 from helpers.forks import fork_plants
 
 from drivers.arm import StopKind
-from drivers.status import TRIPPED, AxisStatus
+from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.errors import DriverError, PositionUnknown
 
 LIMIT = np.array([10.0, 5.0])

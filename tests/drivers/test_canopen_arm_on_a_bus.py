@@ -6,9 +6,9 @@ import threading
 
 from contract_bench import canopen_config
 
-from drivers.canopen.arm import CanopenArm
-from drivers.status import AxisStatus
-from sim_backend.pucks.process import emulate
+from drivers.axis_status import AxisStatus
+from drivers.canopen.driver import CanopenArm
+from sim_backend.emulator.process import emulate
 
 
 def test_drives_are_configured_enabled_and_left_over_a_bus_that_filters_frames() -> None:

@@ -10,19 +10,19 @@ import pytest
 from contract_bench import canopen_config
 
 from drivers.arm import Arm, StopKind
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link
-from drivers.canopen.looking import RATE, SHARE, look_rate
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
+from drivers.canopen.bus_monitor import RATE, SHARE, look_rate
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedFault
 from ident_service.errors import DriverError
 from ident_service.motion.watch import Watched, watch
-from ident_service.service.preflight import watch_document, watch_text
-from sim_backend.pucks.faults import configured
-from sim_backend.pucks.lock_step import LockStepArm
+from ident_service.operations.preflight import watch_document, watch_text
+from sim_backend.emulator.faults import configured
+from sim_backend.emulator.lock_step import LockStepArm
 
 MS = 1_000_000
 

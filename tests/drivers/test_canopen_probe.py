@@ -14,18 +14,18 @@ import yaml
 from helpers.emulated_arms import weightless_config
 from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of, sheet
 
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
 from drivers.canopen.families import family_of, shipped_families
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
 from ident_service.config.family import family_from
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import ConfigError, DriverError, UsageError
-from ident_service.service.bus_probe import Probe, bus_probe, probe_document, probe_text
-from sim_backend.canopen.drive import CanopenDrive
-from sim_backend.pucks.process import emulate
+from ident_service.operations.bus_probe import Probe, bus_probe, probe_document, probe_text
+from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.emulator.process import emulate
 
 needs_sheets = pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
 

@@ -16,15 +16,15 @@ from contract_bench import canopen_config
 from test_canopen_looking import Bench, Tap
 
 from drivers.arm import StopKind
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link
-from drivers.canopen.scan import NODES
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link
+from drivers.canopen.bus_scan import NODES
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, UsageError
-from ident_service.service.bus_scan import Match, Scan, bus_scan, scan_document, scan_text
-from sim_backend.pucks.process import emulate
+from ident_service.operations.bus_scan import Match, Scan, bus_scan, scan_document, scan_text
+from sim_backend.emulator.process import emulate
 
 MS = 1_000_000
 DRIVE = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0, "max_torque": 5.0}

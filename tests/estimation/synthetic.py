@@ -14,7 +14,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
-from ident_service.record.recording import Block
+from ident_service.recordings.recording import Block
 
 Array = np.ndarray
 

@@ -14,8 +14,8 @@ from ident_service.errors import RecordingError
 from ident_service.estimation import smoothing
 from ident_service.estimation.equations import kept_motion
 from ident_service.estimation.smoothing import Motion, smoothed
-from ident_service.record.kept import KeptRecording
-from ident_service.record.part import RangeRecording
+from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.part import RangeRecording
 
 RATE = 200.0
 

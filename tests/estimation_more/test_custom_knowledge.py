@@ -28,12 +28,12 @@ from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.estimation.second_opinion import second_opinion
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import base_parameters
-from ident_service.record.open import open_recording
+from ident_service.operations.identification import Request, identify_files
+from ident_service.recordings.open import open_recording
 from ident_service.results.evidence.making import gather_evidence
 from ident_service.results.parameter_file import ParameterFile, convex_document
 from ident_service.results.report.reservations import reservations
 from ident_service.results.summary import summary
-from ident_service.service.identification import Request, identify_files
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "extending.md"
 RATE = 250.0

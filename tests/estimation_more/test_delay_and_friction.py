@@ -15,7 +15,6 @@ from ident_service.config.schema import FrictionShape, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.choices import clearly_chosen
 from ident_service.estimation.delay import Delay, estimate_delay, with_delay
-from ident_service.estimation.direction import direction
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.fit import prepare, unconstrained
@@ -25,6 +24,7 @@ from ident_service.estimation.least_squares import torque_error, weighted_least_
 from ident_service.estimation.shape_doubt import shape_covariance
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.coulomb_direction import direction
 from ident_service.model.layout import NO_STRIBECK, Layout
 from ident_service.model.regressor import joint_regressor
 

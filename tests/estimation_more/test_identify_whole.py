@@ -18,8 +18,8 @@ from ident_service.config.schema import PriorPull
 from ident_service.errors import UsageError
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.operations.identification import Identified, Request, identify_files
 from ident_service.results.parameter_file import read_parameters
-from ident_service.service.identification import Identified, Request, identify_files
 
 RATE = 250.0
 

@@ -13,10 +13,10 @@ from helpers.random_arms import model_around, random_delta
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation.direction import direction
 from ident_service.estimation.identify import identify
 from ident_service.estimation.periodic import averaged
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.coulomb_direction import direction
 
 RATE, PERIOD = 200.0, 5.0
 LENGTH = round(RATE * PERIOD)

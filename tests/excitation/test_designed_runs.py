@@ -17,7 +17,7 @@ from ident_service.excitation.search import Budget
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
 from ident_service.motion.states import State
-from ident_service.service.commission import record_motion
+from ident_service.operations.commission import record_motion
 
 
 def assert_runs(arm: ArmConfig, motion: Excitation, folder: Path) -> None:

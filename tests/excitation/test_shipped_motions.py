@@ -12,7 +12,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import MotionRefused
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.service.commission import require_clear_from_home
+from ident_service.operations.commission import require_clear_from_home
 
 SIMULATED = [name for name in shipped_arms() if isinstance(load_arm(name).driver, SimulatedDriver)]
 

@@ -15,8 +15,8 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.motion.factory import make_arm
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.states import State
-from ident_service.record.open import open_recording
-from ident_service.record.recorder_process import RecorderProcess
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.recorder_process import RecorderProcess
 
 
 def recorded(model: ArmModel, purpose: str, path: Path) -> RunReport:

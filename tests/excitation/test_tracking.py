@@ -30,9 +30,9 @@ from ident_service.excitation.tracking import cases, track, way_width
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight.stability import stability
 from ident_service.motion.run import run
 from ident_service.motion.states import State
+from ident_service.preflight.stability import stability
 
 SLOW = {"control": {"rate": 250.0}}
 

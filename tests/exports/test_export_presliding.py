@@ -16,8 +16,8 @@ from exports.export_bench import assert_same, compiler, identified, some_delta, 
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
-from ident_service.estimation.direction import direction as directions
 from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.coulomb_direction import direction as directions
 from ident_service.model.dynamic_model import DynamicModel
 from ident_service.model.regressor import joint_regressor
 from ident_service.results import load_model

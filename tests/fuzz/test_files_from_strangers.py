@@ -36,12 +36,12 @@ from ident_service.excitation.plan import excitation
 from ident_service.model import mechanism
 from ident_service.model.arm_model import arm_model
 from ident_service.model.mechanism import Kind, read_mechanism
-from ident_service.record.cycle import Cycle
-from ident_service.record.open import open_recording
-from ident_service.record.writer import RecordingWriter
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.writer import RecordingWriter
 from ident_service.results import parameter_file
 from ident_service.results.parameter_file import read_parameters
-from sim_backend.canopen.objects import Objects
+from sim_backend.canopen_device.objects import Objects
 
 SECONDS, MEMORY = 2.0, 500 * 2**20
 NUMBERS = ("0", "-1", "1e308", "-1e-308", "nan", ".inf", "9" * 30, "1e999", "0x7fffffff", "true", "", "2 pi", "90 deg")

@@ -13,10 +13,10 @@ from ident_service.estimation.identify import identify
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
-from ident_service.record.open import open_recording
-from ident_service.record.recording import Recording
+from ident_service.operations.commission import record_motion
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.recording import Recording
 from ident_service.results.run_folder import write_manifest, write_results
-from ident_service.service.commission import record_motion
 
 COARSE = 250.0  # Hz
 

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from drivers.canopen.bus_errors import BusError
-from drivers.canopen.frame import Frame
-from drivers.canopen.profile import SYNC
+from drivers.can.bus_errors import BusError
+from drivers.can.can_frame import Frame
+from drivers.canopen.pdo_mapping import SYNC
 from drivers.clock import Clock
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.schema import ArmConfig
-from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
+from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 
 EDS = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text(encoding="utf-8")
 

@@ -8,9 +8,9 @@ from typing import Any
 
 from helpers.emulated_arms import Tapped, tapped, weightless_config
 
-from drivers.canopen.arm import CanopenArm
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.schema import ArmConfig
-from sim_backend.pucks.lock_step import LockStepArm
+from sim_backend.emulator.lock_step import LockStepArm
 
 SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
 # File, watchdog that the drive has, mode of operation, N m of a thousand counts where it is not the rated torque.

@@ -9,11 +9,11 @@ from ident_service.config.schema import ArmConfig
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight.check import Verdict
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.motion.preflight.ticket import VALID, Ticket
-from ident_service.service.arm_state import ticket_path
-from ident_service.service.preflight import write_ticket
+from ident_service.motion.preflight_check import Verdict
+from ident_service.motion.ticket import VALID, Ticket
+from ident_service.operations.arm_state import ticket_path
+from ident_service.operations.preflight import write_ticket
+from ident_service.preflight.preflight import preflight
 
 _MADE: dict[str, Ticket] = {}
 

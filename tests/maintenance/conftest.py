@@ -12,9 +12,9 @@ from daemon.conftest import commissioned as commissioned
 from daemon.conftest import quick_text
 from daemon.conftest import state as state
 
-from ident_service.service.acceptance import accept
-from ident_service.service.registry.arms import add_arm
-from ident_service.service.registry.database import Database
+from ident_service.operations.acceptance import accept
+from ident_service.registry.arms import add_arm
+from ident_service.registry.database import Database
 
 ARM = "quick"
 MONDAY = 1_767_571_200.0  # 2026-01-05 00:00:00 UTC

@@ -11,8 +11,8 @@ from typing import Any
 from maintenance.conftest import ARM, description
 
 from ident_service.cli import main
-from ident_service.service.maintenance.alarms import alarms
-from ident_service.service.registry.database import Database, Row
+from ident_service.operations.drift_alarms import alarms
+from ident_service.registry.database import Database, Row
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from maintenance.conftest import ARM
 from maintenance.drifting import reidentified
 
 from ident_service.cli import main
+from ident_service.operations.arm_state import fault_file
+from ident_service.operations.drift_alarms import alarms
+from ident_service.operations.maintenance_schedule import When, add_schedule, dues
+from ident_service.registry.audit import trail
+from ident_service.registry.database import Database
 from ident_service.results.manifest import verified_files
-from ident_service.service.arm_state import fault_file
-from ident_service.service.maintenance.alarms import alarms
-from ident_service.service.maintenance.schedules import When, add_schedule, dues
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.database import Database
 
 DRIER = 1.3
 SEEDS = 20

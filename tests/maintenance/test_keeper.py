@@ -11,22 +11,29 @@ import pytest
 from maintenance.conftest import ARM, MONDAY, Clock, description
 
 from ident_service.config.load import load_arm
+from ident_service.daemon.jobs.commands import JOBS
+from ident_service.daemon.jobs.outcome import outcome, said
+from ident_service.daemon.jobs.queue import Engine
+from ident_service.daemon.jobs.recovery import explain_interrupted, mark_interrupted
+from ident_service.daemon.jobs.requests import Check, Run
+from ident_service.daemon.maintenance.reidentification import Wanted, reidentifications
+from ident_service.daemon.maintenance.scheduler import Keeper
+from ident_service.daemon.maintenance.webhook import deliveries
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.service.acceptance import accepted_set, rollback
-from ident_service.service.arm_state import fault_file
-from ident_service.service.jobs.asked import Check, Run
-from ident_service.service.jobs.commands import JOBS
-from ident_service.service.jobs.engine import Engine
-from ident_service.service.jobs.outcome import outcome, said
-from ident_service.service.jobs.recovery import explain_interrupted, mark_interrupted
-from ident_service.service.maintenance.keeper import Keeper
-from ident_service.service.maintenance.reidentification import Wanted, reidentifications
-from ident_service.service.maintenance.schedules import When, add_event, add_schedule, dues, enable_schedule, schedules
-from ident_service.service.maintenance.webhook import deliveries
-from ident_service.service.registry import jobs
-from ident_service.service.registry.arms import add_arm
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.database import Database, Row
+from ident_service.operations.acceptance import accepted_set, rollback
+from ident_service.operations.arm_state import fault_file
+from ident_service.operations.maintenance_schedule import (
+    When,
+    add_event,
+    add_schedule,
+    dues,
+    enable_schedule,
+    schedules,
+)
+from ident_service.registry import jobs
+from ident_service.registry.arms import add_arm
+from ident_service.registry.audit import trail
+from ident_service.registry.database import Database, Row
 
 HOUR = 3600.0
 pytestmark = pytest.mark.slow  # one commissioning for all of them
@@ -229,8 +236,8 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
     # The run that a process would have left: the accepted one's recording.
     folder = scene.state / "runs" / accepted
     (folder / "identification.mcap").rename(folder / "run.mcap")
+    from ident_service.registry.runs import index_run
     from ident_service.results.manifest import write_manifest
-    from ident_service.service.registry.runs import index_run
 
     write_manifest(folder)
     index_run(scene.db, scene.state, accepted)
@@ -278,8 +285,8 @@ def test_an_accepted_set_that_was_changed_on_the_disk_is_compared_with_nothing(s
 
 
 def test_what_is_rolled_back_to_is_the_same_to_the_last_bit(scene: Scene, accepted: str) -> None:
+    from ident_service.operations.acceptance import accept
     from ident_service.results.manifest import write_manifest
-    from ident_service.service.acceptance import accept
 
     current = scene.state / "arms" / ARM / "current"
     before = {path.name: path.read_bytes() for path in current.iterdir()}

@@ -8,8 +8,8 @@ import pytest
 from maintenance.conftest import ARM, MONDAY, Clock
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.service.maintenance.alarms import acknowledge_alarm, alarms, raise_alarm
-from ident_service.service.maintenance.schedules import (
+from ident_service.operations.drift_alarms import acknowledge_alarm, alarms, raise_alarm
+from ident_service.operations.maintenance_schedule import (
     When,
     add_event,
     add_schedule,
@@ -22,10 +22,10 @@ from ident_service.service.maintenance.schedules import (
     remove_schedule,
     schedules,
 )
-from ident_service.service.registry.arms import add_arm
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.database import Database
-from ident_service.service.registry.runs import _driven
+from ident_service.registry.arms import add_arm
+from ident_service.registry.audit import trail
+from ident_service.registry.database import Database
+from ident_service.registry.runs import _driven
 
 HOUR, DAY = 3600.0, 86400.0
 

@@ -30,8 +30,8 @@ from ident_service.motion.controls import Switches
 from ident_service.motion.latch import Latch
 from ident_service.motion.run import Sink, run
 from ident_service.motion.states import State
-from ident_service.record.cycle import Cycle
-from ident_service.record.writer import RecordingWriter
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.writer import RecordingWriter
 from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault, FaultKind
 

@@ -15,16 +15,16 @@ from helpers.emulated_arms import EDS, Tapped, tapped
 from motion_bench import JOINTS, TRUTH, WatchedArm, bench_config
 
 from drivers.arm import Sample
-from drivers.canopen.arm import CanopenArm
-from drivers.canopen.frame import Frame
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.limits import motion_limits
 from ident_service.config.schema import ArmConfig
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.checks import MAX_AGE
+from sim_backend.emulator.faults import PUCK_FAULTS, PuckFault
+from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth
-from sim_backend.pucks.faults import PUCK_FAULTS, PuckFault
-from sim_backend.pucks.lock_step import LockStepArm
 
 PERIOD = 1e-3
 # Sent by somebody else; a torque frame, a control word and an NMT command are those that would do harm.

@@ -38,9 +38,9 @@ from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Reac
 from ident_service.motion.loop import REST_CYCLES
 from ident_service.motion.lowering import RESTING, SPEED
 from ident_service.motion.run import run
-from ident_service.record.cycle import Cycle
-from ident_service.record.open import open_recording
-from ident_service.record.writer import RecordingWriter
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.writer import RecordingWriter
 from sim_backend.faults import Fault
 
 

@@ -14,7 +14,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.record.cycle import Cycle
+from ident_service.recordings.cycle import Cycle
 from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault
 

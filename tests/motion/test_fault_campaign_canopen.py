@@ -22,8 +22,8 @@ from test_fault_campaign import STATES
 
 from ident_service.motion.faults import FAULTS
 from ident_service.motion.states import State
-from sim_backend.pucks.faults import PUCK_FAULTS
-from sim_backend.pucks.motor import Power
+from sim_backend.emulator.faults import PUCK_FAULTS
+from sim_backend.emulator.motor import Power
 
 SEED = 11
 DRIVES = {"bench canopen": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}

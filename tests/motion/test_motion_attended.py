@@ -19,8 +19,8 @@ from ident_service.errors import DriverError
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.attended import attended
-from ident_service.motion.preflight import plan
 from ident_service.motion.realtime import asked
+from ident_service.preflight import static_checks as plan
 
 
 class Looked:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from drivers.arm import Sample
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from ident_service.motion.checks import (
     FROZEN_CYCLES,
     FROZEN_EFFORT,

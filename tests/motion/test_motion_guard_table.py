@@ -11,7 +11,7 @@ from guard_bench import HOME, LIMITS, LOWER, NAMES, OFF, PERIOD, QUICK, STOP, WA
 from motion_bench import bench_model
 
 from drivers.arm import StopKind
-from drivers.status import AxisEventCode, AxisStatus
+from drivers.axis_status import AxisEventCode, AxisStatus
 from ident_service.model.contact import Contact
 from ident_service.motion.checks import (
     ENVELOPE,

@@ -11,7 +11,7 @@ import pytest
 from guard_bench import HOME, LIMITS, NAMES, PERIOD, STILL, WINDOW, Bench, is_fault, unit
 from motion_bench import bench_model
 
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from ident_service.config.limits import Vector
 from ident_service.model.contact import Contact
 from ident_service.model.rigid_body import InverseDynamics

@@ -12,7 +12,7 @@ from motion_bench import LOOKED
 from run_bench import HOME, LIMITS, MIDWAY, PERIOD, Bench
 
 from drivers.arm import Sample, StopKind
-from drivers.status import AxisEvent, AxisEventCode
+from drivers.axis_status import AxisEvent, AxisEventCode
 from ident_service.errors import DriverError, MotionRefused
 from ident_service.motion.control import ComputedTorque
 from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from guard_bench import HOME, LIMITS, Bench, is_fault, unit
 
-from drivers.status import AxisEvent, AxisEventCode, AxisStatus
+from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from ident_service.motion.checks import VELOCITY_OFF
 from ident_service.motion.faults import FAULTS, Reaction
 

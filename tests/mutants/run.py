@@ -69,7 +69,7 @@ GROUPS = {
     "verifier": Group(
         {
             "ident_service/certificate_verifier.py": 125,
-            "ident_service/service/verify.py": 3,
+            "ident_service/operations/verify.py": 3,
         },
         (
             "tests/certificate/test_verifier_by_hand.py",

@@ -16,9 +16,9 @@ from daemon.conftest import LEASES
 from helpers.browser import chromium_program
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from ident_service.service.api.app import create_app
-from ident_service.service.api.asking import Service
-from ident_service.service.api.settings import Settings
+from ident_service.daemon.app import create_app
+from ident_service.daemon.dependencies import Service
+from ident_service.daemon.settings import Settings
 
 
 @dataclass(frozen=True)

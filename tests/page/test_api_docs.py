@@ -10,7 +10,7 @@ import pytest
 from page.conftest import Reached
 from playwright.sync_api import Browser, ConsoleMessage, Request, expect
 
-VENDORED = files("ident_service.service.pages").joinpath("vendored")
+VENDORED = files("ident_service.daemon.web").joinpath("vendored")
 
 
 def test_the_viewer_is_what_its_document_says() -> None:

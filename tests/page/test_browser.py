@@ -17,11 +17,11 @@ from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 
 from ident_service.motion.control_file import in_use
-from ident_service.service.arm_state import control_path
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.arms import add_arm
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.tokens import add_token
+from ident_service.operations.arm_state import control_path
+from ident_service.registry import jobs as rows
+from ident_service.registry.arms import add_arm
+from ident_service.registry.audit import trail
+from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 ARM = "quick"

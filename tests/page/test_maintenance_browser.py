@@ -14,15 +14,15 @@ from maintenance.conftest import db as db
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, Page, expect
 
+from ident_service.daemon.maintenance.reidentification import reidentifications
 from ident_service.motion.control_file import in_use
-from ident_service.service.arm_state import control_path
-from ident_service.service.maintenance.alarms import alarms
-from ident_service.service.maintenance.reidentification import reidentifications
-from ident_service.service.maintenance.schedules import dues
-from ident_service.service.registry import jobs as rows
-from ident_service.service.registry.arms import add_arm
-from ident_service.service.registry.audit import trail
-from ident_service.service.registry.tokens import add_token
+from ident_service.operations.arm_state import control_path
+from ident_service.operations.drift_alarms import alarms
+from ident_service.operations.maintenance_schedule import dues
+from ident_service.registry import jobs as rows
+from ident_service.registry.arms import add_arm
+from ident_service.registry.audit import trail
+from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 ELBOW = "friction of joint elbow"

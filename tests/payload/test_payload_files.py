@@ -16,11 +16,11 @@ from helpers.changed_arms import COARSE, changed, identified_folder, recorded_ar
 from helpers.once import made_once
 
 from ident_service.certificate_verifier import verify
-from ident_service.record.cycle import Cycle
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.writer import RecordingWriter
+from ident_service.operations.verify import verify_file
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.writer import RecordingWriter
 from ident_service.results.run_folder import read_results
-from ident_service.service.verify import verify_file
 
 pytestmark = pytest.mark.slow
 

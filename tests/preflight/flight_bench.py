@@ -17,9 +17,9 @@ from ident_service.errors import DriverError
 from ident_service.excitation.excitation import Excitation
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.motion.preflight.check import Check, Verdict
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.motion.preflight.ticket import Ticket
+from ident_service.motion.preflight_check import Check, Verdict
+from ident_service.motion.ticket import Ticket
+from ident_service.preflight.preflight import preflight
 from sim_backend.arm import SimulatedArm, from_config
 from sim_backend.faults import Fault
 

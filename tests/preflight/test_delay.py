@@ -9,10 +9,10 @@ import pytest
 from flight_bench import Flight, check_of, flight_config
 
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight.check import Verdict, judged
-from ident_service.motion.preflight.delay import FREQUENCY, MOST, Delay, delay_measures, delay_of
-from ident_service.motion.preflight.look import loop_rate_check
-from ident_service.motion.preflight.session import Trace
+from ident_service.motion.preflight_check import Verdict, judged
+from ident_service.preflight.delay import FREQUENCY, MOST, Delay, delay_measures, delay_of
+from ident_service.preflight.passive_checks import loop_rate_check
+from ident_service.preflight.session import Trace
 from sim_backend.faults import Fault, FaultKind
 
 PERIOD = 2e-3

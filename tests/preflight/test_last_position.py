@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from canopen_run.canopen_run_bench import canopen, described, write
 
-from drivers.canopen.arm import CanopenArm
+from drivers.canopen.driver import CanopenArm
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion import last_position
 from ident_service.motion.last_position import FILE, LastPosition, PositionFile, turned
-from ident_service.motion.preflight.check import Check, Verdict
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.service.zeroing import take_home
-from sim_backend.pucks.faults import parse_fault
-from sim_backend.pucks.lock_step import LockStepArm
+from ident_service.motion.preflight_check import Check, Verdict
+from ident_service.operations.zeroing import take_home
+from ident_service.preflight.preflight import preflight
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm
 
 WHEN = datetime(2026, 5, 4, 3, 2, tzinfo=UTC)
 

@@ -12,10 +12,10 @@ from flight_bench import Flight, Flown, check_of, verdicts
 from drivers.arm import Arm
 from ident_service.errors import DriverError
 from ident_service.excitation.excitation import Excitation
-from ident_service.motion.preflight.check import Verdict
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.motion.preflight.ticket import Ticket
+from ident_service.motion.preflight_check import Verdict
 from ident_service.motion.stoppable import StoppableArm
+from ident_service.motion.ticket import Ticket
+from ident_service.preflight.preflight import preflight
 
 
 def bus_goes(flight: Flight, after: int) -> Arm:

@@ -18,12 +18,12 @@ from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.rigid_body import InverseDynamics
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight.check import CODES, Verdict
-from ident_service.motion.preflight.direction import LEAST_ANSWER
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.motion.preflight.session import trace_of
-from ident_service.motion.preflight.ticket import Ticket
+from ident_service.motion.preflight_check import CODES, Verdict
 from ident_service.motion.reference import Setpoint
+from ident_service.motion.ticket import Ticket
+from ident_service.preflight.direction import LEAST_ANSWER
+from ident_service.preflight.preflight import preflight
+from ident_service.preflight.session import trace_of
 
 
 def test_a_good_arm_passes_all_that_virtual_time_can_tell(good: Flown) -> None:

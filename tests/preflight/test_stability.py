@@ -17,7 +17,7 @@ from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.preflight.stability import Loop, spectral_radius, stability
+from ident_service.preflight.stability import Loop, spectral_radius, stability
 
 Array = np.ndarray
 NO_FILTER = 1e9  # Hz: the low-pass passes everything

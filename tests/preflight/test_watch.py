@@ -13,7 +13,7 @@ from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.clock import VirtualClock
 from ident_service.errors import DriverError, UsageError
 from ident_service.motion.watch import watch
-from ident_service.service.preflight import watch_document, watch_text
+from ident_service.operations.preflight import watch_document, watch_text
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 

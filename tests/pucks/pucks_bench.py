@@ -7,12 +7,12 @@ from pathlib import Path
 
 import yaml
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import Link, open_links
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import Link, open_links
 from ident_service.config.load import load_arm
 from ident_service.config.schema import ArmConfig
+from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 from sim_backend.machine import Truth
-from sim_backend.pucks.lock_step import LockStepArm, LockStepLink
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 EDS = CONFIGS / "puck.eds"

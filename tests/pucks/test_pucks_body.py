@@ -15,10 +15,10 @@ from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend.build import build_machine
-from sim_backend.pucks.body import Body
-from sim_backend.pucks.build import build_emulator
-from sim_backend.pucks.gears import Gears
-from sim_backend.pucks.motor import Power
+from sim_backend.emulator.body import Body
+from sim_backend.emulator.build import build_emulator
+from sim_backend.emulator.gears import Gears
+from sim_backend.emulator.motor import Power
 
 WAM = Transmission(
     ratios=(-42.0, 28.25, -28.25, -18.0, 9.7, 9.7, -14.93),

@@ -10,11 +10,11 @@ import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 from pucks_bench import EDS
 
-from drivers.canopen.frame import Frame
+from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
-from sim_backend.canopen.drive import CanopenDrive
-from sim_backend.canopen.objects import Objects
-from sim_backend.pucks.motor import Motor
+from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.canopen_device.objects import Objects
+from sim_backend.emulator.motor import Motor
 
 NODE = 5
 # FIELDBUS.md 2.5, with the data types of CiA 301 and 402.

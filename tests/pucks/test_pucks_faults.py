@@ -13,8 +13,8 @@ from pucks_bench import MS, Host, pucks_config
 
 from ident_service.config.simulation import FAULT_RULES, FaultKind
 from ident_service.errors import DriverError
-from sim_backend.pucks.faults import _NO_COUNTERPART, PUCK_FAULTS, PuckFault, parse_fault
-from sim_backend.pucks.motor import Power
+from sim_backend.emulator.faults import _NO_COUNTERPART, PUCK_FAULTS, PuckFault, parse_fault
+from sim_backend.emulator.motor import Power
 
 NAMES = ("shoulder", "elbow")
 PER_RADIAN = 4096 / (2 * math.pi)

@@ -13,7 +13,7 @@ import pytest
 from canopen.profiles.p402 import BaseNode402
 from pucks_bench import EDS, pucks_config
 
-from sim_backend.pucks.process import Emulated, emulate
+from sim_backend.emulator.process import Emulated, emulate
 
 CHANNEL = "pucks-foreign"
 
@@ -142,9 +142,9 @@ def test_an_unknown_interface_is_said_so(tmp_path: Path) -> None:
 
 def test_frames_are_of_the_kind_they_were_sent_as() -> None:
     """A bus that nobody listens on must not hinder the sender; python-can's virtual bus keeps kinds apart."""
-    from drivers.canopen.frame import Frame
+    from drivers.can.can_frame import Frame
     from ident_service.config.canopen import CanBus
-    from sim_backend.pucks.station import Station
+    from sim_backend.emulator.station import Station
 
     with can.Bus(interface="virtual", channel="pucks-kinds") as other:
         station = Station([CanBus(interface="virtual", channel="pucks-kinds")])

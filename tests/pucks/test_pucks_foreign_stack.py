@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from pucks_bench import EDS, GEARS, pucks_config
 
-from sim_backend.pucks.process import emulate
+from sim_backend.emulator.process import emulate
 
 STACK = Path(__file__).parents[1] / "foreign_stack"
 CHANNEL = "pucks-foreign-stack"

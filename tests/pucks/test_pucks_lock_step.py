@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from pucks_bench import MS, Host, pucks_config
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import open_links
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import open_links
 from drivers.clock import VirtualClock
 from ident_service.errors import DriverError
-from sim_backend.pucks.lock_step import standing
+from sim_backend.emulator.lock_step import standing
 
 TWO = [{"interface": "lock_step"}, {"interface": "lock_step"}]
 SPREAD = [{"node": 1, "bus": bus, "rated_torque": 1.0, "max_torque": 30.0, "max_speed": 6000.0} for bus in range(2)]
@@ -164,7 +164,7 @@ def test_interfaces_do_not_mix(tmp_path: Path) -> None:
 
 
 def test_a_bus_of_another_arm_cannot_be_joined(tmp_path: Path) -> None:
-    from sim_backend.pucks.lock_step import from_config
+    from sim_backend.emulator.lock_step import from_config
 
     with pytest.raises(DriverError, match="bus 1 was opened before bus 0"):
         from_config(pucks_config(tmp_path, buses=TWO, drives=SPREAD), 1)

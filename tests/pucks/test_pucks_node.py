@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pucks_bench import HOST, MS, Host, pucks_config
 
-from drivers.canopen.frame import Frame
-from drivers.canopen.link import open_links
+from drivers.can.can_frame import Frame
+from drivers.can.can_link import open_links
 
 
 def beat(host: Host) -> None:

@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 from pucks_bench import Host, pucks_config
 
-from drivers.canopen.frame import Frame
+from drivers.can.can_frame import Frame
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.eds import data_sheet
 from ident_service.config.load import with_sheets
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
-from sim_backend.canopen.drive import CanopenDrive
-from sim_backend.canopen.objects import Objects
-from sim_backend.canopen.personality import personality_of
-from sim_backend.pucks.lock_step import LockStepArm
-from sim_backend.pucks.motor import Motor
+from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.canopen_device.objects import Objects
+from sim_backend.canopen_device.personality import personality_of
+from sim_backend.emulator.lock_step import LockStepArm
+from sim_backend.emulator.motor import Motor
 
 SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
 FILES = sorted(SHEETS.glob("*.[ed][dc][sf]"))

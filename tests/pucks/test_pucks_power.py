@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pucks_bench import MS, Host, pucks_config
 
-from sim_backend.canopen.power import TRANSITIONS, Command, PowerState, command_of
-from sim_backend.pucks.faults import parse_fault
-from sim_backend.pucks.motor import Power
+from sim_backend.canopen_device.power import TRANSITIONS, Command, PowerState, command_of
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.motor import Power
 
 # How each state is reached from power-up, and the controlword of each command.
 WAYS = {0x40: (), 0x21: (0x06,), 0x23: (0x06, 0x07), 0x27: (0x06, 0x07, 0x0F), 0x07: (0x06, 0x07, 0x0F, 0x02)}

@@ -20,7 +20,7 @@ import yaml
 from pucks_bench import GEARS, pucks_config
 
 from ident_service.cli import USAGE, main
-from sim_backend.pucks.process import Emulated, emulate
+from sim_backend.emulator.process import Emulated, emulate
 
 PATIENCE = 20.0  # s, for a busy machine
 

@@ -10,7 +10,7 @@ import pytest
 from pucks_bench import CONFIGS, Host, pucks_config
 from test_pucks_body import WAM
 
-from drivers.canopen.link import open_links
+from drivers.can.can_link import open_links
 
 RATED = 0.1  # N m at the motor, so that a count is 0.1 mN m
 

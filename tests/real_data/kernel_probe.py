@@ -15,10 +15,10 @@ from threadpoolctl import threadpool_info
 
 from benchmarks.real_data import CASES, case_estimate, case_model
 from ident_service.config.load import load_arm
+from ident_service.estimation.certificate import certify
 from ident_service.estimation.identify import Estimate, identify
-from ident_service.estimation.proof.certificate import certify
 from ident_service.model.arm_model import arm_model
-from ident_service.record.open import open_recording
+from ident_service.recordings.open import open_recording
 
 
 def estimated(arm: str, recording: str | None) -> Estimate:

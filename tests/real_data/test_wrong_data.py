@@ -23,10 +23,10 @@ from ident_service.config.schema import ArmConfig, Identification
 from ident_service.errors import ConfigError, ModelError
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.record.open import open_recording
-from ident_service.record.recording import Block, Recording
-from ident_service.service.identification import unusable_because
-from ident_service.service.recordings import recording_quality
+from ident_service.operations.identification import unusable_because
+from ident_service.operations.recordings import recording_quality
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.recording import Block, Recording
 
 pytestmark = [pytest.mark.usefixtures("shared")]
 

@@ -14,12 +14,12 @@ import numpy as np
 from record_samples import read_all
 from ring_actors import JOINTS, command, record, store
 
-from ident_service.record import ring_memory
-from ident_service.record.cycle import Cycle
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.recorder_process import RecorderProcess
-from ident_service.record.ring import RingReader
-from ident_service.record.ring_sink import RingSink
+from ident_service.recordings import ring_memory
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.recorder_process import RecorderProcess
+from ident_service.recordings.ring import RingReader
+from ident_service.recordings.ring_sink import RingSink
 
 URDF = "<robot/>"
 WHAT = (JOINTS, URDF, 5, {"arm.yaml": bytes(range(256))}, {"run": "ä"})

@@ -14,9 +14,9 @@ from record_samples import read_all
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError, UsageError
-from ident_service.record import csv_file
-from ident_service.record.csv_file import CsvRecording
-from ident_service.record.open import open_recording
+from ident_service.recordings import csv_file
+from ident_service.recordings.csv_file import CsvRecording
+from ident_service.recordings.open import open_recording
 
 HEADER = "t,q1,q2,tau1,tau2\n"
 NUMBER = st.floats(allow_nan=False, allow_infinity=False)

@@ -24,12 +24,12 @@ from record_samples import (
 )
 
 from ident_service.errors import RecordingError, UsageError
-from ident_service.record.cdr import JointStateEncoder
-from ident_service.record.cycle import Cycle
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.messages import DEFINITIONS, JOINT_STATE
-from ident_service.record.open import open_recording
-from ident_service.record.writer import RecordingWriter
+from ident_service.recordings.cdr import JointStateEncoder
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.messages import DEFINITIONS, JOINT_STATE
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 

@@ -18,11 +18,11 @@ from recorder_bench import URDF, WHAT, actor, await_stream, caught_up, check_pre
 from ring_actors import STEP_NS, holders, inode, record, store
 
 from ident_service.errors import RecordingError, UsageError
-from ident_service.record.cycle import Cycle
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.recorder_process import RecorderProcess
-from ident_service.record.ring_sink import RingSink
-from ident_service.record.writer import RecordingWriter
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.recorder_process import RecorderProcess
+from ident_service.recordings.ring_sink import RingSink
+from ident_service.recordings.writer import RecordingWriter
 
 
 @pytest.fixture(autouse=True)

@@ -9,10 +9,10 @@ import pytest
 from report.pages import parsed, sections
 
 from benchmarks.real_data import CASES, DATA, Case
+from ident_service.operations.identification import Request, identify_files
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.report_files import read_evidence_of
 from ident_service.results.run_folder import read_results
-from ident_service.service.identification import Request, identify_files
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

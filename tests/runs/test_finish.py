@@ -24,10 +24,10 @@ from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
 from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base import base_parameters
-from ident_service.record.mcap_file import McapRecording
-from ident_service.record.open import open_recording
-from ident_service.service.reaching import Reaching, least_seconds, require_target
-from ident_service.service.target_process import missed as not_known
+from ident_service.operations.reaching import Reaching, least_seconds, require_target
+from ident_service.operations.target_process import missed as not_known
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.open import open_recording
 
 PERIOD = 10.0  # s, of the shipped planar arm's motion
 SHARE = 0.06

@@ -10,15 +10,15 @@ import pytest
 import yaml
 
 from drivers.arm import StopKind
-from drivers.status import TRIPPED
+from drivers.axis_status import TRIPPED
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
 from ident_service.motion.factory import make_arm
-from ident_service.service.arm_state import fault_file
-from ident_service.service.recover import let_go, recover
-from sim_backend.pucks.faults import PuckFault
-from sim_backend.pucks.lock_step import LockStepArm, standing
+from ident_service.operations.arm_state import fault_file
+from ident_service.operations.recover import let_go, recover
+from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.lock_step import LockStepArm, standing
 
 
 @pytest.fixture

@@ -23,8 +23,8 @@ from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, ArmFault, MotionRefused
 from ident_service.motion.control_file import ControlFile, in_use
 from ident_service.motion.loop import LOWERS, WAITS
-from ident_service.service.arm_state import control_path, fault_file, ticket_path
-from ident_service.service.watching import Ending
+from ident_service.operations.arm_state import control_path, fault_file, ticket_path
+from ident_service.operations.watching import Ending
 
 Capture = pytest.CaptureFixture[str]
 
@@ -199,7 +199,7 @@ def test_a_state_that_cannot_be_written_is_found_before_anything_moves(
     words: list[str], arm: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "state" / "arms" / load_arm(arm).name
-    monkeypatch.setattr("ident_service.service.run.arm_folder", lambda *_: folder / "ticket.json" / "below")
+    monkeypatch.setattr("ident_service.operations.run.arm_folder", lambda *_: folder / "ticket.json" / "below")
     capsys.readouterr()
     assert main(words) == 2
     out, err = capsys.readouterr()

@@ -16,7 +16,7 @@ from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.errors import UsageError
 from ident_service.motion.factory import make_arm
-from ident_service.service.scale import FILE, check_scale
+from ident_service.operations.scale import FILE, check_scale
 
 CONFIG = load_arm("planar2")
 

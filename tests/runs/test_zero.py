@@ -19,14 +19,14 @@ from ident_service.errors import ConfigError, DriverError, MotionRefused, Positi
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.control_file import ControlFile
 from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight.check import Verdict
-from ident_service.motion.preflight.preflight import preflight
-from ident_service.motion.preflight.ticket import Ticket, subject_of
-from ident_service.service.arm_state import control_path, fault_file, ticket_path
-from ident_service.service.recover import recover
-from ident_service.service.zeroing import home_posture, take_home
-from sim_backend.pucks.faults import PuckFault
-from sim_backend.pucks.lock_step import LockStepArm, standing
+from ident_service.motion.preflight_check import Verdict
+from ident_service.motion.ticket import Ticket, subject_of
+from ident_service.operations.arm_state import control_path, fault_file, ticket_path
+from ident_service.operations.recover import recover
+from ident_service.operations.zeroing import home_posture, take_home
+from ident_service.preflight.preflight import preflight
+from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.lock_step import LockStepArm, standing
 
 HOME = np.array([0.3, -0.2])
 GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}

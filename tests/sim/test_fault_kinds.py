@@ -7,7 +7,7 @@ import pytest
 from sim_arms import arm_config
 
 from drivers.arm import StopKind
-from drivers.status import AxisStatus
+from drivers.axis_status import AxisStatus
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import DriverError
 from sim_backend.arm import from_config

@@ -16,8 +16,8 @@ from helpers.forks import fork_plants
 from remote_bench import listening, remote_config, wait_for
 
 from drivers.arm import StopKind
+from drivers.axis_status import AxisStatus
 from drivers.clock import RealClock, VirtualClock
-from drivers.status import AxisStatus
 from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import DriverError

@@ -6,7 +6,7 @@ import socket
 import struct
 import subprocess
 
-from drivers.canopen.frame import Frame
+from drivers.can.can_frame import Frame
 
 _KERNEL = struct.Struct("=IB3x8s")  # struct can_frame, once more and not the link's own
 EXTENDED, REMOTE, ERROR = 1 << 31, 1 << 30, 1 << 29

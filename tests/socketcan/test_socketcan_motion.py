@@ -26,8 +26,8 @@ from ident_service.excitation.plan import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.factory import make_arm
 from ident_service.motion.states import State
-from ident_service.record.open import open_recording
-from ident_service.service.commission import record_motion
+from ident_service.operations.commission import record_motion
+from ident_service.recordings.open import open_recording
 
 pytestmark = pytest.mark.timeout(900)
 PATIENCE = 300.0  # s, for a machine that emulates another one and has more to do

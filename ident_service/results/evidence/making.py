@@ -13,7 +13,7 @@ import numpy as np
 from ident_service.estimation.equations import Rows, equation_rows
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.model.threads import one_blas_thread
-from ident_service.record.recording import Recording
+from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.bodies import bounds_of, conditions_of, posed
 from ident_service.results.evidence.evidence import (
     Array,

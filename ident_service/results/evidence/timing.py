@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.record.cycles import Cycles, read_cycles
-from ident_service.record.part import RangeRecording
-from ident_service.record.recording import Recording
+from ident_service.recordings.cycles import Cycles, read_cycles
+from ident_service.recordings.part import RangeRecording
+from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.evidence import Array, Timing
 
 _BINS = 60

@@ -14,7 +14,7 @@ import numpy as np
 
 from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.record.quality import MUCH_JITTER
+from ident_service.recordings.quality import MUCH_JITTER
 from ident_service.results.drawing import number, plain
 from ident_service.results.drawing_style import sheet
 from ident_service.results.evidence.evidence import Evidence, Traced

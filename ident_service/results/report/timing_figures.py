@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident_service.record.quality import MUCH_JITTER
+from ident_service.recordings.quality import MUCH_JITTER
 from ident_service.results.drawing import Axes, Canvas, number
 from ident_service.results.drawing_chart import draw_frame
 from ident_service.results.evidence.evidence import Evidence, Timing

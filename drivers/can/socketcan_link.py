@@ -1,0 +1,197 @@
+"""Implement a Link on a CAN socket of the kernel (interface `raw`, Documentation/networking/can.rst).
+
+One system call a frame. Stamps are the kernel's, taken when the frame arrived, turned from wall-clock to monotonic time
+by their age. Frames that the kernel dropped are reported as an error frame of receive overflow.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import struct
+import time
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+
+from drivers.can.bus_errors import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
+from drivers.can.can_frame import Frame
+from drivers.can.kernel_frame import EXTENDED, FD_BYTES, from_kernel, to_kernel
+from drivers.can.kernel_interface import AF_CAN, CAN_RAW, check_interface
+from drivers.can.receive_filter import HEARD, MOST_AT_ONCE
+from drivers.can.sendable import check_sendable
+from drivers.clock import RealClock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+
+# Values of the kernel's headers; Python defines the CAN ones only where it was built with them.
+_SOL_CAN_RAW = 101
+_RAW_FILTER, _RAW_ERR_FILTER, _RAW_LOOPBACK, _RAW_RECV_OWN, _RAW_FD_FRAMES = 1, 2, 3, 4, 5
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
+_ALL_ERRORS = 0x1FFF_FFFF
+_RECEIVE_BUFFER = 1 << 20  # some hundred frames more than the default, while the loop does not read
+_TIMESPEC, _COUNT = struct.Struct("@ll"), struct.Struct("=I")
+_ANCILLARY = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_COUNT.size)
+_PLAUSIBLE_NS = 10_000_000_000  # a stamp older than this, or in the future, comes from a clock that was set
+
+
+def from_config(config: ArmConfig, bus_number: int) -> RawLink:
+    """Open the link of one bus of an arm; entry point `raw`.
+
+    Raises:
+        BusError: the interface is missing, down, or without the CAN FD asked for, or this kernel has no CAN sockets.
+        DriverError: the driver section is not CANopen's, or has options, which this interface does not know.
+    """
+    if not isinstance(config.driver, CanopenDriver):
+        raise DriverError(f"{config.name}: the driver is not CANopen's")
+    bus = config.driver.buses[bus_number]
+    if bus.options:
+        raise DriverError(f"driver.buses.{bus_number}.options: interface raw has none, found {', '.join(bus.options)}")
+    check_interface(bus)
+    fd = bus.data_bitrate is not None
+    return RawLink(open_socket(bus.channel, bus.bitrate, fd=fd), bus.channel, bus.bitrate, fd=fd)
+
+
+def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> socket.socket:
+    """Open a CAN socket that receives all of CANopen and errors of the controller, but not its own frames.
+
+    Args:
+        channel: network interface, as `ip link` names it.
+        bitrate: for the remedy in messages only; the interface is configured outside.
+        fd: whether CAN FD frames may come and go.
+
+    Raises:
+        BusError: the interface is missing or down, or this kernel has no CAN sockets.
+    """
+    try:
+        sock = socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW)
+    except OSError as error:
+        detail = "this kernel has no CAN sockets; load the modules: `modprobe can-raw`, or choose another interface"
+        raise BusError("refused", channel, bitrate, f"{detail}: {error.strerror}") from None
+    try:
+        # Until the bind nothing arrives, so that no frame passes an unset filter.
+        filters = b"".join(struct.pack("=II", wanted, mask | EXTENDED) for wanted, mask in HEARD)
+        sock.setsockopt(_SOL_CAN_RAW, _RAW_FILTER, filters)
+        sock.setsockopt(_SOL_CAN_RAW, _RAW_ERR_FILTER, _ALL_ERRORS)
+        sock.setsockopt(_SOL_CAN_RAW, _RAW_LOOPBACK, 1)
+        sock.setsockopt(_SOL_CAN_RAW, _RAW_RECV_OWN, 0)
+        if fd:
+            sock.setsockopt(_SOL_CAN_RAW, _RAW_FD_FRAMES, 1)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+        with suppress(OSError):
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+        sock.bind((channel,))
+        # The bind succeeds on an interface that is down; the error waits.
+        if code := sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR):
+            raise OSError(code, os.strerror(code))
+    except OSError as error:
+        sock.close()
+        raise BusError(kind_of(error.errno), channel, bitrate, error.strerror or str(error)) from None
+    return sock
+
+
+class RawLink:
+    """Implement a Link on a socket of kernel frames; the thread that opened it is its only user."""
+
+    def __init__(self, sock: socket.socket, name: str, bitrate: int = 1_000_000, *, fd: bool = False) -> None:
+        """Use a bound socket, and close it with the link.
+
+        Args:
+            sock: bound; closed with the link.
+            name: of the interface, for messages.
+            bitrate: for messages.
+            fd: whether data frames are sent as CAN FD.
+        """
+        sock.setblocking(False)
+        self.clock = RealClock()
+        self._socket, self._name, self._bitrate, self._fd = sock, name, bitrate, fd
+        self._watch = BusOffWatch()
+        self._waiting: deque[Frame] = deque()
+        self._dropped = 0
+
+    def send(self, frame: Frame) -> None:
+        """Hand one frame to the kernel's queue.
+
+        Raises:
+            BusError: bus-off, interface down or gone, queue full.
+            DriverError: a frame that cannot exist.
+        """
+        check_sendable(frame, fd=self._fd)
+        if self._watch.off:
+            raise BusError("off", self._name, self._bitrate)
+        try:
+            self._socket.send(to_kernel(frame, fd=self._fd))
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """Return the next frame, None when there is none until the deadline [ns of the clock].
+
+        Raises:
+            BusError: interface down or gone.
+        """
+        while True:
+            if self._waiting:
+                return self._waiting.popleft()
+            if (frame := self._take()) is not None:
+                self._waiting.append(frame)
+                continue
+            remaining = deadline_ns - time.monotonic_ns()
+            if remaining <= 0:
+                return None
+            try:
+                select.select([self._socket], [], [], remaining * 1e-9)
+            except (OSError, ValueError) as error:
+                raise self._failure(error) from None
+
+    def drain(self) -> Sequence[Frame]:
+        """Return all frames that wait, at most `MOST_AT_ONCE`; does not wait.
+
+        Raises:
+            BusError: interface down or gone.
+        """
+        while len(self._waiting) < MOST_AT_ONCE and (frame := self._take()) is not None:
+            self._waiting.append(frame)
+        frames = tuple(self._waiting)
+        self._waiting.clear()
+        return frames
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _take(self) -> Frame | None:
+        try:
+            data, ancillary, _, _ = self._socket.recvmsg(FD_BYTES, _ANCILLARY)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise self._failure(error) from None
+        if not data:
+            raise BusError("gone", self._name, self._bitrate)
+        now, stamp = time.monotonic_ns(), 0
+        for level, kind, value in ancillary:
+            if level != socket.SOL_SOCKET:
+                continue
+            if kind == _SO_TIMESTAMPNS and len(value) == _TIMESPEC.size:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                stamp = seconds * 1_000_000_000 + nanoseconds
+            elif kind == _SO_RXQ_OVFL and len(value) == _COUNT.size:
+                self._note_dropped(_COUNT.unpack(value)[0], now)
+        age = time.time_ns() - stamp
+        frame = from_kernel(data, now - age if 0 <= age < _PLAUSIBLE_NS else now)
+        self._watch.heard(frame)
+        return frame
+
+    def _note_dropped(self, count: int, now: int) -> None:
+        if count != self._dropped:
+            self._dropped = count
+            details = bytes((0, RX_OVERFLOW, 0, 0, 0, 0, 0, 0))
+            self._waiting.append(Frame(CONTROLLER, details, error=True, stamp_ns=now))
+
+    def _failure(self, error: OSError | ValueError) -> BusError:
+        code = error.errno if isinstance(error, OSError) else None
+        return BusError(kind_of(code, "gone"), self._name, self._bitrate, getattr(error, "strerror", "") or str(error))

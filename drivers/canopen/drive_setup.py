@@ -1,0 +1,399 @@
+"""Configure drives before anything moves: check their identity, their own protection, the frames they exchange.
+
+Everything is compared first, written where it differs, and read back (FIELDBUS.md 2.5; DRIVES.md 2 and 4). What a drive
+lacks of it was judged before (`capabilities.py`): what is indispensable has been refused, what may be missing is left
+out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.arm import Watchdog
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, where
+from drivers.canopen.cia402 import POWER_OFF, state_of
+from drivers.canopen.families import entry_of
+from drivers.canopen.motor_units import Coordinates, torque_limit_counts
+from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
+from drivers.canopen.pdo_setup import configure_pdos
+from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, NotHeld, Objects, SdoRefused, optional
+from drivers.canopen.stored_zero import Zeros
+from ident_service.config.canopen import (
+    CanopenDrive,
+    CanopenDriver,
+    DriveIdentity,
+    Reactions,
+    motor_speeds,
+    quick_stop_decelerations,
+)
+from ident_service.config.family import TorquePath
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import AnotherDrive, DriverError
+
+LIMIT_SLACK = 0.05  # rad or m by which the drives' position limits exceed the joints'
+_FIRMWARE = 0x100A
+_COUNTS_PER_LINE = (1.0, 4.0)
+_GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
+_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two reads
+_ROUNDING = 1e-6
+_LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
+IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
+
+
+@dataclass(frozen=True)
+class MotorLimits:
+    """Keep what the joints' limits mean for one motor.
+
+    Attributes:
+        positions: lowest and highest [counts], for a drive that heeds them; None where joints have none.
+        speed: at which it turns when all joints move at their velocity limits [turns per minute].
+        deceleration: 6085h, in the drive's unit; None where neither the drive's section nor the joints say one.
+    """
+
+    positions: tuple[int, int] | None
+    speed: float = 0.0
+    deceleration: int | None = None
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Hold one drive's part of the configuration.
+
+    Attributes:
+        drive: its section of the description.
+        profile: of its bus.
+        reactions: to faults that the drive finds by itself.
+        quick_stop: 605Ah, in place of what `reactions` leaves open.
+        motor: the joints' limits converted to this motor.
+        can: its capabilities.
+    """
+
+    drive: CanopenDrive
+    profile: BusProfile
+    reactions: Reactions
+    quick_stop: int
+    motor: MotorLimits
+
+    can: Capabilities
+
+    @property
+    def torque(self) -> TorquePath:
+        """Return how torques are streamed to the drive."""
+        assert self.can.torque is not None  # noqa: S101 - else it has been refused
+        return self.can.torque
+
+    @property
+    def limit_counts(self) -> int:
+        """Return the largest torque [counts of the target]."""
+        return torque_limit_counts(self.drive.max_torque, self.drive.rated_torque)
+
+    def watchdog(self) -> list[Write]:
+        """Return the downloads that set a watchdog of the maker's."""
+        if (own := self.drive.watchdog_entry) is None:
+            return []
+        return [Write(Entry(own.index, own.sub, Kind[own.type.upper()], "watchdog of the drive's maker"), own.value)]
+
+    def options(self) -> list[Write]:
+        """Return the downloads of the reactions, for drives that let them be chosen."""
+        return [
+            Write(od.QUICK_STOP_OPTION, self.quick_stop),
+            Write(od.FAULT_OPTION, self.reactions.fault),
+            Write(od.ABORT_CONNECTION, self.reactions.abort_connection),
+        ]
+
+    def hints(self) -> list[Write]:
+        """Return the downloads of the cycle and the position limits, for drives that want to know them.
+
+        They protect nothing: drives in torque mode give torque beyond the position limits.
+        """
+        todo = [Write(od.SYNC_PERIOD, self.period_us)]
+        if self.motor.positions is not None:
+            lowest, highest = self.motor.positions
+            todo += [Write(od.LOWER_LIMIT, lowest), Write(od.UPPER_LIMIT, highest)]
+        power = next(power for power in (-3, -4, -5, -6) if self.period_us % 10 ** (6 + power) == 0)
+        number = self.period_us // 10 ** (6 + power)
+        return [*todo, Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)] if number <= 0xFF else todo
+
+    @property
+    def period_us(self) -> int:
+        """Return the cycle's period [us]."""
+        return round(1e6 / self.profile.rate)
+
+    def pdos(self) -> list[Pdo]:
+        """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
+        target = entry_of(self.torque.target, "target torque", "counts")
+        found = []
+        for pdo in self.profile.pdos(self.drive.node):
+            own = tuple(target if slot == od.TARGET_TORQUE else slot for slot in pdo.slots)
+            found.append(replace(pdo, slots=own))
+            if od.STATUS_WORD in pdo.slots and not self.can.event:
+                found[-1] = replace(pdo, type=self.profile.status_syncs, inhibit=0, timer=0)
+        return found
+
+
+def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
+    """Convert the limits of an arm's joints to each of its motors.
+
+    Args:
+        config: with a CANopen driver and a transmission.
+        found: its coordinates, of the zero that the drives have.
+    """
+    driver, gears, joints = config.driver, config.transmission, list(config.joints.values())
+    assert isinstance(driver, CanopenDriver)  # noqa: S101 - refused in the beginning
+    assert gears is not None  # noqa: S101 - likewise
+    lowest, highest = np.array([joint.position or (-np.inf, np.inf) for joint in joints]).T
+    limits = found.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+    speeds = motor_speeds(gears, [joint.velocity for joint in joints])
+    brakes = quick_stop_decelerations(driver, gears, [joint.acceleration for joint in joints])
+    return [MotorLimits(*one) for one in zip(limits, speeds, brakes, strict=True)]
+
+
+def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
+    """Return the watchdog of each drive; `names` are what people call the drives."""
+    found, of_torque = zip(names, driver.drives, strict=True), ("rpdo_timer", "vendor")
+    seconds = driver.watchdog_seconds
+    return tuple(Watchdog(name, one.watchdog, seconds(one), one.watchdog in of_torque) for name, one in found)
+
+
+def differences(found: Mapping[str, int], wanted: DriveIdentity) -> list[str]:
+    """Describe how an identity (1018h), by the keys of `IDENTITY`, differs from the configured one; else empty."""
+    return [
+        f"{name} is {found[name]:08X}h instead of {value:08X}h" if name in found else f"{name} is not told"
+        for name, value in wanted.model_dump(exclude_none=True).items()
+        if found.get(name) != value
+    ]
+
+
+def quick_stop_option(config: ArmConfig) -> int:
+    """Return the value for 605Ah: as described, else to stay in quick stop where the arm has no brakes."""
+    assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - of an arm of CANopen drives
+    described = config.driver.reactions.quick_stop
+    if described is not None:
+        return described
+    return _STAYS if config.control.after_stop in ("hold", "lower") else _LETS_GO
+
+
+def identify(objects: Objects, wanted: DriveIdentity) -> str:
+    """Read the identity of a drive and compare it with the wanted one.
+
+    Returns:
+        `node 3: vendor 0000019Eh, product ..., revision ..., serial ..., firmware ...`.
+
+    Raises:
+        DriverError: it does not answer, is no drive, or not the one that the configuration names.
+    """
+    kind = objects.read(od.DEVICE_TYPE)
+    if kind & 0xFFFF != DRIVE_PROFILE:
+        raise DriverError(f"node {objects.node}: is no drive of CiA 402 (1000h is {kind:08X}h)")
+    found = {}
+    for name, entry in IDENTITY.items():
+        try:
+            found[name] = objects.read(entry)
+        except SdoRefused as refused:  # all but the vendor are optional (CiA 301, 7.5.2.19)
+            if refused.code not in DOES_NOT_EXIST:
+                raise
+    if others := differences(found, wanted):
+        raise AnotherDrive(f"node {objects.node}: is not the drive that the configuration names: {', '.join(others)}")
+    try:
+        firmware = objects.read_bytes(_FIRMWARE, 0, "software version").decode("ascii", "replace").strip("\0 ")
+    except SdoRefused:
+        firmware = "not told"
+    words = ", ".join(f"{name} {value:08X}h" for name, value in found.items())
+    return f"node {objects.node}: {words}, firmware {firmware}"
+
+
+def configure(objects: Objects, setup: Setup) -> int:
+    """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
+
+    Returns:
+        The mode of operation (6060h), which is sent with every control word.
+
+    Raises:
+        DriverError: it lacks, refuses or forgets something; the message names the entry and says why.
+    """
+    _encoder(objects, setup.drive)
+    _timing(objects, setup)
+    unused = setup.profile.silenced(setup.drive.node)
+    configure_pdos(objects, setup.pdos(), unused, setup.can.dummies)
+    _rated_torque(objects, setup)
+    _largest_torque(objects, setup)
+    _max_speed(objects, setup)
+    _deceleration(objects, setup)
+    for write in setup.options():
+        objects.ensure_if_there(write)
+    objects.ensure(setup.profile.heartbeat(setup.drive.node))
+    # Supervision of the host comes last: from then on the host must be present.
+    spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
+    for write in setup.profile.watched(setup.drive.node):
+        (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
+    for write in setup.watchdog():
+        objects.ensure(write)
+    for write in setup.hints():
+        with suppress(SdoRefused, NotHeld):
+            objects.ensure_if_there(write)
+    _mode(objects, setup)
+    return setup.torque.mode if setup.torque.by is None else objects.read(od.MODE)
+
+
+def _timing(objects: Objects, setup: Setup) -> None:
+    """Configure SYNC without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
+    for write in setup.profile.identifiers(setup.drive.node):
+        objects.ensure_if_there(write)
+    counter = Write(od.SYNC_OVERFLOW, 0)
+    if optional(objects.holds, counter) is False:
+        objects.ensure_if_there(Write(od.SYNC_PERIOD, 0))
+        objects.ensure(counter)
+    objects.ensure_if_there(Write(od.SYNC_WINDOW, 0))  # torques come just before the next SYNC
+
+
+def _largest_torque(objects: Objects, setup: Setup) -> None:
+    """Set the largest torque that the drive gives, in its own entry and unit."""
+    limit, value = setup.can.limit, setup.limit_counts
+    assert limit is not None  # noqa: S101 - else it has been refused
+    if limit.per is not None:
+        value = value * objects.read(entry_of(limit.per, "what the largest torque is per mille of")) // 1000
+    for text in (limit.entry, limit.negative):
+        try:
+            if text is not None:
+                objects.ensure(Write(entry_of(text, "largest torque"), value))
+        except SdoRefused as refused:
+            words = f"drives.max_torque is {setup.drive.max_torque:g} N m"
+            raise SdoRefused(
+                f"{refused}; {words}, which the drive must be able to limit itself to", refused.code
+            ) from None
+    if setup.torque.slope is not None:  # mode 4 would turn a step into a ramp: the whole torque within 1 ms
+        objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
+
+
+def _mode(objects: Objects, setup: Setup) -> None:
+    """Set the mode of operation, and wait until the drive reports it, which may take some time."""
+    by, clock = setup.torque.by, objects.clock
+    entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
+    if not objects.holds(wanted := Write(entry, setup.torque.mode)):
+        objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
+    last = clock.now_ns() + round(_MODE_PATIENCE * 1e9)
+    while (mode := objects.read(display)) != setup.torque.mode:
+        if clock.now_ns() > last:
+            words = f"is in mode {mode} ({display.index:04X}h) although {setup.torque.mode} was set"
+            raise DriverError(f"node {objects.node}: {words}")
+        clock.sleep_until_ns(clock.now_ns() + _MODE_AGAIN_NS)
+
+
+def _mode_entry(text: str) -> Entry:
+    return entry_of(text, "mode of operation of the maker's")
+
+
+def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
+    """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
+
+    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed (`stored_zero.py`) it
+    confirms afterwards too, and nothing else: one that restarted in the session has lost its zero.
+
+    Args:
+        objects: of the drive.
+        zeros: of the arm, None where drives know their position.
+        number: of the drive.
+        restarted: whether it has sent a boot-up message in the session.
+
+    Raises:
+        DriverError: it does not answer, or refuses.
+    """
+    # Asked for: a status report may be held back by its inhibit time.
+    if state_of(objects.read(od.STATUS_WORD)) not in POWER_OFF:
+        return
+    counts = None
+    if zeros is not None:
+        counts = zeros.held(objects, number)
+        yield
+    for entry in (od.ABORT_CONNECTION, od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
+        optional(objects.write, Write(entry, 0))
+    if zeros is not None and counts is not None:
+        yield
+        zeros.keep_on(objects, number, counts, restarted)
+
+
+def _encoder(objects: Objects, drive: CanopenDrive) -> None:
+    """Compare the described counts of a motor turn with the drive's own scaling, where it has one.
+
+    A drive with a gear ratio of its own (6091h) tells positions in another unit. Some give the lines of an encoder, of
+    which each has four counts.
+    """
+    counts, turns, motor, shaft = (
+        optional(objects.read, entry) for entry in (od.ENCODER_COUNTS, od.ENCODER_TURNS, od.GEAR_MOTOR, od.GEAR_SHAFT)
+    )
+    if not counts or not turns or motor != shaft:
+        return
+    ratio = drive.counts * turns / counts
+    if ratio not in _COUNTS_PER_LINE:
+        raise DriverError(
+            f"node {objects.node}: a motor turn has {counts / turns:g} counts by the drive (608Fh), {drive.counts} by "
+            f"the description (drives.counts): the scale of its positions is wrong by {ratio:g}"
+        )
+
+
+def _rated_torque(objects: Objects, setup: Setup) -> None:
+    """Set the rated torque where the family lets it be set, or check that the drive's own is the described one."""
+    unit, rated = setup.can.family.unit, setup.drive.rated_torque
+    if unit is None or unit.rated is None or not unit.writable:
+        return  # compared already
+    entry, size = entry_of(unit.rated, "rated torque"), TORQUE_UNITS[unit.unit]
+    wanted = Write(entry, round(rated / size))
+    if wanted.value < 1 or abs(wanted.value * size - rated) > _ROUNDING * rated:
+        words = f"rated_torque {rated:g} N m is not whole {unit.unit}, which is what {where(entry)} holds"
+        raise DriverError(f"node {objects.node}: {words}")
+    try:
+        objects.ensure(wanted)
+    except SdoRefused as refused:
+        if refused.code not in READ_ONLY:
+            raise
+        raise DriverError(
+            f"node {objects.node}: its rated torque is {objects.read(entry) * size:g} N m and cannot be set; "
+            f"the configuration says rated_torque: {rated:g}"
+        ) from None
+
+
+def _max_speed(objects: Objects, setup: Setup) -> None:
+    """Set the motor's largest speed, or check that the drive's own leaves the joints their velocities.
+
+    Above it a drive takes its torque back, in the middle of a motion.
+    """
+    if (entry := setup.can.speed) is None:
+        return
+    try:
+        objects.ensure(Write(entry, round(setup.drive.max_speed)))
+    except SdoRefused as refused:
+        if refused.code not in READ_ONLY:
+            raise
+        held = objects.read(entry)
+        if held < round(setup.motor.speed):
+            raise DriverError(
+                f"node {objects.node}: gives no torque above {held} turns per minute ({entry.index:04X}h, which cannot"
+                f" be set), but its motor turns at {setup.motor.speed:.0f} at the joints' limits; lower"
+                " joints.NAME.velocity"
+            ) from None
+
+
+def _deceleration(objects: Objects, setup: Setup) -> None:
+    """Set the deceleration of quick stops (6085h), where a drive has it; a sufficient one of its own may stay."""
+    if setup.motor.deceleration is None:
+        return
+    wanted = Write(od.QUICK_STOP_DECELERATION, setup.motor.deceleration)
+    try:
+        objects.ensure(wanted)
+    except SdoRefused as refused:
+        if refused.code in DOES_NOT_EXIST and setup.drive.quick_stop_deceleration is None:
+            return
+        if refused.code not in READ_ONLY:
+            raise
+        held = objects.read(od.QUICK_STOP_DECELERATION)
+        if held < _GENTLER * wanted.value:
+            raise DriverError(
+                f"node {objects.node}: brakes by {held} in a quick stop (6085h, which cannot be set), {wanted.value} "
+                "wanted; give its drives.quick_stop_deceleration where its unit is not counts per square second"
+            ) from None

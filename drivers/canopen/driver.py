@@ -1,0 +1,408 @@
+"""Drive an arm of CANopen drives in cyclic synchronous torque mode.
+
+A sample is stamped when SYNC was sent, at which the torque that was handed over began to act and all positions were
+taken.
+
+Torque frames begin with `enable` and then never cease while cycles come, with zero torque once the arm is stopped: a
+drive that missed them would rightly report it. `close` takes the drives back to what they were when they were powered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
+from drivers.axis_status import AxisStatus
+from drivers.can.bus_lock import BusLock
+from drivers.can.can_link import Link, open_links
+from drivers.can.frame_log import SessionLog, logged_links, require_format
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.axis_events import Reports
+from drivers.canopen.bus_monitor import LookingArm
+from drivers.canopen.capabilities import required
+from drivers.canopen.cia402 import NmtCommand, joint_status
+from drivers.canopen.drive_setup import (
+    Setup,
+    configure,
+    identify,
+    motor_limits,
+    quick_stop_option,
+    released,
+    watchdogs_of,
+)
+from drivers.canopen.enabling import Enabling, Resetting, hold
+from drivers.canopen.homing import ZeroingArm
+from drivers.canopen.measured import MeasuredTorque
+from drivers.canopen.motor_units import Coordinates, coordinates, unwrapped
+from drivers.canopen.pdo_codec import Drive, Emergency
+from drivers.canopen.pdo_mapping import bus_profiles
+from drivers.canopen.sdo import Objects
+from drivers.canopen.stopping import StopCommand
+from drivers.canopen.stored_zero import zeros_of
+from drivers.canopen.sync_cycle import Buses
+from drivers.clock import Clock, RealClock, VirtualClock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError, PositionUnknown
+
+# Between two checks of everybody's heartbeats and status reports: share of a status period, and cycles at most.
+_LOOK_SHARE, _MOST_UNLOOKED = 0.1, 10
+
+
+class CanopenArm(Arm):
+    """Implement an arm with drives on one or more buses, behind one transmission."""
+
+    def __init__(self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> None:
+        """Use the arm's description; nothing is opened.
+
+        Args:
+            config: with a CANopen driver and a transmission.
+            open_bus: gives the links, in the order of the buses.
+
+        Raises:
+            DriverError: the description lacks the driver, the transmission, or joints.
+        """
+        if not isinstance(config.driver, CanopenDriver) or config.transmission is None:
+            raise DriverError(f"{config.name}: needs a CANopen driver and a transmission")
+        self._config, self._driver, self._open_bus = config, config.driver, open_bus
+        self._period_ns = round(1e9 / config.control.rate)
+        self._profiles = bus_profiles(config.driver, config.control.rate)
+        cycles = int(_LOOK_SHARE * config.driver.status.period * config.control.rate)
+        self._look_every = min(max(1, cycles), _MOST_UNLOOKED)
+        self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
+        self._zeros = zeros_of(config)
+        self._quick_stop = quick_stop_option(config)
+        self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
+        if len(self._limits) != len(config.driver.drives):
+            raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
+        joints = len(self._limits)
+        self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
+        # Joints that each drive moves, and drives that each joint needs.
+        self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
+        self._drives_of = self._coordinates.motors_of
+        names, drives = list(config.joints), enumerate(config.driver.drives)
+        self._names = [f"{' and '.join(names[j] for j in self._joints_of[k])}: drive {one.node}" for k, one in drives]
+        # Until the buses are open and bring theirs.
+        in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
+        self.clock: Clock = VirtualClock() if in_step else RealClock()
+        self._buses: Buses | None = None
+        self._locks: list[BusLock] = []
+        self._log_path: Path | None = None
+        self._log: SessionLog | None = None
+        self._reset_state()
+
+    def _reset_state(self) -> None:
+        self._enabled = self._streaming = False
+        self._stop = StopCommand()
+        self._stops = 0  # stop commands so far
+        self._counts = [0] * len(self._limits)
+        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._unwrapped: list[int] | None = None
+        self._told: list[tuple[int | None, Emergency | None]] = []
+        self._status: tuple[int, ...] = ()
+        self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
+        first = {k: joints[0] for k, joints in self._joints_of.items()}
+        self._reports = Reports(self._driver, first, self._look_every)
+        self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns)
+        self._identities: tuple[str, ...] = ()
+
+    def look(self) -> Arm:
+        """Return an arm that reads the drives' objects by SDO and sends nothing else."""
+        return LookingArm(self._config, self._open_bus)
+
+    def zero(self) -> tuple[str, ...]:
+        """Store the drives' present position as the home of the description; as in the contract."""
+        if self._buses is not None:
+            raise DriverError("the arm is open; close it before it is zeroed")
+        with ZeroingArm(self._config, self._open_bus) as arm:
+            return arm.take_home()
+
+    def log_frames(self, path: Path) -> None:
+        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        self._log_path = require_format(path)
+
+    def logged(self) -> str:
+        """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
+        return "" if self._log is None or self._log.report is None else str(self._log.report)
+
+    def open(self) -> None:
+        """Lock and open every bus, and configure every drive; nothing is energised.
+
+        Raises:
+            DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
+                another one, or refuses a part of its configuration. Nothing stays open.
+            PositionUnknown: drives have lost their zero (`stored_zero.py`); likewise.
+        """
+        if self._buses is not None:
+            raise DriverError("the arm is already open")
+        self._reset_state()
+        self._log = None
+        try:
+            if not self.clock.lock_step:
+                self._locks = [BusLock(bus) for bus in self._driver.buses]
+            links = self._open_bus(self._config)
+            if self._log_path is not None:
+                self._log, links = logged_links(links, self._log_path, [profile.fd for profile in self._profiles])
+                self._log_path = None
+            buses = Buses(self._profiles, links, self._period_ns)
+            self.clock = buses.clock
+            try:
+                buses.listen()
+            except BaseException:
+                buses.close()  # without the farewell of `close`, which another host's drives would obey
+                raise
+            self._buses = buses
+            buses.call()
+            self._find_zero(buses)
+            self._identities = tuple(self._configured(buses))
+            buses.begin()
+            self._require_no_restart(buses)
+        except BaseException:
+            self.close()
+            raise
+
+    def describe(self) -> ArmDescription:
+        """Return the description of the open arm; raises DriverError when it is not open."""
+        self._open()
+        found = self._coordinates
+        return ArmDescription(
+            tuple(self._config.joints),
+            1e9 / self._period_ns,
+            np.minimum(found.torque_limit, self._limits),
+            found.torque_resolution,
+            found.position_resolution,
+            self._identities,
+            "drivers.canopen",
+            lost_cycles=self._driver.lost_cycles,
+        )
+
+    def enable(self) -> None:
+        """Energise all drives together with zero torque, through the states of CiA 402.
+
+        Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
+
+        Raises:
+            DriverError: not open, a drive has a fault, or does not follow in time; only what held the arm still does.
+        """
+        buses = self._open()
+        held = hold(buses.drives)
+        self._no_torque()
+        self._streaming, self._stop = True, StopCommand()
+        try:
+            reports = self._driver.status.inhibit, self._driver.status.period
+            now_ns, option = self.clock.now_ns(), self._quick_stop
+            steps = Enabling(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
+            self._through(buses, steps)
+        except BaseException:
+            self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
+            raise
+        buses.forget_events()  # of the states that drives went through
+        self._enabled = True
+
+    def reset(self) -> None:
+        """Clear the faults that drives have latched; nothing is energised.
+
+        Raises:
+            DriverError: not open, enabled, or a fault stays because its cause does.
+        """
+        buses = self._open()
+        if self._enabled:
+            raise DriverError("the arm is enabled; stop it before its faults are cleared")
+        self._through(buses, Resetting(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        """Exchange one cycle, as the contract says.
+
+        Raises:
+            DriverError: as in the contract.
+        """
+        buses = self._open()
+        if torque is not None:
+            if not self._enabled:
+                raise DriverError("a torque was given, but the arm is not enabled")
+            wanted = np.asarray(torque, dtype=float)
+            if wanted.shape != self._limits.shape or not np.isfinite(wanted).all():
+                raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
+            wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
+            self._counts, _ = self._coordinates.torque_counts(wanted)
+            self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+        self._stop.repeat(buses)
+        # While enabled, an exchange without a torque sends no torque frame: drives that supervise them must notice.
+        idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
+        stamp_ns = buses.cycle(idle if torque is None else self._counts)
+        self._measured.cycle(self._counts, buses.drives)
+        sample = self._sample(buses, stamp_ns)
+        self._cycle += 1
+        return sample
+
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        """Return the watchdog of each drive, see `Arm`."""
+        return watchdogs_of(self._driver, self._names)
+
+    def withhold(self, kind: str) -> None:
+        """Stop sending what watchdogs of one kind watch, see `Arm`."""
+        self._open().withheld.add(kind)
+
+    def drive_status(self) -> tuple[AxisStatus, ...]:
+        """Return the last reported status of each drive, see `Arm`."""
+        return tuple(drive.axis_status for drive in self._open().drives)
+
+    def stop(self, kind: StopKind) -> None:
+        """Command every drive to switch off, or to stop by itself; never raises. The last torque acts until it does.
+
+        A drive that cannot be told is told again for 75 ms, and then before each cycle.
+        """
+        self._enabled = False
+        self._stops += 1
+        self._no_torque()
+        if self._buses is not None:
+            self._buses.withheld.clear()
+            self._stop.give(self._buses, kind)
+
+    def close(self) -> None:
+        """Take torque off, restore the drives' power-up settings and close the buses; any number of times.
+
+        A quick stop is not cut short by it: drives that are told to let go in the midst of one would let the arm fall.
+        The same holds for drives that were found holding the arm in quick stop, unless they have been told to let go.
+        """
+        if not self._stop.braking:
+            held = not self._stops and self._buses is not None and hold(self._buses.drives)
+            self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
+        if self._buses is not None:
+            self._leave(self._buses)
+            self._buses.close()
+        for lock in self._locks:
+            lock.close()
+        self._buses, self._locks = None, []
+        self._streaming = False
+        if self._log is not None:  # last: everybody is off, and the file may take its time
+            self._log.close()
+
+    def _leave(self, buses: Buses) -> None:
+        """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""
+        zero = self._counts if self._streaming else None
+        self._stop.see_through(buses, zero, self._period_ns)
+        there: dict[int, Objects] = {}  # by bus
+        for number, drive in enumerate(self._driver.drives[: self._begun]):
+            with suppress(Exception):
+                objects = buses.objects(number)
+                # Between two conversations, so that the others do not miss their torque frames.
+                buses.cycle(zero)
+                for _ in released(objects, self._zeros, number, buses.restarted(number)):
+                    buses.cycle(zero)
+                there[drive.bus] = objects
+        for number in range(len(buses.drives)):
+            with suppress(Exception):
+                buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
+        for objects in there.values():
+            with suppress(Exception):  # its answer comes behind all commands, which closing a link could cut off
+                objects.read(od.DEVICE_TYPE)
+
+    def _open(self) -> Buses:
+        if self._buses is None:
+            raise DriverError("the arm is not open")
+        return self._buses
+
+    def _no_torque(self) -> None:
+        self._counts = [0] * len(self._limits)
+        self._acting = _frozen(np.zeros(len(self._limits)))
+
+    def _find_zero(self, buses: Buses) -> None:
+        """Find the zero that the drives confirm, before they are configured, which may make them forget it."""
+        if self._zeros is not None:
+            held = [self._zeros.held(buses.objects(number), number) for number in range(len(buses.drives))]
+            self._coordinates = self._coordinates.zeroed(self._zeros.all_of(held), self._zeros.home)
+
+    def _configured(self, buses: Buses) -> Iterator[str]:
+        """Identify and configure all drives one by one; yields the identity of each in words."""
+        motors = motor_limits(self._config, self._coordinates)
+        for number, drive in enumerate(self._driver.drives):
+            objects = buses.objects(number)
+            identity = identify(objects, drive.identity)
+            own = self._driver.reactions, self._quick_stop, motors[number], required(objects, self._driver, number)
+            self._begun = number + 1
+            buses.modes[number] = configure(objects, Setup(drive, buses.profile(number), *own))
+            if self._zeros is not None:
+                counts = self._coordinates.zero[number]
+                if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):
+                    raise PositionUnknown(self._zeros.lost([drive.node]))
+                identity += f", home at {counts} counts"  # a preflight ticket is for this zero
+            yield identity
+
+    def _require_no_restart(self, buses: Buses) -> None:
+        """Raise PositionUnknown where a drive has restarted since it was configured, and so has lost its zero."""
+        if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
+            raise PositionUnknown(self._zeros.lost(restarted))
+
+    def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
+        """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
+        stops = self._stops
+        while not steps.done:
+            buses.cycle(self._counts if self._streaming else None)
+            for number, word in steps.commands(self.clock.now_ns()):
+                if self._stops == stops:
+                    buses.control(number, word)
+            if self._stops != stops:
+                raise DriverError("the arm was stopped on its drives' way to another state")
+
+    def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
+        drives = buses.drives
+        if self._unwrapped is None:
+            nearest = zip(self._coordinates.zero, drives, strict=True)
+            self._unwrapped = [unwrapped(zero, drive.position) for zero, drive in nearest]
+        else:
+            self._unwrapped = [
+                unwrapped(before, drive.position) for before, drive in zip(self._unwrapped, drives, strict=True)
+            ]
+        valid, age = self._all_fresh
+        if not buses.complete:
+            ages = [max(drives[k].age for k in needed) for needed in self._drives_of]
+            valid = (age := np.array(ages, dtype=np.int64)) == 0
+        return Sample(
+            self._cycle,
+            stamp_ns,
+            self._coordinates.positions(self._unwrapped),
+            None,
+            self._acting,
+            valid,
+            age,
+            buses.lost,
+            self._statuses(drives),
+            max(drive.status_age for drive in drives),
+            tuple(self._reports.new(buses.codecs, self._cycle, self.clock.now_ns())),
+            measured_torque=self._measured.torque,
+            torque_difference=self._measured.difference if self._enabled else None,
+            stamp_doubt_ns=buses.stamp_doubt_ns,
+        )
+
+    def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
+        """Return the status of each joint; computed again only when a drive has reported something new."""
+        told = [(drive.status, drive.emergency) for drive in drives]
+        if told != self._told:
+            self._told = told
+            self._status = tuple(int(joint_status(drives[k].axis_status for k in needed)) for needed in self._drives_of)
+        return self._status
+
+
+def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
+    """Create the arm of a configuration with a CANopen driver, not open.
+
+    Args:
+        config: the arm's.
+        clock: ignored: time is that of the link, virtual in lock step.
+
+    Raises:
+        DriverError: the description lacks something.
+    """
+    return CanopenArm(config)
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,158 @@
+"""Store the zero of an arm in its drives, whose encoders count from where they were at power-up (`zero: at_home`).
+
+There it is lost together with the count that it is about; no file of a host can be out of date. Object 1020h (CiA 301,
+verify configuration) is two numbers that a host may store in a drive:
+
+    sub 1   6064h of this motor while the joints stood at the home of the arm's description, as 32 bits
+    sub 2   CRC-32 of these counts and of all that their meaning depends on; never 0, which a drive has after power-up
+
+A description with another home, gear or encoder has another mark, so that what was zeroed with the old one is void. It
+is never stored (1010h): a drive that had it back after power-up would confirm a count that is gone.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.motor_units import Vector, signed
+from drivers.canopen.pdo_mapping import Write
+from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError, PositionUnknown
+
+_WHOSE = "ident: counts at home, 1"
+_STORES_BY_ITSELF = 1 << 1  # of 1010h
+
+
+class Zeros:
+    """Hold the zeros of all drives of one arm.
+
+    Attributes:
+        home: the posture to which the zeros belong [rad or m], shape (joints,), read-only.
+    """
+
+    def __init__(self, config: ArmConfig) -> None:
+        """Use the description of an arm with `zero: at_home`.
+
+        Raises:
+            DriverError: its encoders need no zero, or the description has no posture to say it in.
+        """
+        driver, gears = config.driver, config.transmission
+        if not isinstance(driver, CanopenDriver) or gears is None or driver.zero != "at_home":
+            raise DriverError(f"{config.name}: driver.zero is absolute: its encoders know where the arm stands")
+        homes = [joint.home for joint in config.joints.values()]
+        if len(homes) != len(driver.drives) or None in homes:
+            raise DriverError(f"{config.name}: driver.zero is at_home, which needs joints.*.home for every joint")
+        self.home: Vector = np.array(homes, dtype=float)
+        self.home.setflags(write=False)
+        self._name = config.name
+        coupling = np.eye(len(homes)) if gears.coupling is None else np.array(gears.coupling)
+        self._about = [
+            # Numbers, not their rounded text: what is nearly the same is another arm.
+            (drive.bus, drive.node, drive.counts, (ratio * row).tolist(), self.home[row != 0.0].tolist())
+            for drive, ratio, row in zip(driver.drives, gears.ratios, coupling, strict=True)
+        ]
+
+    def mark(self, number: int, counts: int) -> int:
+        """Return the value of 1020h:02 that marks these counts of a drive as its counts at home."""
+        return zlib.crc32(repr((_WHOSE, self._about[number], counts)).encode()) or 1
+
+    def held(self, objects: Objects, number: int) -> int | None:
+        """Return the counts at home that a drive confirms, signed; None where it does not. Raises as `Objects.read`."""
+        try:
+            mark = objects.read(od.ZERO_MARK)
+            counts = signed(objects.read(od.ZERO_COUNTS)) if mark else 0
+        except SdoRefused as refused:
+            if refused.code not in DOES_NOT_EXIST:
+                raise
+            return None
+        return counts if mark == self.mark(number, counts) and mark else None
+
+    def keep(self, objects: Objects, number: int, counts: int) -> None:
+        """Store these counts at home in a drive, and read them back; raises as `Objects.set`."""
+        objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
+        objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
+
+    def keep_on(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
+        """Store again the counts that a drive confirmed before it was configured, unless it has restarted since.
+
+        Args:
+            objects: of the drive.
+            number: its.
+            counts: at home.
+            restarted: whether it has sent a boot-up message; asked before, and when its answers have been heard.
+
+        Returns:
+            Whether the drive confirms them; otherwise its mark has been deleted.
+
+        Raises:
+            DriverError: as `Objects.set`.
+        """
+        if not restarted():
+            self.keep(objects, number, counts)
+            if not restarted():
+                return True
+        self.forget(objects)
+        return False
+
+    def forget(self, objects: Objects) -> None:
+        """Delete the mark in a drive, so that it confirms nothing, and read it back; raises as `Objects.set`."""
+        objects.set(Write(od.ZERO_MARK, 0))
+
+    def require_kept(self, objects: Objects) -> None:
+        """Check that a drive can hold a zero, and loses it with its power.
+
+        Raises:
+            DriverError: it has no object 1020h, or stores parameters by itself.
+        """
+        try:
+            for entry in (od.ZERO_COUNTS, od.ZERO_MARK):
+                objects.read(entry)
+        except SdoRefused as refused:
+            if refused.code not in DOES_NOT_EXIST:
+                raise
+            raise DriverError(
+                f"node {objects.node}: has no object 1020h, in which its zero would be kept; "
+                "such drives need encoders that know their position (zero: absolute)"
+            ) from None
+        try:
+            stores = objects.read(od.STORED)
+        except SdoRefused:
+            return
+        if stores & _STORES_BY_ITSELF:
+            raise DriverError(
+                f"node {objects.node}: stores parameters by itself (1010h): its zero would outlive its count"
+            )
+
+    def all_of(self, held: Sequence[int | None]) -> list[int]:
+        """Return the counts at home of all drives.
+
+        Args:
+            held: counts that each of them confirms.
+
+        Raises:
+            PositionUnknown: some confirm nothing; the message names them and says what to do.
+        """
+        lost = [about[1] for about, counts in zip(self._about, held, strict=True) if counts is None]
+        if lost:
+            raise PositionUnknown(self.lost(lost))
+        return [counts for counts in held if counts is not None]
+
+    def lost(self, nodes: Sequence[int]) -> str:
+        """Describe that drives have no zero, and what to do about it."""
+        return (
+            f"drives {', '.join(map(str, sorted(nodes)))} do not know where the arm stands: their encoders count from "
+            "where they were when power came, and nobody has zeroed them since (with this description); lead the arm "
+            f"to its home by hand, then `ident home {self._name} --zero`"
+        )
+
+
+def zeros_of(config: ArmConfig) -> Zeros | None:
+    """Return the zeros of an arm whose encoders need them, else None; raises as `Zeros`."""
+    needed = isinstance(config.driver, CanopenDriver) and config.driver.zero == "at_home"
+    return Zeros(config) if needed else None

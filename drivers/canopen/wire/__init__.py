@@ -1,5 +1,0 @@
-"""Provide the interface `ident_wire`: a CAN bus among processes of one user, over a local socket.
-
-It orders frames as arbitration does, can keep the pace of a bit rate, and lets errors be injected; for emulated drives
-where the kernel has no CAN. `hub.py` is the wire itself, `link.py` an end of it, `bus.py` an end for python-can.
-"""

@@ -1,0 +1,1 @@
+"""Serve: the HTTP API, jobs, schedules and pages of one daemon per state folder."""

@@ -1,0 +1,162 @@
+"""Put the parts of the service together as one application; nothing is done before it starts."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sqlite3
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
+from fastapi.routing import APIRoute
+
+from ident_service import __version__
+from ident_service.daemon.authentication import Gate
+from ident_service.daemon.connections import Connections
+from ident_service.daemon.dependencies import Service
+from ident_service.daemon.errors import answer_mistakes
+from ident_service.daemon.jobs.queue import Engine
+from ident_service.daemon.live import LiveRuns
+from ident_service.daemon.maintenance.scheduler import Keeper
+from ident_service.daemon.maintenance.webhook import Webhook, read_secret
+from ident_service.daemon.metrics import Metrics
+from ident_service.daemon.news import Watch
+from ident_service.daemon.openapi import describe
+from ident_service.daemon.request_guard import Doors
+from ident_service.daemon.routes import (
+    about,
+    access,
+    arms,
+    deletion,
+    descriptions,
+    events,
+    exports,
+    jobs,
+    live,
+    maintenance,
+    pruning,
+    runs,
+    uploads,
+)
+from ident_service.daemon.routes.checks import Checks
+from ident_service.daemon.settings import Settings
+from ident_service.daemon.uploads import delete_half_uploads
+from ident_service.daemon.web.routes import PAGES
+from ident_service.operations.acceptance import settle
+from ident_service.operations.deletion import remove_deleted
+from ident_service.registry.arms import know_shipped
+from ident_service.registry.audit import enter_waiting
+from ident_service.registry.database import Database
+from ident_service.registry.runs import rebuild_runs
+from ident_service.registry.tokens import first_token
+
+_REFRESH = 1.0  # s between reads of tokens that were made or revoked at a terminal
+_CLEAN = 600.0  # s between searches for abandoned uploads
+_LOG = logging.getLogger("ident.serve")
+ROUTERS = (
+    *(
+        about.router,
+        access.router,
+        arms.router,
+        descriptions.router,
+        jobs.router,
+        live.router,
+        runs.router,
+        pruning.router,
+    ),
+    *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
+)
+"""Routers of the application, in the order in which they are included."""
+
+
+def create_app(settings: Settings, connections: Connections | None = None) -> FastAPI:
+    """Create the service as an ASGI application; its database is opened now, its queue runs during its lifespan.
+
+    Args:
+        settings: how it runs.
+        connections: of the listener that it is served by; None where something else counts them.
+
+    Raises:
+        UsageError: the state folder cannot be used.
+    """
+    db = Database(settings.state)
+    first_token(db, settings.state)
+    know_shipped(db)
+    metrics = Metrics()
+    engine = Engine(
+        *(db, settings.state),
+        computing=settings.computing,
+        motion_door=settings.motion_door,
+        lease_factor=settings.lease_factor,
+        metrics=metrics,
+    )
+    keeper = Keeper(engine, _webhook(settings, db))
+    service = Service(settings, db, engine, Gate(db), metrics, keeper, Checks())
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        settle(db, settings.state)
+        remove_deleted(settings.state)
+        engine.start(lambda: rebuild_runs(db, settings.state))
+        keeper.start()
+        refreshing = asyncio.create_task(_refresh(service))
+        try:
+            yield
+        finally:
+            refreshing.cancel()
+            await run_in_threadpool(engine.close)
+            app.state.live.close()
+            await run_in_threadpool(keeper.close)
+            db.close()
+
+    app = FastAPI(
+        title="ident",
+        version=__version__,
+        description="Commission a robot arm. Everything is named by id; every motion needs an operator, a lease and "
+        "the typed name of its arm; stop needs none of them.",
+        openapi_url="/api/v1/openapi.json",
+        docs_url=None,  # these pages load scripts from other machines
+        redoc_url=None,
+        lifespan=lifespan,
+        generate_unique_id_function=_operation,
+    )
+    app.state.service = service
+    app.state.live = LiveRuns()
+    app.state.watch = Watch(db, settings.state, lambda row: jobs.answer_of(service, row).model_dump(mode="json"))
+    for router in ROUTERS:
+        app.include_router(router)
+    describe(app)
+    answer_mistakes(app)
+    book = Connections() if connections is None else connections
+    app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=book)
+    return app
+
+
+async def _refresh(service: Service) -> None:
+    clean = 0.0
+    while True:
+        await asyncio.sleep(_REFRESH)
+        try:
+            if time.monotonic() >= clean:
+                clean = time.monotonic() + _CLEAN
+                for upload in await run_in_threadpool(delete_half_uploads, service.state):
+                    _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
+            await run_in_threadpool(enter_waiting, service.db, service.state)
+            await run_in_threadpool(service.gate.refresh)
+            await run_in_threadpool(service.db.rest)
+        except (sqlite3.Error, OSError) as error:
+            _LOG.error("the state folder cannot be looked after: %s", error)
+
+
+def _webhook(settings: Settings, db: Database) -> Webhook | None:
+    if settings.webhook is None or settings.webhook_secret is None:
+        return None
+    return Webhook(db, settings.webhook, read_secret(settings.webhook_secret))
+
+
+def _operation(route: APIRoute) -> str:
+    """Return the function's name as the operation id of a route, for generated clients."""
+    return route.name

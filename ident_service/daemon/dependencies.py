@@ -1,0 +1,194 @@
+"""Authenticate requests and provide the routes' dependencies: the service, and the caller's name and role.
+
+A token comes as `Authorization: Bearer`, or a session of the page as a cookie. Browsers send cookies by themselves, so
+a request with a cookie that changes anything must also have an Origin header (`request_guard.py` has checked that it is this
+service's).
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+from fastapi import Depends, HTTPException, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
+
+from ident_service.daemon.authentication import Gate, Throttled
+from ident_service.daemon.jobs.queue import Engine
+from ident_service.daemon.maintenance.scheduler import Keeper
+from ident_service.daemon.metrics import Metrics
+from ident_service.daemon.routes.checks import Checks
+from ident_service.daemon.settings import Settings
+from ident_service.registry.database import Database
+from ident_service.registry.tokens import Access
+
+COOKIE: Final = "ident_session"
+_SAFE = frozenset({"GET", "HEAD"})
+
+
+WhileKnown = Callable[[AsyncIterator[str]], AsyncIterator[str]]
+
+
+@dataclass(frozen=True)
+class Service:
+    """Components that the routes work with, as `app.state.service`."""
+
+    settings: Settings
+    db: Database
+    engine: Engine
+    gate: Gate
+    metrics: Metrics
+    keeper: Keeper
+    checks: Checks
+
+    @property
+    def state(self) -> Path:
+        """Return the state folder."""
+        return self.settings.state
+
+
+def service_of(request: Request) -> Service:
+    """Return the service that this request reached."""
+    service = request.app.state.service
+    assert isinstance(service, Service)  # noqa: S101 - `create_app` put it there
+    return service
+
+
+async def serving(request: Request) -> Service:
+    """Return the service, as a dependency; a coroutine, so that a stop does not wait for a shared worker thread."""
+    return service_of(request)
+
+
+_bearer = HTTPBearer(auto_error=False, description="a token, as `ident token add` prints it")
+_cookie = APIKeyCookie(name=COOKIE, auto_error=False, description="a session, from /api/v1/login")
+Bearer = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
+Cookie = Annotated[str | None, Depends(_cookie)]
+
+
+def address_of(request: Request) -> str:
+    """Return the client address of a request; empty where it is not known."""
+    return request.client.host if request.client else ""
+
+
+async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access | None:
+    """Return name and role of the caller by token or session; None without a valid session and without a token.
+
+    Raises:
+        HTTPException: 401 for an unknown token, 429 after too many failed attempts, 403 for a changing request with a
+            session and without an Origin header.
+    """
+    service, found = service_of(request), None
+    if bearer is not None:
+        try:
+            found = await run_in_threadpool(service.gate.by_token, bearer.credentials, address_of(request))
+        except Throttled as error:
+            raise throttled(error) from None
+        if found is None:
+            raise unknown()
+    elif cookie is not None:
+        found = await run_in_threadpool(service.gate.by_session, cookie)
+        if found is not None:
+            _require_page(request)
+    if found is not None:
+        request.state.who = found.name
+    return found
+
+
+def _require_page(request: Request) -> None:
+    if request.method not in _SAFE and "origin" not in request.headers:
+        raise HTTPException(403, "a request with a session says which page it comes from")
+
+
+async def viewer(found: Annotated[Access | None, Depends(access_of)]) -> Access:
+    """Return the caller, who needs a token or a session; raises 401 for others."""
+    if found is None:
+        raise unknown()
+    return found
+
+
+async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
+    """Return the caller, who needs the role operator; raises 403 for others."""
+    if found.role != "operator":
+        raise HTTPException(403, f"the token {found.name!r} may look only; this needs the role operator")
+    return found
+
+
+async def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
+    """Return the name of the caller of a stop: any token or session, and on this machine anybody at all.
+
+    A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
+    From another machine it takes a token of any role, so that strangers on a network cannot keep an arm from working.
+    Memory is asked. The registry is where a stranger's token may be one that was made a moment ago.
+    """
+    service = service_of(request)
+    near = _loopback(address_of(request)) and service.settings.loopback
+    secret = None if bearer is None else bearer.credentials
+    found = service.gate.known(secret, cookie)
+    if found is None and not near:
+        await run_in_threadpool(service.gate.refresh)
+        if (found := service.gate.known(secret, cookie)) is None:
+            raise unknown()
+    request.state.who = "anybody" if found is None else found.name
+    return str(request.state.who)
+
+
+async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> Access:
+    """Return the caller who renews a lease, as `operator`, but from memory without waiting for the registry.
+
+    Raises:
+        HTTPException: as `operator`.
+    """
+    secret = None if bearer is None else bearer.credentials
+    found = service_of(request).gate.known(secret, cookie)
+    if found is None:
+        return await operator(await viewer(await access_of(request, bearer, cookie)))
+    if secret is None:
+        _require_page(request)
+    request.state.who = found.name
+    return await operator(found)
+
+
+async def while_known(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
+    """Return a filter that ends an event stream when its token or session is no longer valid."""
+    gate, secret = service_of(request).gate, None if bearer is None else bearer.credentials
+
+    async def told(events: AsyncIterator[str]) -> AsyncIterator[str]:
+        async for one in events:
+            if gate.known(secret, cookie) is None:
+                return
+            yield one
+
+    return told
+
+
+def unknown() -> HTTPException:
+    """Return the error for a caller without a valid token or session (401)."""
+    return HTTPException(
+        401, "give a token that counts: Authorization: Bearer TOKEN", headers={"WWW-Authenticate": "Bearer"}
+    )
+
+
+def throttled(error: Throttled) -> HTTPException:
+    """Return the error for too many failed attempts (429)."""
+    return HTTPException(429, str(error), headers={"Retry-After": str(math.ceil(error.seconds))})
+
+
+def _loopback(address: str) -> bool:
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return False
+
+
+Serving = Annotated[Service, Depends(serving)]
+Near = Annotated[str, Depends(anybody_near)]
+LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
+Viewer = Annotated[Access, Depends(viewer)]
+Told = Annotated[WhileKnown, Depends(while_known)]
+Operator = Annotated[Access, Depends(operator)]
+"""Dependencies that routes declare."""

@@ -1,0 +1,143 @@
+"""Turn errors into one model of failure with the fitting HTTP status."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+from dataclasses import asdict
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from ident_service.daemon.responses import Failure
+from ident_service.errors import (
+    AlreadyThere,
+    ArmError,
+    ConfigError,
+    DiskFull,
+    IdentError,
+    InUse,
+    ModelError,
+    MotionRefused,
+    ParameterError,
+    RecordingError,
+    RegistryBusy,
+    Unavailable,
+    UnknownId,
+    UsageError,
+)
+from ident_service.registry.database import FILE, shortage
+
+_STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
+    (UnknownId, 404),
+    (AlreadyThere, 409),
+    (InUse, 409),
+    (UsageError, 400),
+    (ConfigError, 422),
+    (ModelError, 422),
+    (ParameterError, 422),
+    (RecordingError, 422),
+    (MotionRefused, 409),
+    (DiskFull, 507),
+    (Unavailable, 503),
+    (ArmError, 409),
+)
+_KINDS: Final = {413: "TooLarge"}  # whose phrase is another one in each version of Python
+_LOG = logging.getLogger("ident.http")
+_WORDS: Final = {
+    400: "The request cannot be meant.",
+    401: "No token or session, or one that does not count.",
+    403: "Not with this role, or not from this page.",
+    404: "No such thing is known.",
+    405: "Not with this method.",
+    409: "Not now: a fault, a lease, another motion, a name that is taken, or what refers to it stands against it.",
+    413: "Too large.",
+    421: "The service is not called that.",
+    422: "The request has mistakes; the message names them.",
+    429: "Too many failed attempts.",
+    503: "Not at this moment: ask again after `Retry-After` seconds.",
+    507: "The disk, or the registry's share of it, is full.",
+}
+
+
+def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the `responses` of a route: its own failure statuses, besides those that any route may have."""
+    every = {400, 401, 403, 413, 421, 422, 429, 503, 507, *statuses}
+    return {status: {"model": Failure, "description": _WORDS[status]} for status in sorted(every)}
+
+
+def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Return the failure `responses` of a route whose successful answers are not JSON."""
+    content = {"application/json": {"schema": {"$ref": "#/components/schemas/Failure"}}}
+    return {
+        status: {"description": said["description"], "content": content} for status, said in failures(*statuses).items()
+    }
+
+
+def status_of(error: IdentError) -> int:
+    """Return the HTTP status for an error."""
+    return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
+
+
+def answer_mistakes(app: FastAPI) -> None:
+    """Install the exception handlers that turn every error into a `Failure`."""
+
+    async def _resources(request: Request, error: Exception) -> JSONResponse:
+        if (short := _short_of(request, error)) is None:
+            raise error  # a mistake of ours: the last handler tells it
+        status, kind, words, headers = short
+        _LOG.error("%s: %s", words, error, extra={"path": request.url.path})
+        return _answer(status, kind, words, headers)
+
+    app.add_exception_handler(sqlite3.Error, _resources)
+    app.add_exception_handler(OSError, _resources)
+
+    @app.exception_handler(IdentError)
+    async def _ident(request: Request, error: IdentError) -> JSONResponse:
+        for cause in (error, error.__context__):
+            if isinstance(cause, OSError | sqlite3.Error | Unavailable) and _short_of(request, cause) is not None:
+                return await _resources(request, cause)
+        status = status_of(error)
+        if status == HTTPStatus.INTERNAL_SERVER_ERROR:
+            _LOG.error("an answer failed", exc_info=error)
+        more = {"dependents": [asdict(one) for one in error.dependents]} if isinstance(error, InUse) else {}
+        return _answer(status, type(error).__name__, str(error), more=more)
+
+    @app.exception_handler(RequestValidationError)
+    async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
+        said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:10])
+        return _answer(422, "InvalidRequest", said)
+
+    @app.exception_handler(HTTPException)
+    async def _http(_: Request, error: HTTPException) -> JSONResponse:
+        kind = _KINDS.get(error.status_code) or HTTPStatus(error.status_code).phrase.title().replace(" ", "")
+        return _answer(error.status_code, kind, str(error.detail), dict(error.headers or {}))
+
+    @app.exception_handler(Exception)
+    async def _ours(_: Request, error: Exception) -> JSONResponse:
+        _LOG.error("an answer failed", exc_info=error)
+        return _answer(500, "InternalError", "the service failed; its log says how")
+
+
+def _short_of(request: Request, error: Exception) -> tuple[int, str, str, dict[str, str]] | None:
+    """Return the answer for a lack of a resource (locked registry, full disk); None for any other error."""
+    found = error
+    if not isinstance(error, Unavailable):
+        found = shortage(request.app.state.service.state / FILE, error) or error
+    if isinstance(found, RegistryBusy):
+        return 503, "RegistryBusy", "another process keeps the registry; ask again", {"Retry-After": "2"}
+    if isinstance(found, DiskFull):
+        return 507, "DiskFull", "the disk of the state folder is full; make room, then ask again", {}
+    return None
+
+
+def _answer(
+    status: int, kind: str, message: str, headers: dict[str, str] | None = None, more: dict[str, Any] | None = None
+) -> JSONResponse:
+    # The request may hold characters that cannot be encoded; they must not prevent an answer.
+    message = message.encode("utf-8", "replace").decode("utf-8")
+    return JSONResponse({"error": {"kind": kind, "message": message, **(more or {})}}, status, headers=headers)

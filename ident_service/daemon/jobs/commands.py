@@ -1,0 +1,276 @@
+"""Translate a request by ids into the arguments of a command: the only place where an id becomes a path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from ident_service.config.load import arm_from_json
+from ident_service.daemon.jobs.requests import (
+    MOVES,
+    Asked,
+    Base,
+    BusLoad,
+    BusProbe,
+    BusScan,
+    Check,
+    Compare,
+    ConfigCheck,
+    Correct,
+    Design,
+    Export,
+    Feasible,
+    Figures,
+    Home,
+    Identify,
+    Judge,
+    LeaveLimit,
+    Payload,
+    Preview,
+    RecordingOf,
+    Recover,
+    Rehearse,
+    Report,
+    Run,
+    Simulate,
+    Verify,
+    Watch,
+    Zero,
+)
+from ident_service.errors import UsageError
+from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
+from ident_service.operations.acceptance import ARM, PARAMETERS, accepted_set
+from ident_service.registry.arms import KnownArm, known_arm, resources
+from ident_service.registry.database import Database
+from ident_service.registry.motions import MOTIONS, motion_path, new_id
+from ident_service.registry.runs import (
+    COLUMNS,
+    EXPORTS,
+    REPORTS,
+    RUNS,
+    TAKEN_AWAY,
+    known_run,
+    recording_name,
+    run_file,
+    run_folder,
+)
+
+JOBS = "jobs"
+_LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, BusProbe, ConfigCheck)  # that make no folder
+_OF_A_RUN = (Report, Export, Verify, Compare, Feasible, Correct, Figures, Payload)
+_VERBS: Final = {
+    "leave_limit": ("recover",),
+    "zero": ("home",),
+    "bus_load": ("bus", "load"),
+    "bus_scan": ("bus", "scan"),
+    "bus_probe": ("bus", "probe"),
+    "config_check": ("config", "check"),
+}
+FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(TAKEN_AWAY, EXPORTS)}
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command that a job's process runs.
+
+    Attributes:
+        words: after `ident`.
+        arm: name, None where it is about none.
+        moves: whether an arm may get a torque, or another zero.
+        run: id of the folder that is made, or that it is about; None for a preflight.
+        resources: that it has for itself while it runs; none for one that only computes.
+        lease: how long its motion goes on after a renewal [s].
+        waits: whether it may wait for its resources; what a person says of an arm as it stands now may not.
+    """
+
+    words: tuple[str, ...]
+    arm: str | None
+    moves: bool
+    run: str | None
+    resources: tuple[str, ...]
+    lease: float
+    waits: bool = True
+
+
+def command(db: Database, state: Path, asked: Asked) -> Command:
+    """Return the command that carries out a request.
+
+    Raises:
+        UsageError: it names what is not known.
+        ConfigError: the arm's description has mistakes.
+    """
+    if isinstance(asked, _OF_A_RUN):
+        return _about_a_run(db, state, asked)
+    if isinstance(asked, Judge):
+        return _judgement(db, state, asked)
+    arm = known_arm(db, state, asked.arm)
+    made = None if isinstance(asked, _LOOKS) else new_id(arm.name)
+    words = [*_VERBS.get(asked.kind, (asked.kind,)), *_words(db, state, asked, arm)]
+    if made is not None:
+        words += ["--out", str(state / FOLDERS.get(asked.kind, RUNS) / made)]
+    moves = asked.kind in MOVES
+    if moves:
+        words.append("--lease-from-stdin")
+    return Command(
+        (*words, *_always(state)),
+        arm.name,
+        moves,
+        made,
+        resources(arm.config) if moves or isinstance(asked, Watch | Recover | BusScan | BusProbe) else (),
+        HOLD_TO_RUN_SECONDS if isinstance(asked, Rehearse) else LEASE_SECONDS,
+        waits=not isinstance(asked, Zero),
+    )
+
+
+def accepted_description(state: Path, arm: str, number: int) -> Path:
+    """Return the file of the description that an acceptance keeps.
+
+    Raises:
+        UsageError: there is no such acceptance; or its description names code, which only a terminal may run. An upload
+            cannot name any, but a folder that was imported can.
+        ParameterError: what was accepted was changed on the disk.
+    """
+    path = accepted_set(state, arm, number)[1] / ARM
+    if (code := arm_from_json(path).constraints.custom) is not None:
+        raise UsageError(
+            f"what was accepted for {arm} was identified with code (constraints.custom: {code}), which a daemon does "
+            "not run; use `ident reidentify` at a terminal"
+        )
+    return path
+
+
+def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
+    path = str(arm.path)
+    if isinstance(asked, Design):
+        return [path, *_design(db, state, asked)]
+    if isinstance(asked, Identify):
+        recordings = _recordings(db, state, asked.recordings)
+        judged = [f"--validate={one}" for one in _recordings(db, state, asked.validate_on)]
+        judged += _columns(db, state, (*asked.recordings, *asked.validate_on))
+        chosen = {"method": asked.method, "feasible-set": asked.feasible_set, "prior": asked.prior}
+        if asked.as_accepted is not None:
+            path = str(accepted_description(state, arm.name, asked.as_accepted))
+        return [*recordings, "--arm", path, *judged, *_given(chosen)]
+    if isinstance(asked, Simulate):
+        motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
+        return [path, *motion, *_given({"seed": asked.seed, "feasible-set": asked.feasible_set})]
+    if isinstance(asked, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
+        return [path]
+    if isinstance(asked, BusLoad):
+        return [path, *_given({"rate": asked.rate})]
+    if isinstance(asked, Zero):
+        return [path, "--zero", "--confirm", arm.name]
+    if isinstance(asked, LeaveLimit):
+        return [path, "--leave-limit"]
+    if isinstance(asked, Watch):
+        return [path, f"--seconds={asked.seconds!r}"]
+    if isinstance(asked, Check | Run | Rehearse | Preview):
+        motion = [] if asked.motion is None else [str(motion_path(db, state, asked.motion))]
+        if isinstance(asked, Check):
+            return [path, *motion, *(["--home"] if asked.home else []), "--confirm", arm.name]
+        speed = [] if isinstance(asked, Preview) else [f"--speed={asked.speed!r}"]
+        return [path, *motion, *speed, *(_until(asked) if isinstance(asked, Run) else [])]
+    raise AssertionError(asked)
+
+
+def _until(asked: Run) -> list[str]:
+    if asked.until is None:
+        return []
+    return [f"--until={asked.until.share!r}", *(f"--parameter={one}" for one in asked.until.parameters)]
+
+
+def _design(db: Database, state: Path, asked: Design) -> list[str]:
+    if asked.seconds is None and asked.starts is None:
+        raise UsageError("a search ends: give seconds, or starts, or both")
+    after = [f"--after={path}" for path in _as_described(db, state, asked.after)]
+    chosen = {"search-time": asked.seconds, "starts": asked.starts, "seed": asked.seed, "criterion": asked.criterion}
+    parameters = [f"--parameter={expression}" for expression in asked.parameters]
+    return [*after, *parameters, *_given({**chosen, "motion": asked.motion})]
+
+
+def _about_a_run(
+    db: Database,
+    state: Path,
+    asked: Report | Export | Verify | Compare | Feasible | Correct | Figures | Payload,
+) -> Command:
+    folder, arm = run_folder(db, state, asked.run), str(known_run(db, asked.run)["arm"])
+    made = new_id(arm) if asked.kind in TAKEN_AWAY else None
+    place = state / (REPORTS if isinstance(asked, Report) else EXPORTS)
+    if isinstance(asked, Verify):
+        described = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
+        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS)), *_given({"arm": described})]
+    elif isinstance(asked, Compare):
+        words = ["compare", str(folder), str(run_folder(db, state, asked.other))]
+    elif isinstance(asked, Feasible | Correct):
+        conditions = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
+        words = [asked.kind, str(run_file(db, state, asked.run, PARAMETERS))]
+        words += _given({"feasible-set": asked.feasible_set, "arm": conditions})
+        if isinstance(asked, Correct):
+            words += [f"--metric={asked.metric}", "--out", str(place / str(made) / PARAMETERS)]
+    elif isinstance(asked, Report):
+        words = ["report", str(folder), "--out", str(place / f"{asked.run}.html")]
+    elif isinstance(asked, Payload):
+        words = ["payload", str(folder), *_as_described(db, state, asked.recordings), "--out", str(place / str(made))]
+        words += ["--refit-offsets"] if asked.refit_offsets else []
+    else:
+        formats = asked.format if isinstance(asked, Figures) else ",".join(asked.formats)
+        words = [asked.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
+    if made is not None or isinstance(asked, Report):
+        # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
+        (place / str(made) if isinstance(asked, Correct) else place).mkdir(parents=True, exist_ok=True)
+    return Command((*words, *_always(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
+
+
+def _judgement(db: Database, state: Path, asked: Judge) -> Command:
+    run = known_run(db, asked.run)
+    if run["arm"] != asked.arm:
+        raise UsageError(f"the run {asked.run} is about the arm {run['arm']}, not {asked.arm}")
+    accepted = accepted_set(state, asked.arm, asked.against)[1] / PARAMETERS
+    words = ["compare", str(accepted), str(run_folder(db, state, asked.run)), "--keep"]
+    return Command((*words, *_always(state)), asked.arm, False, asked.run, (), LEASE_SECONDS)
+
+
+def _recordings(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+    return [f"{_recording(db, state, one)}{range_words(one)}" for one in asked]
+
+
+def _recording(db: Database, state: Path, one: RecordingOf) -> Path:
+    return run_file(db, state, one.run, one.name or recording_name(db, one.run))
+
+
+def _as_described(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+    """Return paths as `_recordings` does, for commands that take no columns file.
+
+    Raises:
+        UsageError: a recording came with one.
+    """
+    if _columns(db, state, asked):
+        raise UsageError(
+            "a recording that came with a columns file can be identified from only; for this, say how its "
+            "columns are laid out in the arm's description, and upload it without"
+        )
+    return _recordings(db, state, asked)
+
+
+def _columns(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+    """Return `--columns` options for the uploaded recordings that came with a columns file."""
+    files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in asked}
+    return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
+
+
+def range_words(one: RecordingOf) -> str:
+    """Format a recording's range as the command line has it; empty for a whole recording."""
+    if one.start is None and one.end is None:
+        return ""
+    return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))
+
+
+def _given(options: Mapping[str, object]) -> list[str]:
+    """Return options that have a value, each in one word, so that no value can pass for an option."""
+    return [f"--{name}={value}" for name, value in options.items() if value is not None]
+
+
+def _always(state: Path) -> tuple[str, ...]:
+    return ("--json", "--state", str(state))

@@ -1,0 +1,363 @@
+"""Run jobs in the order they came: one motion at a time per arm and per bus, a few computations beside them.
+
+One thread starts what may run and sees its end, one per ended job enters it, one keeps leases (`live_jobs.py`). All
+that lasts is in the registry and in the jobs' folders, so that this process may be killed at any moment: `recovery.py`
+tells afterwards what became of what ran.
+
+A motion's lease is renewed by whoever asked for it; each renewal goes on to the motion's process as one line. Silence
+of either asks for the controlled stop. A scheduled motion's lease is our own.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sqlite3
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ident_service.daemon.jobs.child_process import Child, OwnChild, UnitChild
+from ident_service.daemon.jobs.commands import JOBS, Command, command
+from ident_service.daemon.jobs.live_jobs import TICK, LiveJob, LiveJobs
+from ident_service.daemon.jobs.outcome import lateness_of, outcome, said
+from ident_service.daemon.jobs.progress import Progress, progress
+from ident_service.daemon.jobs.reach import confirm_support, finish_arm, moving_arms, pause_arm, stop_arms
+from ident_service.daemon.jobs.recovery import explain_interrupted, mark_interrupted
+from ident_service.daemon.jobs.registration import keep
+from ident_service.daemon.jobs.requests import Asked
+from ident_service.daemon.metrics import Metrics
+from ident_service.errors import IdentError, UsageError
+from ident_service.motion.control_file import stop_asked_ns
+from ident_service.operations.arm_state import control_path
+from ident_service.registry import jobs as rows
+from ident_service.registry.audit import AuditQueue, note
+from ident_service.registry.database import Database, Row
+from ident_service.registry.motions import new_id
+from ident_service.registry.runs import RUNS
+
+_POLITE = 15.0  # s for a computation that was asked to end
+_AGAIN = 1.0  # s between attempts to write to a registry that is full or locked
+LOG = logging.getLogger("ident.jobs")
+
+
+class Engine:
+    """Queue of jobs that runs them, and stops arms."""
+
+    def __init__(
+        self,
+        db: Database,
+        state: Path,
+        *,
+        computing: int = 1,
+        motion_door: Path | None = None,
+        lease_factor: float = 1.0,
+        now: Callable[[], float] = time.monotonic,
+        metrics: Metrics | None = None,
+    ) -> None:
+        """Create the engine; nothing runs before `start`.
+
+        Args:
+            db: the registry.
+            state: the state folder.
+            computing: how many jobs compute at a time.
+            motion_door: socket of the unit that motions run in; None for processes of our own.
+            lease_factor: how much longer than usual the service waits for a renewal before it tells the motion's
+                process to stop, which counts by itself; for tests on machines that stall.
+            now: the leases' clock [s].
+            metrics: that count jobs and leases; figures of its own if None.
+        """
+        self.metrics = Metrics() if metrics is None else metrics
+        self.db, self.state, self.audit = db, state, AuditQueue(db)
+        self.live = LiveJobs(lease_factor, now, self.metrics.renewed)
+        self._computing, self._door, self._now = computing, motion_door, now
+        self._unwritten: set[str] = set()  # jobs whose end waits for room in the registry
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self._first: Callable[[], Any] = lambda: None
+        self.beat = now()
+
+    def start(self, first: Callable[[], Any] = lambda: None) -> None:
+        """Mark the jobs that were interrupted, then begin to run the queue; returns at once.
+
+        Args:
+            first: done by the queue's thread before it begins anything.
+        """
+        self._first = first
+        mark_interrupted(self.db, self.state)
+        self._requeue()
+        self._thread.start()
+        self.live.start()
+
+    @property
+    def closing(self) -> bool:
+        """Return whether the engine is ending."""
+        return self._closing.is_set()
+
+    @property
+    def healthy(self) -> bool:
+        """Return whether the queue is being looked after, and the registry can be written."""
+        alive = self._thread.is_alive() and self.live.healthy
+        return alive and self._now() - self.beat < 30.0 and not self._unwritten
+
+    def create(
+        self,
+        asked: Asked,
+        by: str,
+        *,
+        own_lease: bool = False,
+        stops: int | None = None,
+        entering: Callable[[Row], None] = lambda _: None,
+    ) -> Row:
+        """Queue a job.
+
+        Args:
+            asked: by ids.
+            by: the name of a token, or `service`.
+            own_lease: whether a motion's lease is the service's own, as a scheduled one's is.
+            stops: what `live.stops` answered when a person, or the schedule, began that of which this is a later step.
+            entering: writes what belongs to the job in the same transaction.
+
+        Raises:
+            UsageError: it names what is not known.
+            ConfigError: the arm's description has mistakes.
+            MotionRefused: the service is ending, or somebody has asked for a stop meanwhile; or it may not wait, and
+                would have to.
+        """
+        order = command(self.db, self.state, asked)
+        job = new_id(asked.kind)
+        live = LiveJob(job, order, by, own_lease, self._now(), time.monotonic_ns())
+        self.live.add(live, stops)
+        try:
+            (self.state / JOBS / job).mkdir(parents=True)
+            with self.db.transaction():
+                row = rows.add_job(
+                    *(self.db, job, asked.kind, order.arm, asked.model_dump(mode="json"), list(order.words), by),
+                    motion=order.moves,
+                    run=order.run,
+                )
+                note(self.db, by, "job created", job, kind=asked.kind, arm=order.arm)
+                entering(row)
+        except BaseException:
+            self.live.remove(live)
+            with suppress(OSError):
+                (self.state / JOBS / job).rmdir()
+            raise
+        self.live.enter(live)
+        return row
+
+    def cancel(self, job: str, by: str, why: str = "") -> None:
+        """End a job: a motion by a controlled stop, a computation by SIGTERM, one that waits at once.
+
+        Raises:
+            UsageError: no such job, or it has ended.
+        """
+        if not self.live.end(job, why or f"cancelled by {by}"):
+            raise UsageError(f"the job {job} has ended already: {rows.known_job(self.db, job)['state']}")
+        self.audit.note(by, "job cancelled", job)
+
+    def stop(self, arm: str | None, by: str) -> dict[str, list[str]]:
+        """Bring an arm, or all, to a controlled stop, whoever moves it; motions that wait are cancelled.
+
+        Waits for nobody: the word to our own children is a line in a pipe, the control file is memory, and what the
+        audit trail says of it is entered later.
+        """
+        reached, ended = list[str](), self.live.stop(arm, f"{by} asked for a stop")
+        try:
+            reached = stop_arms(self.state, arm)
+        finally:
+            self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
+        return {"arms": reached, "jobs": ended}
+
+    def pause(self, arm: str, by: str, *, wanted: bool) -> bool:
+        """Pause an arm, or let it go on (`wanted` False); return whether a process moves it."""
+        reached = pause_arm(self.state, arm, wanted=wanted)
+        self.audit.note(by, "pause" if wanted else "resume", arm, reached=[arm] if reached else [])
+        return reached
+
+    def finish(self, arm: str, by: str) -> bool:
+        """End a run early by its regular end, out of a pause too; return whether a process moves the arm."""
+        reached = finish_arm(self.state, arm)
+        self.audit.note(by, "finish", arm, reached=[arm] if reached else [])
+        return reached
+
+    def confirm_support(self, arm: str, by: str) -> bool:
+        """Pass on a person's confirmation that an arm held after a stop is supported; return whether one was held."""
+        reached = confirm_support(self.state, arm)
+        self.audit.note(by, "supported", arm, reached=[arm] if reached else [])
+        return reached
+
+    def progress(self, row: Row) -> Progress | None:
+        """Return the progress of a running job; None for one that does not run."""
+        if row["state"] != "running" or row["started"] is None:
+            return None
+        typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
+        return progress(said(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
+
+    def moving(self) -> list[str]:
+        """Return the names of the arms that any process moves."""
+        return moving_arms(self.state)
+
+    def begin_closing(self) -> None:
+        """Stop all arms and begin nothing more; returns at once."""
+        self._closing.set()
+        self.live.end_all("the service ends")
+        self.live.changed.set()
+
+    def close(self, seconds: float = 40.0) -> None:
+        """Bring the arms to rest, end the other jobs, and wait for both up to a bound [s]."""
+        self.begin_closing()
+        if self._thread.ident is not None:
+            self._thread.join(seconds)
+        self.live.close()
+        self.audit.close()
+
+    # --- what the thread does
+
+    def _work(self) -> None:
+        try:
+            explain_interrupted(self.db, self.state, self._closing.is_set)
+            self._first()
+        except Exception:
+            LOG.exception("what was interrupted could not be told")
+        while True:
+            self.beat = self._now()
+            try:
+                self._look()
+            except sqlite3.Error as error:
+                LOG.error("the queue waits for the registry: %s", error)
+                time.sleep(_AGAIN)
+            except Exception:  # the queue must go on, whatever one job does to it
+                LOG.exception("the queue stumbled")
+                time.sleep(_AGAIN)
+            if self.closing and not self.live:
+                return
+            self.live.changed.wait(TICK if self.live else 1.0)
+            self.live.changed.clear()
+
+    def _look(self) -> None:
+        found = self.live.entered()
+        for live in found:
+            if live.order.moves and not live.asked_to_end and self._stopped_at_terminal(live):
+                self.live.end(live.job, "somebody asked for a stop")
+            # Running jobs first: a waiting one may have to wait for the registry.
+            if live.child is not None:
+                self._watch(live, live.child)
+        for live in found:
+            if live.child is None and live in self.live:
+                self._wait(live)
+
+    def _stopped_at_terminal(self, live: LiveJob) -> bool:
+        """Return whether a stop was asked for after this motion was, possibly not through this service."""
+        stamp = stop_asked_ns(control_path(self.state, str(live.order.arm)))
+        # A stamp in the future is from before the machine was started.
+        return live.asked_ns < stamp <= time.monotonic_ns()
+
+    def _wait(self, live: LiveJob) -> None:
+        """Handle a queued job: end it if asked to, begin it if it is its turn."""
+        if live.asked_to_end:
+            self._finish(live, "cancelled", live.asked_to_end, None)
+        elif self.live.free(live, self._computing):
+            self._begin(live)
+
+    def _begin(self, live: LiveJob) -> None:
+        folder = self.state / JOBS / live.job
+        if not rows.started(self.db, live.job, ""):
+            self.live.remove(live)
+            return
+        if live.asked_to_end:  # cancelled while the registry was written
+            self._finish(live, "cancelled", live.asked_to_end, None)
+            return
+        child: Child
+        try:
+            # The unit for motions also has access to the buses.
+            if live.order.resources and self._door is not None:
+                child = UnitChild(live.order.words, folder, self._door)
+            else:
+                child = OwnChild(live.order.words, folder)
+        except (IdentError, OSError) as error:
+            self._finish(live, "failed", f"its process could not be started: {error}", None)
+            return
+        self.live.began(live, child)
+        self.db.write("UPDATE jobs SET process = ? WHERE id = ?", child.process, live.job)
+        LOG.info("job started", extra={"job": live.job, "arm": live.order.arm})
+
+    def _watch(self, live: LiveJob, child: Child) -> None:
+        """Check a running job; end a computation by SIGTERM, then by SIGKILL, and conclude a job that has ended."""
+        if live.asked_to_end and not live.order.moves:
+            if not live.told:
+                live.told = True
+                child.signal(signal.SIGTERM)
+            elif not live.killed and self._now() - live.since > _POLITE:
+                live.killed = True
+                child.signal(signal.SIGKILL)
+        if child.ended() and not live.concluding:
+            # In a thread of its own: hashing a long recording takes long.
+            live.concluding = True
+            threading.Thread(target=self._conclude, args=(live, child), name=live.job, daemon=True).start()
+
+    def _conclude(self, live: LiveJob, child: Child) -> None:
+        """Enter what an ended job has made, then the job's end."""
+        self.live.conclude(live, child)
+        ended = outcome(said(self.state / JOBS / live.job), child.exit_code, live.asked_to_end)
+        while True:
+            try:
+                self._finish(live, ended.state, self._kept(live, ended.detail), ended.exit_code)
+            except sqlite3.Error as error:
+                # For example a full disk; until there is room, the service must not count as healthy.
+                LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
+                self._unwritten.add(live.job)
+                if self._closing.wait(_AGAIN):
+                    return  # the next start determines the job's outcome
+            else:
+                self._unwritten.discard(live.job)
+                return
+
+    def _kept(self, live: LiveJob, detail: str) -> str:
+        """Enter what a job made; return `detail`, with the error if that failed."""
+        try:
+            keep(self.db, self.state, rows.known_job(self.db, live.job), live.by)
+        except sqlite3.Error:
+            raise  # as for the end of the job itself
+        except Exception as error:  # whatever stands in its way, the job has ended
+            LOG.exception("what a job made could not be entered")
+            return "; ".join(filter(None, (detail, f"its folder could not be entered: {error}")))
+        return detail
+
+    def _finish(self, live: LiveJob, state: str, detail: str, code: int | None) -> None:
+        with self.db.transaction():
+            entered = rows.ended(self.db, live.job, state, detail, code)
+            if entered:
+                note(self.db, live.by, "job ended", live.job, state=state, detail=detail)
+        if entered:
+            self._count(live.job)
+        self.live.remove(live)
+        LOG.info("job ended", extra={"job": live.job, "state": state, "detail": detail})
+
+    def _count(self, job: str) -> None:
+        row = rows.known_job(self.db, job)
+        began, ended = row["started"] or row["ended"], row["ended"]
+        ran = max(ended - began, 0.0) if row["started"] else None
+        self.metrics.job(row["kind"], row["state"], max(began - row["created"], 0.0), ran)
+        if row["motion"] and row["run"] is not None:
+            self.metrics.lateness(lateness_of(self.state / RUNS / row["run"]))
+
+    def _requeue(self) -> None:
+        """Queue computations again that waited when the service ended, in their old order."""
+        from pydantic import TypeAdapter
+
+        reader: TypeAdapter[Asked] = TypeAdapter(Asked)
+        for row in rows.queue(self.db):
+            try:
+                order = command(self.db, self.state, reader.validate_python(row["request"]))
+            except (IdentError, ValueError) as error:
+                rows.ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
+                continue
+            # Its arguments and folder are those that were entered when it was requested.
+            order = Command(tuple(row["words"]), order.arm, order.moves, row["run"], order.resources, order.lease)
+            waiting = LiveJob(row["id"], order, row["created_by"], False, self._now())
+            self.live.add(waiting)
+            self.live.enter(waiting)

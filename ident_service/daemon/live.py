@@ -1,0 +1,228 @@
+"""Show a run while it moves: samples thinned for display, and parameter deviations so far.
+
+All is read from what the recorder has flushed into the run's file: the motion process, its ring buffer and its recorder
+are never asked for anything. Ten viewers cost as much as one: the first to ask reads on for all. The parameter
+deviations are computed by a thread, one bounded step every 1.5 s, and only while somebody watches. The thread keeps the
+service's own priority: with a lower one it could be kept waiting while it holds the interpreter, and a stop with it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from ident_service.config.load import arm_from_json
+from ident_service.errors import IdentError, RecordingError
+from ident_service.recordings.recording import Block
+from ident_service.recordings.tail import RecordingTail, Samples
+
+if TYPE_CHECKING:  # the thread that needs estimation imports it, so that the service starts without
+    from ident_service.estimation.growing import Doubt, GrowingInformation
+
+ARM, RECORDING = "arm.json", "run.mcap"
+BIN_NS: Final = 20_000_000  # one point of the display
+_LOOK = 0.08  # s between reads of the file, however many viewers there are
+_WORK = 1.5  # s between updates of the deviations
+_PATIENCE = 5.0  # s without a viewer, after which the deviations are not updated
+_FRAMES = 600  # frames kept for viewers who join late
+_MOST_WAITING = 120  # pieces of at most a MiB of the file that may wait for the thread
+_MOST_RUNS = 8
+_LOG = logging.getLogger("ident.live")
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One event for viewers, as JSON: `kind` is `samples` or `doubt`."""
+
+    number: int
+    kind: str
+    data: str
+
+
+class LiveRun:
+    """One run that is being recorded, with its viewers' events; may be used from any thread."""
+
+    def __init__(self, folder: Path, now: Callable[[], float] = time.monotonic) -> None:
+        """Create the follower; nothing is read before the first call of `since`.
+
+        Args:
+            folder: of the run, there or not yet.
+            now: clock of looks and viewers [s].
+        """
+        self._folder, self._now = folder, now
+        self._lock = threading.Lock()
+        self._tail: RecordingTail | None = None
+        self._frames: deque[Frame] = deque(maxlen=_FRAMES)
+        self._number, self._looked, self._seen = 0, -math.inf, now()
+        self._first_ns: int | None = None
+        self._waiting: deque[Samples] = deque(maxlen=_MOST_WAITING)
+        self._worker: threading.Thread | None = None
+        self._growing: GrowingInformation | None = None
+        self._lost = False
+        self.broken = ""
+
+    def since(self, number: int) -> list[Frame]:
+        """Return the frames after this number; read on in the file if no viewer has just done so."""
+        now = self._now()
+        self._seen = now
+        if self._lock.acquire(blocking=False):
+            try:
+                if now - self._looked >= _LOOK and not self.broken:
+                    self._looked = now
+                    self._look()
+            except (RecordingError, OSError) as error:
+                self.broken = str(error)
+                _LOG.warning("a run cannot be watched: %s", error)
+            finally:
+                self._lock.release()
+        return [frame for frame in list(self._frames) if frame.number > number]
+
+    def close(self) -> None:
+        """Close the file."""
+        with self._lock:
+            self._seen = -math.inf
+            if self._tail is not None:
+                self._tail.close()
+            self._tail, self.broken = None, self.broken or "closed"
+
+    def _look(self) -> None:
+        if self._tail is None:
+            for name in (f"{RECORDING}.partial", RECORDING):
+                try:
+                    self._tail = RecordingTail(self._folder / name)
+                    break
+                except FileNotFoundError:
+                    continue
+            else:
+                return
+        samples = self._tail.read()
+        if samples is None:
+            return
+        self._publish("samples", self._thinned(samples, self._tail.joint_names))
+        self._lost |= len(self._waiting) == _MOST_WAITING
+        if self._lost:
+            return
+        self._waiting.append(samples)
+        if self._worker is None or not self._worker.is_alive():
+            self._worker = threading.Thread(target=self._work, name="live doubt", daemon=True)
+            self._worker.start()
+
+    def _thinned(self, samples: Samples, names: tuple[str, ...]) -> dict[str, Any]:
+        """Return the last position and torque of every 20 ms, and the largest following error in them."""
+        if self._first_ns is None:
+            self._first_ns = int(samples.stamp_ns[0])
+        bins = (samples.stamp_ns - self._first_ns) // BIN_NS
+        starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
+        ends = np.append(starts[1:], len(bins)) - 1
+        error = samples.reference - samples.position
+        high, low = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
+        time_s = (samples.stamp_ns[ends] - self._first_ns) * 1e-9
+        return {
+            "joints": list(names),
+            "time": _numbers(time_s, 3),
+            "position": [_numbers(column, 5) for column in samples.position[ends].T],
+            "torque": [_numbers(column, 4) for column in samples.torque[ends].T],
+            "error": [_numbers(column, 7) for column in np.where(high >= -low, high, low).T],
+        }
+
+    def _publish(self, kind: str, value: dict[str, Any]) -> None:
+        self._number += 1
+        self._frames.append(Frame(self._number, kind, json.dumps(value, allow_nan=False)))
+
+    # --- the thread that computes the deviations
+
+    def _work(self) -> None:
+        from ident_service.estimation.growing import GrowingInformation
+        from ident_service.model.arm_model import arm_model
+
+        try:
+            if self._growing is None:
+                self._growing = GrowingInformation(arm_model(arm_from_json(self._folder / ARM)))
+            while self._now() - self._seen < _PATIENCE:
+                time.sleep(_WORK)
+                # Samples were dropped: the deviations would be those of a run with a gap.
+                if self._lost:
+                    return
+                self._one_step(self._growing)
+        except (IdentError, OSError, np.linalg.LinAlgError) as error:
+            self._lost = True
+            _LOG.warning("doubt cannot be shown while the arm moves: %s", error)
+
+    def _one_step(self, growing: GrowingInformation) -> None:
+        while self._waiting:
+            samples = self._waiting.popleft()
+            growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
+        if growing.step() and (doubt := growing.doubt()) is not None:
+            told = _told(doubt, growing.base.expressions, growing.base.units)
+            with self._lock:
+                self._publish("doubt", told)
+
+
+class LiveRuns:
+    """Table of the runs that somebody watches, the last few."""
+
+    def __init__(self) -> None:
+        self._lock, self._runs = threading.Lock(), OrderedDict[str, LiveRun]()
+
+    def run(self, name: str, folder: Path) -> LiveRun:
+        """Return the run of this id, added if it is new."""
+        with self._lock:
+            found = self._runs.setdefault(name, LiveRun(folder))
+            self._runs.move_to_end(name)
+            while len(self._runs) > _MOST_RUNS:
+                self._runs.popitem(last=False)[1].close()
+        return found
+
+    def close(self) -> None:
+        """Close all runs."""
+        for name in list(self._runs):
+            self.forget(name)
+
+    def forget(self, name: str) -> None:
+        """Close and remove a run that has ended."""
+        with self._lock:
+            found = self._runs.pop(name, None)
+        if found is not None:
+            found.close()
+
+
+def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) -> dict[str, Any]:
+    from ident_service.estimation.doubt import shares
+
+    return {
+        "seconds": round(doubt.seconds, 2),
+        "parameters": [
+            {
+                "expression": expression,
+                "unit": unit,
+                "value": float(value),
+                "deviation": float(deviation) if math.isfinite(deviation) else None,
+                "share": float(share) if math.isfinite(share) else None,
+                "verdict": verdict,
+            }
+            for expression, unit, value, deviation, share, verdict in zip(
+                expressions,
+                units,
+                doubt.beta,
+                doubt.deviations,
+                shares(doubt.beta, doubt.deviations, doubt.negligible),
+                doubt.verdicts,
+                strict=True,
+            )
+        ],
+    }
+
+
+def _numbers(values: np.ndarray[Any, Any], digits: int) -> list[float | None]:
+    """Return rounded numbers for JSON; None for one that is not finite."""
+    return [round(value, digits) if math.isfinite(value) else None for value in values.tolist()]

@@ -1,0 +1,101 @@
+"""Serve the routes about the service itself: health, metrics, identity, sessions of the page, audit trail."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Annotated
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import PlainTextResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service import __version__
+from ident_service.daemon.authentication import SESSION_SECONDS, Throttled
+from ident_service.daemon.dependencies import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
+from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.paging import PAGES, BeforeNumber, Most, Page
+from ident_service.daemon.responses import AuditLine, HealthAnswer, WhoAnswer
+from ident_service.errors import IdentError
+from ident_service.operations.arm_state import fault_file
+from ident_service.operations.drift_alarms import alarms
+from ident_service.operations.maintenance_schedule import dues
+from ident_service.registry.audit import trail
+
+router = APIRouter(tags=["service"], responses=failures())
+AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines
+
+
+class Login(BaseModel):
+    """Token to be exchanged for a session of the page."""
+
+    model_config = ConfigDict(extra="forbid")
+    token: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+@router.get(
+    "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
+)
+def healthz(service: Serving, response: Response) -> HealthAnswer:
+    """Return whether the service looks after its queue and its schedule; asks for no token."""
+    healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
+    response.status_code = 200 if healthy else 503
+    return HealthAnswer(healthy=healthy, version=__version__)
+
+
+@router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
+def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
+    """Return the metrics of the service in Prometheus' text format."""
+    rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")
+    faults, place = dict[str, int](), service.state / "arms"
+    for folder in place.iterdir() if place.is_dir() else ():
+        try:
+            faults[folder.name] = len(fault_file(service.state, folder.name).latched())
+        except IdentError:
+            faults[folder.name] = 1  # a damaged file prevents motion like a fault
+    jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
+    due = Counter[str](row["arm"] for row in dues(service.db))
+    drifted = Counter[str](row["arm"] for row in alarms(service.db, most=10_000))
+    text = service.metrics.text(jobs, service.engine.moving(), faults, due, drifted)
+    return PlainTextResponse(text, media_type="text/plain; version=0.0.4")
+
+
+@router.get("/api/v1/whoami")
+def whoami(who: Viewer) -> WhoAnswer:
+    """Return name and role of the token or session that asks."""
+    return WhoAnswer(name=who.name, role=who.role)
+
+
+@router.post("/api/v1/login")
+def login(service: Serving, request: Request, response: Response, body: Login) -> WhoAnswer:
+    """Exchange a token for a session; its cookie cannot be read by scripts and is sent by no other site."""
+    try:
+        found = service.gate.log_in(body.token, address_of(request))
+    except Throttled as error:
+        raise throttled(error) from None
+    if found is None:
+        raise unknown()
+    session, who = found
+    response.set_cookie(
+        *(COOKIE, session),
+        max_age=int(SESSION_SECONDS),
+        path="/",
+        secure=service.settings.tls,
+        httponly=True,
+        samesite="strict",
+    )
+    return WhoAnswer(name=who.name, role=who.role)
+
+
+@router.post("/api/v1/logout", status_code=204)
+def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
+    """End the session of the page."""
+    if cookie is not None:
+        service.gate.log_out(cookie)
+    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+
+
+@router.get("/api/v1/audit", responses=PAGES)
+def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
+    """List the lines of the audit trail, the newest first."""
+    service.engine.audit.flush(AUDIT_SECONDS)
+    return [AuditLine(**row) for row in page(most, lambda n: trail(service.db, before=before, most=n))]

@@ -1,0 +1,233 @@
+"""Serve the routes about arms: list, description, faults, acceptances, pause and resume, challenge, motions."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated
+
+from fastapi import APIRouter
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.config.source import MOST_BYTES
+from ident_service.daemon.authentication import CHALLENGE_SECONDS
+from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
+from ident_service.daemon.errors import failures
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id
+from ident_service.daemon.paging import PAGES, BeforeId, Most, Page
+from ident_service.daemon.responses import (
+    AcceptanceAnswer,
+    ArmAnswer,
+    ArmLine,
+    AskedAnswer,
+    ChallengeAnswer,
+    FaultAnswer,
+    MotionAnswer,
+)
+from ident_service.errors import MotionRefused
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.control_file import mover
+from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
+from ident_service.operations.arm_state import control_path, fault_file
+from ident_service.operations.description_process import judge_apart
+from ident_service.registry import arms as known
+from ident_service.registry import motions
+from ident_service.registry.audit import note
+from ident_service.registry.runs import run_folder
+
+router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
+Text = Annotated[str, Field(max_length=known.MOST_BYTES)]
+Note = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Description(_Body):
+    """Description of an arm as YAML, and the files that it names, by name."""
+
+    description: Annotated[str, Field(max_length=MOST_BYTES)]
+    files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+
+
+class Support(_Body):
+    """Confirmation that the arm is supported or home: its name, typed by a person who sees it."""
+
+    confirm: Annotated[str, Field(max_length=200)]
+
+
+class NewArm(Description):
+    """Description of an arm to be stored.
+
+    `replace` says that it may take the place of another one of its name; without it that is answered 409.
+    """
+
+    replace: bool = False
+
+
+class MotionUpload(_Body):
+    """Motion for an arm: the content of a `motion.json`."""
+
+    arm: ArmName
+    motion: Annotated[str, Field(max_length=4 * 2**20)]
+
+
+class Acceptance(_Body):
+    """Decision of a person that the parameters of a run are the arm's."""
+
+    run: Id
+    note: Note
+
+
+class Rollback(_Body):
+    """Decision of a person to return to an earlier set; the one before the current set if `to` is left out."""
+
+    note: Note
+    to: Annotated[int, Field(ge=1, lt=10_000)] | None = None
+
+
+@router.get("/arms")
+def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
+    """List all arms by name."""
+    return [ArmLine(**row) for row in known.arm_names(service.db)]
+
+
+@router.post("/arms", status_code=201, responses=failures(409))
+def add_arm(service: Serving, who: Operator, body: NewArm) -> ArmAnswer:
+    """Add an arm by its description; sending the same one again changes nothing."""
+    text, files = body.description, body.files
+    with service.checks.place():
+        added = known.add_arm(
+            *(service.db, service.state, text, files, who.name), replace=body.replace, judge=judge_apart
+        )
+    return _arm(service, added.name)
+
+
+@router.get("/arms/{arm}")
+def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
+    """Show an arm: its description, who moves it, its faults, what was accepted."""
+    return _arm(service, arm)
+
+
+@router.post("/arms/{arm}/challenge", status_code=201)
+def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
+    """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
+
+
+@router.get("/arms/{arm}/faults")
+def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[FaultAnswer]:
+    """List the faults of an arm that nobody has acknowledged, the earliest first."""
+    return _arm(service, arm).faults
+
+
+@router.post("/arms/{arm}/faults/{code}/ack")
+def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> FaultAnswer:
+    """Acknowledge a fault by its name."""
+    name = known.known_arm(service.db, service.state, arm).name
+    file = fault_file(service.state, name)
+    since = {one.code: one.since for one in file.remembered()}
+    cause = file.acknowledge(code)
+    note(service.db, who.name, "fault acknowledged", name, code=code, cause=cause)
+    return FaultAnswer(code=code, cause=cause, since=since[code])
+
+
+@router.post("/arms/{arm}/pause")
+def pause(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Pause the motion of an arm; it keeps its lease."""
+    return _pause(service, who.name, arm, wanted=True)
+
+
+@router.post("/arms/{arm}/resume")
+def resume(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Resume the motion of an arm."""
+    return _pause(service, who.name, arm, wanted=False)
+
+
+@router.post("/arms/{arm}/finish")
+def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+    """Finish a run early; the arm goes back to where it stood, and the run is done."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return AskedAnswer(arm=name, asked="finish", reached=service.engine.finish(name, who.name))
+
+
+@router.post("/arms/{arm}/supported")
+def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> AskedAnswer:
+    """Confirm that the arm, which is held after a stop, is supported or home: it is then let down."""
+    name = known.known_arm(service.db, service.state, arm).name
+    if body.confirm != name:
+        raise MotionRefused(f"that {name} is supported is confirmed by its name, typed by a person who sees it")
+    return AskedAnswer(arm=name, asked="supported", reached=service.engine.confirm_support(name, who.name))
+
+
+@router.get("/arms/{arm}/acceptances")
+def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[AcceptanceAnswer]:
+    """List the accepted sets of an arm, the earliest first; the last one is current."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return [AcceptanceAnswer(**asdict(act)) for act in acceptances(service.state, name)]
+
+
+@router.post("/arms/{arm}/acceptances", status_code=201)
+def accept_run(service: Serving, who: Operator, arm: ArmName, body: Acceptance) -> AcceptanceAnswer:
+    """Accept the parameters of a run of this arm."""
+    name = known.known_arm(service.db, service.state, arm).name
+    folder = run_folder(service.db, service.state, body.run)
+    act = accept(service.db, service.state, folder, body.note, who.name, arm=name)
+    return AcceptanceAnswer(**asdict(act))
+
+
+@router.post("/arms/{arm}/rollback", status_code=201)
+def roll_back(service: Serving, who: Operator, arm: ArmName, body: Rollback) -> AcceptanceAnswer:
+    """Make an earlier accepted set the current one again."""
+    name = known.known_arm(service.db, service.state, arm).name
+    return AcceptanceAnswer(**asdict(rollback(service.db, service.state, name, body.note, who.name, body.to)))
+
+
+@router.get("/motions", responses=PAGES)
+def list_motions(
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 500
+) -> list[MotionAnswer]:
+    """List motions, or those of an arm, the newest first."""
+    found = page(most, lambda n: motions.motions(service.db, arm, before=before, most=n))
+    return [MotionAnswer(**row) for row in found]
+
+
+@router.post("/motions", status_code=201)
+def add_motion(service: Serving, who: Operator, body: MotionUpload) -> MotionAnswer:
+    """Upload a motion that was designed elsewhere; preflight judges it like any other."""
+    arm = known.known_arm(service.db, service.state, body.arm)
+    joints = arm_model(arm.config).chain.joints
+    return MotionAnswer(**motions.add_motion(service.db, service.state, arm.name, body.motion, who.name, joints))
+
+
+@router.get("/motions/{motion}")
+def get_motion(service: Serving, _: Viewer, motion: Id) -> MotionAnswer:
+    """Show a motion: its arm, duration and hash."""
+    return MotionAnswer(**motions.known_motion(service.db, motion))
+
+
+def _arm(service: Service, arm: str) -> ArmAnswer:
+    found = known.known_arm(service.db, service.state, arm)
+    acts = acceptances(service.state, found.name)
+    config = found.config
+    return ArmAnswer(
+        name=found.name,
+        source="shipped" if found.source == "shipped" else "uploaded",
+        description=config.description,
+        sha256=config.sha256,
+        joints=list(config.joints) or list(arm_model(config).chain.names),
+        simulated=isinstance(config.driver, SimulatedDriver),
+        unattended_motion=config.unattended_motion,
+        resources=list(known.resources(config)),
+        moved_by=mover(control_path(service.state, found.name)),
+        faults=[FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],
+        accepted=AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
+    )
+
+
+def _pause(service: Service, who: str, arm: str, *, wanted: bool) -> AskedAnswer:
+    name = known.known_arm(service.db, service.state, arm).name
+    reached = service.engine.pause(name, who, wanted=wanted)
+    return AskedAnswer(arm=name, asked="pause" if wanted else "resume", reached=reached)

@@ -1,0 +1,60 @@
+"""Serve the routes that check a description without storing it, and show an arm's home posture.
+
+Modules that compute with mechanisms are imported only in the request, so that the service starts without them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Literal
+
+from fastapi import APIRouter
+from pydantic import BaseModel
+
+from ident_service.config.load import load_arm
+from ident_service.daemon.dependencies import Operator, Serving, Viewer
+from ident_service.daemon.errors import failures
+from ident_service.daemon.jobs.requests import ArmName
+from ident_service.daemon.routes.arms import Description
+from ident_service.operations.description_process import judge_apart
+from ident_service.registry.arms import known_arm, uploaded
+
+router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
+
+
+class DescriptionAnswer(BaseModel):
+    """Description without mistakes.
+
+    `stable` is null for an arm that can be identified but not moved; `objections` say what is wrong with the gains,
+    `text` is all of it for a person.
+    """
+
+    arm: str
+    sha256: str
+    stable: bool | None
+    objections: list[str]
+    text: str
+
+
+class HomeJoint(BaseModel):
+    """One joint of the posture in which an arm is zeroed: its position [rad or m], and the unit of that."""
+
+    joint: str
+    position: float
+    unit: Literal["rad", "m"]
+
+
+@router.post("/descriptions/check")
+def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
+    """Check a description without keeping it; its mistakes are answered with line and column."""
+    with service.checks.place(), uploaded(service.state, body.description, body.files) as path:
+        load_arm(path, upload=True)  # finds most mistakes, without a process
+        return DescriptionAnswer(**judge_apart(path))
+
+
+@router.get("/arms/{arm}/home")
+def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
+    """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
+    from ident_service.operations.zeroing import home_posture
+
+    return [HomeJoint(**asdict(one)) for one in home_posture(known_arm(service.db, service.state, arm).config)]

@@ -1,0 +1,260 @@
+"""Serve the routes about jobs (create, watch, cancel, renew the lease) and the stop, which needs no role."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import sqlite3
+from collections.abc import AsyncIterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from types import MappingProxyType
+from typing import Annotated, Any, Final, Literal
+
+from fastapi import APIRouter, Header, HTTPException, Query, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import PlainTextResponse, StreamingResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Told, Viewer
+from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.jobs.commands import JOBS
+from ident_service.daemon.jobs.outcome import said
+from ident_service.daemon.jobs.reach import held_arm
+from ident_service.daemon.jobs.requests import MOVES, ArmName, Asked, Id
+from ident_service.daemon.paging import PAGES, BeforeNumber, Most, Page
+from ident_service.daemon.responses import JobAnswer, JobResult, LeaseAnswer, StopAnswer
+from ident_service.errors import MotionRefused, UsageError
+from ident_service.registry import jobs as rows
+from ident_service.registry.database import Row
+from ident_service.registry.tokens import Access
+
+router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
+MOST_LOG: Final = 2**20
+NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
+_EVENTS = 0.2  # s between looks at a job that is watched
+_BREATH = 10.0  # s without news, after which a comment shows that the line is up
+# Its own threads: whatever else is busy, a stop is not.
+_STOPS = ThreadPoolExecutor(4, thread_name_prefix="stop")
+_STREAM: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/event-stream": {}}, "description": "Events."},
+    **failures_of_files(404, 409),
+}
+_REPLAYED: Final[dict[str, Any]] = {
+    "Idempotent-Replayed": {
+        "description": "`true` where the key had made this job before.",
+        "schema": {"type": "string"},
+    }
+}
+Key = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=200,
+        pattern=r"^[\x21-\x7e]+$",
+        description="of computations: within a day, the same token, key and job are answered with the job that was "
+        "made then, and another job with the same key is 409",
+    ),
+]
+State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
+
+
+class Confirmation(BaseModel):
+    """Confirmation of one motion by a person: the arm's name, typed, and the challenge that was given for it."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: Annotated[str, Field(max_length=64)]
+    challenge: Annotated[str, Field(max_length=64)]
+
+
+class JobRequest(BaseModel):
+    """Job to be done; one that may move an arm needs the confirmation, and its lease renewed from now on."""
+
+    model_config = ConfigDict(extra="forbid")
+    job: Asked
+    confirm: Confirmation | None = None
+
+
+def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, who: str) -> None:
+    """Refuse a motion that no person has confirmed.
+
+    Raises:
+        MotionRefused: no confirmation, or one that does not count.
+    """
+    # The challenge is used up first, so that a name cannot be tried again with it.
+    good = confirm is not None and service.gate.confirm(confirm.challenge, arm, who)
+    if confirm is None or not good or confirm.name != arm:
+        raise MotionRefused(
+            f"{arm}: a motion needs a fresh challenge of this arm (POST /api/v1/arms/{arm}/challenge), used once, "
+            "and the arm's name as a person has typed it"
+        )
+
+
+@router.post("/jobs", status_code=201, responses={201: {"headers": _REPLAYED}})
+def create_job(
+    service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
+) -> JobAnswer:
+    """Begin or queue a job; a computation repeated with the same `Idempotency-Key` is the same job."""
+    if idempotency_key is None:
+        return begin_job(service, who, body)
+    if body.job.kind in MOVES:
+        raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
+    asked = hashlib.sha256(body.job.model_dump_json().encode()).hexdigest()
+    if (row := rows.job_of_key(service.db, who.name, idempotency_key, asked)) is None:
+
+        def enter(job: Row) -> None:
+            rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
+
+        try:
+            return answer_of(service, service.engine.create(body.job, who.name, entering=enter))
+        except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
+            row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
+            if row is None:
+                raise
+    response.headers["Idempotent-Replayed"] = "true"
+    return answer_of(service, row)
+
+
+def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
+    """Queue the job of a request to the API or of a page.
+
+    Raises:
+        MotionRefused: a motion that no person has confirmed.
+        IdentError: as the engine.
+    """
+    if body.job.kind in MOVES:
+        require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
+    return answer_of(service, service.engine.create(body.job, who.name))
+
+
+@router.get("/jobs", responses=PAGES)
+def list_jobs(
+    page: Page,
+    service: Serving,
+    _: Viewer,
+    state: Annotated[list[State] | None, Query()] = None,
+    arm: ArmName | None = None,
+    before: BeforeNumber = None,
+    most: Most = 100,
+) -> list[JobAnswer]:
+    """List jobs, the newest first."""
+    states = tuple(state or rows.STATES)
+    found = page(most, lambda n: rows.jobs(service.db, states=states, arm=arm, before=before, most=n), "number")
+    return [answer_of(service, row) for row in found]
+
+
+@router.get("/jobs/{job}")
+def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
+    """Show a job: its state, its progress, and why it ended."""
+    return answer_of(service, rows.known_job(service.db, job))
+
+
+@router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
+def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
+    """Return the end of the log of a job."""
+    row = rows.known_job(service.db, job)
+    return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
+
+
+@router.get("/jobs/{job}/result")
+def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
+    """Return what the command of a job answered."""
+    row = rows.known_job(service.db, job)
+    answer = said(service.state / JOBS / row["id"]).answer
+    return JobResult(job=row["id"], answer=_named(answer, service, row))
+
+
+@router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
+async def watch_job(service: Serving, _: Viewer, told: Told, job: Id) -> StreamingResponse:
+    """Watch a job by server-sent events; `job` whenever it changes, until it has ended."""
+    row = await run_in_threadpool(rows.known_job, service.db, job)
+    return StreamingResponse(told(_events(service, row["id"])), media_type="text/event-stream")
+
+
+@router.post("/jobs/{job}/cancel")
+def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
+    """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
+    service.engine.cancel(job, who.name)
+    return answer_of(service, rows.known_job(service.db, job))
+
+
+@router.post("/jobs/{job}/lease")
+async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
+    """Renew the lease of a motion; only the caller who asked for the motion can."""
+    holder = service.engine.live.lease_holder(job)
+    if holder is not None and holder != who.name:
+        raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
+    if (seconds := service.engine.live.renew(job)) is None:
+        row = await run_in_threadpool(rows.known_job, service.db, job)
+        raise MotionRefused(f"the job {job} has no lease to renew: {row['state']}")
+    return LeaseAnswer(job=job, seconds=seconds)
+
+
+@router.post("/stop")
+async def stop_all(service: Serving, who: Near) -> StopAnswer:
+    """Stop all arms, under control; needs no lease and no role; on the service's own machine no token either."""
+    return await _stop(service, None, who)
+
+
+@router.post("/arms/{arm}/stop")
+async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
+    """Stop an arm, under control; as for all arms; it is no error if no process moves it."""
+    return await _stop(service, arm, who)
+
+
+async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
+    done = await asyncio.get_running_loop().run_in_executor(_STOPS, service.engine.stop, arm, who)
+    return StopAnswer(**done)
+
+
+def answer_of(service: Service, row: Row) -> JobAnswer:
+    """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
+    found = service.engine.progress(row)
+    shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
+    shown["detail"] = _named(row["detail"], service, row)
+    progress = None if found is None else _named(asdict(found), service, row)
+    held = bool(row["motion"]) and row["state"] == "running" and held_arm(service.state, str(row["arm"]))
+    return JobAnswer(**{**shown, "progress": progress, "held": held})
+
+
+def _named(value: Any, service: Service, row: Row) -> Any:
+    """Values of a job as others may read them: its arm by name, in commands too, and no places of this machine."""
+    described = {word: row["arm"] for word in row["words"] if word.startswith("/") and word.endswith(".yaml")}
+    return without_paths(value, str(service.state), described if row["arm"] is not None else {})
+
+
+def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
+    """Values in which places below the state folder are told relative to it.
+
+    Args:
+        value: JSON values.
+        state: the folder.
+        named: what other places are called.
+    """
+    if isinstance(value, str):
+        for place, name in named.items():
+            value = value.replace(place, name)
+        return value.replace(f"{state}/", "")
+    if isinstance(value, list):
+        return [without_paths(part, state, named) for part in value]
+    if isinstance(value, dict):
+        return {key: without_paths(part, state, named) for key, part in value.items()}
+    return value
+
+
+async def _events(service: Service, job: str) -> AsyncIterator[str]:
+    last, silent = "", 0.0
+    while True:
+        row = await run_in_threadpool(rows.known_job, service.db, job)
+        shown = (await run_in_threadpool(answer_of, service, row)).model_dump_json()
+        if shown != last:
+            last, silent = shown, 0.0
+            yield f"event: job\ndata: {json.dumps(json.loads(shown))}\n\n"
+        elif silent > _BREATH:
+            silent = 0.0
+            yield ": still here\n\n"
+        if row["state"] not in rows.LIVE or (service.engine.closing and row["state"] == "queued"):
+            return
+        await asyncio.sleep(_EVENTS)
+        silent += _EVENTS

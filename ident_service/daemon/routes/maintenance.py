@@ -1,0 +1,214 @@
+"""Serve the routes about schedules, maintenance, due re-identifications, re-identifications and drift alarms."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+from fastapi import APIRouter, HTTPException, Path
+from fastapi.concurrency import run_in_threadpool
+from pydantic import BaseModel, ConfigDict, Field
+
+from ident_service.daemon.dependencies import LeaseKeeper, Operator, Service, Serving, Viewer
+from ident_service.daemon.errors import failures
+from ident_service.daemon.jobs.requests import ArmName, Id
+from ident_service.daemon.maintenance.reidentification import Wanted, known_reidentification, reidentifications
+from ident_service.daemon.maintenance.webhook import deliveries
+from ident_service.daemon.paging import PAGES, BeforeId, BeforeNumber, Most, Page
+from ident_service.daemon.responses import LeaseAnswer
+from ident_service.daemon.routes.jobs import Confirmation, require_confirmed, without_paths
+from ident_service.daemon.routes.maintenance_answers import (
+    AlarmAnswer,
+    DeliveryAnswer,
+    DueAnswer,
+    EventAnswer,
+    ReidentificationAnswer,
+    ScheduleAnswer,
+)
+from ident_service.motion.controls import LEASE_SECONDS
+from ident_service.operations import drift_alarms as raised
+from ident_service.operations import maintenance_schedule as planned
+from ident_service.registry.arms import known_arm
+from ident_service.registry.database import Row
+
+router = APIRouter(prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409))
+Number = Annotated[int, Path(ge=1, lt=2**62)]
+Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
+
+
+class _Body(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class NewSchedule(_Body):
+    """Schedule of an arm's re-identification: exactly one of cron (UTC), operating hours, maintenance."""
+
+    arm: ArmName
+    cron: Annotated[str, Field(max_length=200)] | None = None
+    hours: Annotated[float, Field(gt=0, lt=1e6)] | None = None
+    maintenance: bool = False
+    motion: Id | None = None
+
+
+class Enabled(_Body):
+    """State of a schedule: enabled or disabled."""
+
+    enabled: bool
+
+
+class Event(_Body):
+    """Maintenance that was done."""
+
+    what: Annotated[str, Field(min_length=1, max_length=planned.LONGEST_WHAT)]
+    note: Annotated[str, Field(max_length=planned.LONGEST_NOTE)] = ""
+
+
+class Remark(_Body):
+    """Decision of a person, with a reason."""
+
+    note: Words
+
+
+class NewReidentification(_Body):
+    """Request to re-identify an arm now; it moves twice, for the preflight and for the run."""
+
+    arm: ArmName
+    motion: Id | None = None
+    confirm: Confirmation | None = None
+
+
+@router.get("/schedules")
+def list_schedules(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[ScheduleAnswer]:
+    """List schedules, or those of an arm."""
+    return [ScheduleAnswer(**row) for row in planned.schedules(service.db, arm)]
+
+
+@router.post("/schedules", status_code=201)
+def add_schedule(service: Serving, who: Operator, body: NewSchedule) -> ScheduleAnswer:
+    """Schedule the re-identification of an arm."""
+    when = planned.When(body.cron, body.hours, body.maintenance)
+    row = planned.add_schedule(service.db, _arm(service, body.arm), when, who.name, time.time(), body.motion)
+    return ScheduleAnswer(**row)
+
+
+@router.post("/schedules/{number}/enabled")
+def enable_schedule(service: Serving, who: Operator, number: Number, body: Enabled) -> ScheduleAnswer:
+    """Enable a schedule from now on, or disable it."""
+    row = planned.enable_schedule(service.db, number, who.name, time.time(), enabled=body.enabled)
+    return ScheduleAnswer(**row)
+
+
+@router.delete("/schedules/{number}", status_code=204)
+def remove_schedule(service: Serving, who: Operator, number: Number) -> None:
+    """Remove a schedule."""
+    planned.remove_schedule(service.db, number, who.name)
+
+
+@router.get("/arms/{arm}/maintenance", responses=PAGES)
+def list_maintenance(
+    page: Page, service: Serving, _: Viewer, arm: ArmName, before: BeforeNumber = None, most: Most = 100
+) -> list[EventAnswer]:
+    """List the maintenance of an arm, the newest first."""
+    name = _arm(service, arm)
+    found = page(most, lambda n: planned.events(service.db, name, before=before, most=n))
+    return [EventAnswer(**row) for row in found]
+
+
+@router.post("/arms/{arm}/maintenance", status_code=201)
+def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) -> EventAnswer:
+    """Enter maintenance that was done.
+
+    What is scheduled after it falls due, and may begin by itself where that is allowed.
+    """
+    row = planned.add_event(service.db, _arm(service, arm), body.what, body.note, who.name, time.time())
+    return EventAnswer(**row)
+
+
+@router.get("/due")
+def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
+    """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
+    return [DueAnswer(**row) for row in planned.dues(service.db, arm)]
+
+
+@router.post("/due/{number}/dismiss", status_code=204)
+def dismiss_due(service: Serving, who: Operator, number: Number, body: Remark) -> None:
+    """Dismiss a due re-identification, on a person's decision."""
+    planned.dismiss(service.db, number, body.note, who.name, time.time())
+
+
+@router.get("/reidentifications", responses=PAGES)
+def list_reidentifications(
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
+) -> list[ReidentificationAnswer]:
+    """List re-identifications, the newest first."""
+    found = page(most, lambda n: reidentifications(service.db, arm, before=before, most=n))
+    return [_told(service, row) for row in found]
+
+
+@router.post("/reidentifications", status_code=201)
+def begin_reidentification(service: Serving, who: Operator, body: NewReidentification) -> ReidentificationAnswer:
+    """Re-identify an arm: check, run, identify, compare with the accepted set.
+
+    The lease is renewed until the arm has come to rest.
+    """
+    arm = _arm(service, body.arm)
+    require_confirmed(service, arm, body.confirm, who.name)
+    return _told(service, service.keeper.reidentifications.begin(Wanted(arm, body.motion), who.name))
+
+
+@router.get("/reidentifications/{name}")
+def get_reidentification(service: Serving, _: Viewer, name: Id) -> ReidentificationAnswer:
+    """Show a re-identification."""
+    return _told(service, known_reidentification(service.db, name))
+
+
+@router.post("/reidentifications/{name}/lease")
+async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
+    """Renew the lease of a re-identification, for the step that it is at; none is needed where nothing moves."""
+    step = service.keeper.reidentifications.step(name)
+    if step is None:
+        row = await run_in_threadpool(known_reidentification, service.db, name)
+        step = row["begun_by"], row["job"]
+    if step[0] != who.name:
+        raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
+    if step[1] is not None:
+        service.engine.live.renew(step[1])
+    return LeaseAnswer(job=step[1] or "", seconds=LEASE_SECONDS)
+
+
+@router.get("/alarms", responses=PAGES)
+def list_alarms(
+    page: Page,
+    service: Serving,
+    _: Viewer,
+    arm: ArmName | None = None,
+    closed: bool = False,
+    before: BeforeNumber = None,
+    most: Most = 100,
+) -> list[AlarmAnswer]:
+    """List drift alarms that stand, or with `closed` all that ever were raised, the newest first."""
+    found = page(most, lambda n: raised.alarms(service.db, arm, closed=closed, before=before, most=n))
+    return [AlarmAnswer(**row) for row in found]
+
+
+@router.post("/alarms/{number}/ack")
+def acknowledge_alarm(service: Serving, who: Operator, number: Number, body: Remark) -> AlarmAnswer:
+    """Acknowledge a drift alarm, on a person's decision; the accepted set stays as it is."""
+    return AlarmAnswer(**raised.acknowledge_alarm(service.db, number, body.note, who.name, time.time()))
+
+
+@router.get("/deliveries", responses=PAGES)
+def list_deliveries(
+    page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100
+) -> list[DeliveryAnswer]:
+    """List notices to the webhook and what became of them, the newest first."""
+    found = page(most, lambda n: deliveries(service.db, before=before, most=n), "number")
+    return [DeliveryAnswer(**row) for row in found]
+
+
+def _arm(service: Service, arm: str) -> str:
+    return known_arm(service.db, service.state, arm).name
+
+
+def _told(service: Service, row: Row) -> ReidentificationAnswer:
+    return ReidentificationAnswer(**{**row, "detail": without_paths(row["detail"], str(service.state))})

@@ -1,0 +1,71 @@
+"""Serve the routes about runs: their records, recordings, parameters, files and reports."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import APIRouter
+from fastapi.responses import FileResponse
+
+from ident_service.daemon.dependencies import Serving, Viewer
+from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id
+from ident_service.daemon.paging import PAGES, BeforeId, Most, Page
+from ident_service.daemon.responses import ParametersAnswer, RecordingAnswer, RunAnswer, RunLine
+from ident_service.errors import UnknownId
+from ident_service.registry import runs
+from ident_service.registry.runs import REPORTS
+
+router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404))
+_REPORT = "report.html"
+_BINARY: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The file."},
+    **failures_of_files(404),
+}
+# Content security policy of the report: its inline style and script run in a sandbox and can reach nothing.
+_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'; "
+    "sandbox allow-scripts allow-downloads"
+)
+_PAGE: dict[int | str, dict[str, Any]] = {
+    200: {"content": {"text/html": {}}, "description": "The report."},
+    **failures_of_files(404),
+}
+
+
+@router.get("/runs", responses=PAGES)
+def list_runs(
+    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
+) -> list[RunLine]:
+    """List runs, the newest first."""
+    return [RunLine(**row) for row in page(most, lambda n: runs.runs(service.db, arm, before=before, most=n))]
+
+
+@router.get("/runs/{run}")
+def get_run(service: Serving, _: Viewer, run: Id) -> RunAnswer:
+    """Show a run: its ending, files, recordings and parameters."""
+    row, found = runs.known_run(service.db, run), runs.parameter_set(service.db, run)
+    return RunAnswer(
+        **row,
+        files=runs.run_files(service.db, service.state, run),
+        recordings=[RecordingAnswer(**one) for one in runs.recordings(service.db, run)],
+        parameters=None if found is None else ParametersAnswer(**found),
+    )
+
+
+@router.get("/runs/{run}/files/{name}", response_class=FileResponse, responses=_BINARY)
+def get_file(service: Serving, _: Viewer, run: Id, name: FileName) -> FileResponse:
+    """Download a file that the manifest of a run names; never shown as a page."""
+    path = runs.run_file(service.db, service.state, run, name)
+    return FileResponse(path, media_type="application/octet-stream", filename=name)
+
+
+@router.get("/runs/{run}/report.html", response_class=FileResponse, responses=_PAGE)
+def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
+    """Show the report of a run: the newest that a job of the kind `report` has made, else the run's own."""
+    path = service.state / REPORTS / f"{runs.known_run(service.db, run)['id']}.html"
+    if not path.is_file() and _REPORT in runs.run_files(service.db, service.state, run):
+        path = runs.run_file(service.db, service.state, run, _REPORT)
+    if not path.is_file():
+        raise UnknownId(f"the run {run} has no report yet; ask for a job of the kind report")
+    return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": _POLICY})

@@ -1,0 +1,241 @@
+"""Serve the pages of arms: list, commissioning steps, and a person's acts: confirm, acknowledge, accept, roll back."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fastapi import APIRouter, Response
+
+from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
+from ident_service.daemon.errors import status_of
+from ident_service.daemon.jobs.requests import MOVES, ArmName
+from ident_service.daemon.maintenance.reidentification import known_reidentification, reidentifications
+from ident_service.daemon.routes import arms, jobs
+from ident_service.daemon.web.commissioning_steps import ladder
+from ident_service.daemon.web.forms import Form, PageRoute, seen
+from ident_service.daemon.web.reidentification_steps import compared
+from ident_service.daemon.web.render import page
+from ident_service.errors import IdentError, MotionRefused, UsageError
+from ident_service.motion.control_file import in_use
+from ident_service.operations import maintenance_schedule as planned
+from ident_service.operations.arm_state import control_path, fault_file
+from ident_service.operations.drift_alarms import alarms
+from ident_service.registry import arms as known
+from ident_service.registry import jobs as rows
+from ident_service.registry import motions as known_motions
+from ident_service.registry import runs as known_runs
+from ident_service.registry.tokens import Access
+
+router = APIRouter(include_in_schema=False, route_class=PageRoute)
+_NUMBERS: Final = {"speed": float, "seconds": float, "seed": int, "starts": int, "until": float}
+_KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export"})
+
+
+@router.get("/")
+def list_arms(service: Serving, who: Viewer) -> Response:
+    """List all arms without reading their descriptions, which would take too long for a first page."""
+    accepted = {
+        row["arm"]: row["number"]
+        for row in service.db.rows("SELECT arm, MAX(number) AS number FROM acceptances GROUP BY arm")
+    }
+    lines = []
+    for row in known.arm_names(service.db):
+        try:
+            faults = len(fault_file(service.state, row["name"]).latched())
+        except IdentError:
+            faults = 1  # a damaged file prevents motion like a fault
+        moving = in_use(control_path(service.state, row["name"]))
+        lines.append({**row, "accepted": accepted.get(row["name"]), "faults": faults, "moving": moving})
+    busy = rows.jobs(service.db, states=rows.LIVE, most=50)
+    standing = _alarms(service, None)
+    due = planned.dues(service.db)
+    for line in lines:
+        line["alarms"] = sum(one["arm"] == line["name"] for one in standing)
+        line["dues"] = sum(one["arm"] == line["name"] for one in due)
+    return page("arms", who, arms=lines, alarms=standing, dues=due, jobs=[jobs.answer_of(service, row) for row in busy])
+
+
+@router.get("/new")
+def describe(who: Operator) -> Response:
+    """Show the form for a new description."""
+    return page("new", who, problem="", text="", replace=False)
+
+
+@router.post("/new")
+def take_description(service: Serving, who: Operator, form: Form) -> Response:
+    """Add the arm of the form's description, or show every mistake in it."""
+    text, replace = form.get("description", "").replace("\r\n", "\n"), "replace" in form
+    try:
+        added = arms.add_arm(service, who, arms.NewArm(description=text, replace=replace))
+    except IdentError as error:
+        return page("new", who, status_of(error), problem=str(error), text=text, replace=replace)
+    return seen(f"/arms/{added.name}")
+
+
+@router.get("/arms/{arm}")
+def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
+    """Show one arm: its commissioning steps, its runs, and its acceptances."""
+    answer = arms.get_arm(service, who, arm)
+    config = known.known_arm(service.db, service.state, arm).config
+    due = planned.dues(service.db, answer.name)
+    scheduled = {row["id"]: row["motion"] for row in planned.schedules(service.db, answer.name)}
+    sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ?", answer.name)
+    return page(
+        "arm",
+        who,
+        arm=answer,
+        rungs=ladder(service.db, service.state, config),
+        motions=known_motions.motions(service.db, answer.name),
+        alarms=_alarms(service, answer.name),
+        dues=due,
+        due_motion=next((motion for row in due if (motion := scheduled.get(row["schedule"]))), ""),
+        schedules=len(scheduled),
+        maintained=planned.events(service.db, answer.name, most=1),
+        agains=reidentifications(service.db, answer.name, most=20),
+        runs=known_runs.runs(service.db, answer.name, most=20),
+        identified=[row["run"] for row in sets],
+        acts=list(reversed(arms.list_acceptances(service, who, arm))),
+        jobs=[jobs.answer_of(service, row) for row in rows.jobs(service.db, arm=answer.name, most=10)],
+    )
+
+
+@router.post("/arms/{arm}/confirm")
+def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Show what is about to move, and ask for the arm's name."""
+    return _confirmation(service, who, arm, form, "")
+
+
+@router.post("/arms/{arm}/move")
+def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Begin a motion that a person has confirmed; the page of its job keeps its lease from then on."""
+    if form.get("kind") == "rehearse":
+        raise UsageError("a rehearsal begins when the button of its page is held")
+    asked = _asked(arm, form)
+    body = {"job": asked, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
+    try:
+        job = jobs.begin_job(service, who, jobs.JobRequest.model_validate(body))
+    except MotionRefused:
+        words = "That was not the arm's name, or this page was open for too long. Nothing has moved; try again."
+        return _confirmation(service, who, arm, form, words)
+    return seen(f"/jobs/{job.id}?attended=1")
+
+
+@router.post("/arms/{arm}/jobs")
+def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Queue a job that moves nothing."""
+    if form.get("kind") not in _KINDS:
+        raise UsageError("choose what is to be done on the page of the arm")
+    job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
+    return seen(f"/jobs/{job.id}")
+
+
+@router.post("/arms/{arm}/ack")
+def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Acknowledge a fault that a person has read."""
+    arms.acknowledge(service, who, arm, form.get("code", ""))
+    return seen(f"/arms/{arm}")
+
+
+@router.post("/arms/{arm}/accept")
+def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Accept the parameters of a run as the arm's, on a person's decision."""
+    _require_name(arm, form)
+    arms.accept_run(service, who, arm, arms.Acceptance(run=form.get("run", ""), note=form.get("note", "")))
+    return seen(f"/arms/{arm}#accepted")
+
+
+@router.post("/arms/{arm}/rollback")
+def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Return to an earlier accepted set, on a person's decision."""
+    _require_name(arm, form)
+    body = {"note": form.get("note", ""), **({"to": form["to"]} if form.get("to") else {})}
+    arms.roll_back(service, who, arm, arms.Rollback.model_validate(body))
+    return seen(f"/arms/{arm}#accepted")
+
+
+@router.post("/arms/{arm}/pause")
+def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Pause the motion of an arm, or resume it."""
+    (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
+    job, again = form.get("job", ""), form.get("again", "")
+    if again:
+        return seen(f"/reidentifications/{known_reidentification(service.db, again)['id']}?attended=1")
+    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
+@router.post("/arms/{arm}/finish")
+def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """End a run early by its regular end."""
+    arms.finish(service, who, arm)
+    job = form.get("job", "")
+    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
+@router.post("/arms/{arm}/supported")
+def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
+    """Confirm, on a person's word, that an arm that is held is supported."""
+    arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
+    job = form.get("job", "")
+    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+
+
+def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
+    """Return the open drift alarms of an arm, or of all, each with its comparison."""
+    return [
+        {**row, "compared": compared(service.db, service.state, row["run"], row["what"])}
+        for row in alarms(service.db, arm, most=50)
+    ]
+
+
+def _asked(arm: str, form: dict[str, str]) -> dict[str, Any]:
+    """Return the job that a form asks for; empty fields are left out."""
+    kind = form.get("kind", "")
+    given = {key: value for key, value in form.items() if value and key in _FIELDS.get(kind, ())}
+    try:
+        asked: dict[str, Any] = {key: _NUMBERS.get(key, str)(value) for key, value in given.items()}
+    except ValueError:
+        raise UsageError(f"{kind}: a number is missing, or is none") from None
+    asked["kind"] = kind
+    if kind in ("report", "export"):
+        return {**asked, **({"formats": _formats(form)} if kind == "export" else {})}
+    if "until" in asked:
+        asked["until"] = {"share": asked["until"]}
+    if kind == "identify":
+        asked["recordings"] = [{"run": asked.pop("recording", "")}]
+        if "validation" in asked:
+            asked["validate_on"] = [{"run": asked.pop("validation")}]
+    return {**asked, "arm": arm}
+
+
+_FIELDS: Final[dict[str, tuple[str, ...]]] = {
+    "design": ("seconds", "seed", "criterion"),
+    "check": ("motion",),
+    "rehearse": ("motion", "speed"),
+    "run": ("motion", "speed", "until"),
+    "identify": ("recording", "validation", "method"),
+    "simulate": ("motion",),
+    "report": ("run",),
+    "export": ("run",),
+}
+
+
+def _formats(form: dict[str, str]) -> list[str]:
+    return [name.removeprefix("format-") for name in form if name.startswith("format-")]
+
+
+def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str], problem: str) -> Response:
+    if form.get("kind") not in MOVES:
+        raise UsageError("choose a motion on the page of the arm")
+    given = arms.challenge(service, who, arm)
+    fields = {"kind": form["kind"], **{key: form.get(key, "") for key in ("motion", "speed", "until")}}
+    motion = known_motions.known_motion(service.db, fields["motion"]) if fields["motion"] else None
+    status = 409 if problem else 200
+    # A rehearsal begins on its own page while its button is held: the lease would lapse while a page loads.
+    if form["kind"] == "rehearse":
+        return page("rehearse", who, status, arm=given.arm, given=given, fields=fields, motion=motion)
+    return page("confirm", who, status, arm=given.arm, given=given, fields=fields, motion=motion, problem=problem)
+
+
+def _require_name(arm: str, form: dict[str, str]) -> None:
+    if form.get("name", "").strip() != arm:
+        raise UsageError(f"{arm}: type the arm's name to say that you mean this arm; nothing was changed")

@@ -1,0 +1,324 @@
+"""Represent preflight tickets: the findings, for which arm, motion, model and software, and until when they count.
+
+One JSON object of format `ident-ticket`. The code that moves the arm asks it `valid_for` the motion; any change
+since asks for a new check. It is a record, not a signature: it protects against mistakes, not against people.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime, timedelta
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from drivers.arm import ArmDescription
+from ident_service import __version__
+from ident_service.errors import MotionRefused, UsageError
+from ident_service.excitation.excitation import Excitation
+from ident_service.model.arm_model import ArmModel
+from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, INDISPENSABLE, Check, Measure, Verdict
+
+FORMAT, VERSION = "ident-ticket", 1
+VALID = timedelta(minutes=15)
+_MOST_BYTES = 2**20
+_HASHES = {
+    "arm_sha256": "the arm's description",
+    "excitation_sha256": "the motion",
+    "model_sha256": "the model's parameters",
+    "bus_sha256": "what the arm on the bus says of itself",
+}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Identify the arm, motion, model and software that a ticket is about.
+
+    Attributes:
+        arm: name.
+        arm_sha256: of the configuration.
+        excitation: name of the motion; empty for none.
+        excitation_sha256: of its JSON; empty for none.
+        model_sha256: of the prior parameters.
+        identities: per axis, what the drives answered; empty where no arm could be opened.
+        bus_sha256: of all else that the open arm says of itself; empty likewise.
+        driver: its software, likewise.
+        software: this one, and its version.
+    """
+
+    arm: str
+    arm_sha256: str
+    excitation: str
+    excitation_sha256: str
+    model_sha256: str
+    identities: tuple[str, ...]
+    bus_sha256: str
+    driver: str
+    software: str
+
+
+@dataclass(frozen=True)
+class Ticket:
+    """Represent the result of a preflight.
+
+    Attributes:
+        subject: arm, motion, model and software that were checked.
+        checks: all of them, in the order of `CODES`.
+        created: UTC, whole milliseconds.
+        expires: UTC.
+    """
+
+    subject: Subject
+    checks: tuple[Check, ...]
+    created: datetime
+    expires: datetime
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return FAILED where one check failed, else NEEDS_PERSON where one does, else PASSED."""
+        found = {check.verdict for check in self.checks}
+        for worse in (Verdict.FAILED, Verdict.NEEDS_PERSON):
+            if worse in found:
+                return worse
+        return Verdict.PASSED
+
+    def _verdicts(self, code: str) -> set[Verdict]:
+        return {check.verdict for check in self.checks if check.code == code}
+
+    def valid_for(self, subject: Subject, now: datetime) -> list[str]:
+        """Return why this ticket does not allow a motion; empty when it does.
+
+        Args:
+            subject: of what is about to be done, with the open arm's own description. One without a motion, for a way
+                home, asks for all that was found of the arm and for nothing that was found of the motion: such a way is
+                checked from where it begins, when it begins.
+            now: UTC.
+        """
+        found = []
+        no_motion = not subject.excitation_sha256
+        if codes := [
+            check.code
+            for check in self.checks
+            if check.verdict in (Verdict.FAILED, Verdict.NEEDS_PERSON)
+            and not (no_motion and check.code in ABOUT_THE_MOTION)
+        ]:
+            found.append(f"the check did not pass: {', '.join(codes)}")
+        elif codes := [code for code in INDISPENSABLE if Verdict.PASSED not in self._verdicts(code)]:
+            found.append(f"the check was not made: {', '.join(codes)}")
+        if now < self.created:
+            found.append("it was made in the future: a clock has been set")
+        elif now >= self.expires:
+            found.append(f"it expired at {self.expires.isoformat(timespec='seconds')}")
+        mine, theirs = self.subject, subject
+        if mine.arm != theirs.arm:
+            found.append(f"it is for {mine.arm}, not for {theirs.arm}")
+        for key, what in _HASHES.items():
+            if getattr(mine, key) != getattr(theirs, key) and not (no_motion and key == "excitation_sha256"):
+                found.append(f"{what} has changed since")
+        if mine.identities != theirs.identities:
+            found.append("the drives are others than those that were checked")
+        for was, now_is in ((mine.driver, theirs.driver), (mine.software, theirs.software)):
+            found += [f"it was made with {was or 'no driver'}, not with {now_is or 'none'}"] if was != now_is else []
+        return found
+
+    def require_valid_for(self, subject: Subject, now: datetime) -> None:
+        """Raise MotionRefused, which says why, unless this ticket is `valid_for` the motion."""
+        if why := self.valid_for(subject, now):
+            raise MotionRefused(
+                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
+            )
+
+    def with_arm(self, subject: Subject) -> Subject:
+        """Return the subject on the arm of this ticket, to compare all that can be compared before the arm is open."""
+        mine = self.subject
+        return replace(subject, identities=mine.identities, bus_sha256=mine.bus_sha256, driver=mine.driver)
+
+    def to_json(self) -> str:
+        """Return the ticket as one JSON object, the inverse of `ticket_from_json`."""
+        return json.dumps(ticket_values(self), indent=1, allow_nan=False)
+
+
+def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDescription | None) -> Subject:
+    """Return the subject that a ticket must have to allow this motion on this arm.
+
+    Args:
+        model: of the arm.
+        excitation: to be run; None for a way home.
+        described: by the open arm, None where it could not be opened.
+    """
+    bus = driver = ""
+    axes: tuple[str, ...] = ()
+    if described is not None:
+        axes, driver = described.identities, described.software
+        arrays = (described.torque_limit, described.torque_resolution, described.position_resolution)
+        values = [value.tolist() for value in arrays]
+        bus = _sha256(repr((described.joint_names, described.rate, values)).encode())
+    prior = b"" if model.prior is None else model.prior.astype("<f8").tobytes()
+    return Subject(
+        arm=model.config.name,
+        arm_sha256=model.config.sha256,
+        excitation="" if excitation is None else excitation.name,
+        excitation_sha256="" if excitation is None else _sha256(excitation.to_json().encode()),
+        model_sha256=_sha256(" ".join(model.layout.names).encode() + prior),
+        identities=axes,
+        bus_sha256=bus,
+        driver=driver,
+        software=f"ident-service {__version__}",
+    )
+
+
+def new_ticket(subject: Subject, checks: Sequence[Check], now_ns: int, valid: timedelta = VALID) -> Ticket:
+    """Create a ticket made now (`now_ns` since 1970 in UTC [ns]) that counts for `valid`."""
+    created = utc(now_ns)
+    return Ticket(subject, tuple(checks), created, created + valid)
+
+
+def utc(now_ns: int) -> datetime:
+    """Convert a time [ns since 1970 in UTC] to a date, rounded down to milliseconds."""
+    return datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=now_ns // 1_000_000)
+
+
+def ticket_values(ticket: Ticket) -> dict[str, Any]:
+    """Return the ticket as JSON values."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "verdict": ticket.verdict.value,
+        "created": ticket.created.isoformat(timespec="milliseconds"),
+        "expires": ticket.expires.isoformat(timespec="milliseconds"),
+        "subject": asdict(ticket.subject) | {"identities": list(ticket.subject.identities)},
+        "checks": [
+            {
+                "code": check.code,
+                "verdict": check.verdict.value,
+                "reason": check.reason,
+                "remedy": check.remedy,
+                "measures": [asdict(one) for one in check.measures],
+            }
+            for check in ticket.checks
+        ],
+    }
+
+
+def read_ticket(path: Path) -> Ticket:
+    """Read a ticket's file.
+
+    Raises:
+        UsageError: no such file, or not a ticket; the message says what is wrong with it.
+    """
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise UsageError(f"larger than {_MOST_BYTES} bytes, so not a ticket")
+        return ticket_from_json(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UsageError(f"{path}: not UTF-8 text, so not a ticket; `ident check` makes a new one") from None
+    except UsageError as error:
+        raise UsageError(f"{path}: {error}; `ident check` makes a new one") from None
+
+
+def ticket_from_json(text: str) -> Ticket:
+    """Parse a ticket from JSON, the inverse of `Ticket.to_json`.
+
+    Raises:
+        UsageError: not a ticket; the message says what is wrong with it.
+    """
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"not JSON: {error}") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise UsageError(f"not a ticket; expected a JSON object whose format is {FORMAT!r}")
+    if content.get("version") != VERSION:
+        raise UsageError(f"version {content.get('version')!r} of the format; this software reads version {VERSION}")
+    _require_keys(content, ("format", "version", "verdict", "created", "expires", "subject", "checks"), "the ticket")
+    ticket = Ticket(
+        _subject(content["subject"]),
+        tuple(_check(one) for one in _list(content["checks"], "checks")),
+        _time(content["created"], "created"),
+        _time(content["expires"], "expires"),
+    )
+    if tuple(check.code for check in ticket.checks) != CODES:
+        raise UsageError(f"the checks must be {', '.join(CODES)}, each once and in this order")
+    if content["verdict"] != ticket.verdict.value:
+        raise UsageError(f"says {content['verdict']!r}, but its checks say {ticket.verdict.value!r}")
+    return ticket
+
+
+def _subject(value: Any) -> Subject:
+    names = tuple(Subject.__dataclass_fields__)
+    _require_keys(value, names, "subject")
+    texts = {name: _text(value[name], name) for name in names if name != "identities"}
+    identities = tuple(_text(one, "identities") for one in _list(value["identities"], "identities"))
+    return Subject(**texts, identities=identities)
+
+
+def _check(value: Any) -> Check:
+    _require_keys(value, ("code", "verdict", "reason", "remedy", "measures"), "a check")
+    try:
+        verdict = Verdict(value["verdict"])
+    except ValueError:
+        raise UsageError(f"{value['verdict']!r} is no verdict") from None
+    found = tuple(_measure(one) for one in _list(value["measures"], "measures"))
+    texts = [_text(value[key], key) for key in ("code", "reason", "remedy")]
+    return Check(texts[0], verdict, found, texts[1], texts[2])
+
+
+def _measure(value: Any) -> Measure:
+    _require_keys(value, tuple(Measure.__dataclass_fields__), "a measure")
+    joint = value["joint"]
+    return Measure(
+        _text(value["what"], "what"),
+        _number(value["value"], "value"),
+        _text(value["unit"], "unit"),
+        None if joint is None else _text(joint, "joint"),
+        _number(value["least"], "least"),
+        _number(value["most"], "most"),
+    )
+
+
+def _require_keys(value: Any, keys: Sequence[str], what: str) -> None:
+    if not isinstance(value, dict):
+        raise UsageError(f"{what} must be an object")
+    if missing := [key for key in keys if key not in value]:
+        raise UsageError(f"{what} lacks {', '.join(missing)}")
+    if unknown := [key for key in value if key not in keys]:
+        raise UsageError(f"{what} has unknown keys: {', '.join(unknown)}")
+
+
+def _list(value: Any, what: str) -> list[Any]:
+    if not isinstance(value, list):
+        raise UsageError(f"{what} must be a list")
+    return value
+
+
+def _text(value: Any, what: str) -> str:
+    if not isinstance(value, str):
+        raise UsageError(f"{what} must be text")
+    return value
+
+
+def _number(value: Any, what: str) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+        raise UsageError(f"{what} must be a finite number or null")
+    return float(value)
+
+
+def _time(value: Any, what: str) -> datetime:
+    try:
+        time = datetime.fromisoformat(_text(value, what))
+    except ValueError:
+        raise UsageError(f"{what} is no time: {value!r}") from None
+    if time.tzinfo is None or time.utcoffset() != timedelta(0):
+        raise UsageError(f"{what} must be UTC")
+    return time
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,232 @@
+"""Design a motion for an arm and write motion, search, preview and drawings to one folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from ident_service.config.design import Design
+from ident_service.config.limits import motion_limits
+from ident_service.config.load import load_arm
+from ident_service.errors import UsageError
+from ident_service.estimation.equations import equations
+from ident_service.excitation.design import Designed, design_motion, family, settled
+from ident_service.excitation.excitation import Excitation, read_excitation
+from ident_service.excitation.expectation import NoiseModel, described_noise
+from ident_service.excitation.found_file import found_to_json, read_found
+from ident_service.excitation.plan import excitation
+from ident_service.excitation.search import Budget, Progress
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.base import BaseParameters
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+from ident_service.motion.surroundings import touching_stop
+from ident_service.operations.motion_drawings import DRAWINGS, drawings
+from ident_service.operations.preview import Preview, preview, preview_document, recorded_noise
+from ident_service.operations.preview_text import preview_text
+from ident_service.operations.recordings import open_together
+from ident_service.preflight.stability import delay_of, stability
+from ident_service.recordings.part import overlap
+from ident_service.results.files import appearing_folder, require_place, write_atomically
+from ident_service.results.parameter_file import read_parameters
+
+MOTION, SEARCH, PREVIEW, DOCUMENT = "motion.json", "search.json", "preview.txt", "preview.json"
+FILES = (MOTION, SEARCH, PREVIEW, DOCUMENT, *DRAWINGS)
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """Data about an arm beside its description: identified parameters, noise, recordings.
+
+    Attributes:
+        parameters: a parameter file whose link parameters predict the torques, instead of the prior.
+        noise: a parameter file of an earlier identification, whose residuals are the noise to be expected.
+        recordings: whose information the new motion adds to.
+    """
+
+    parameters: Path | None = None
+    noise: Path | None = None
+    recordings: tuple[Path, ...] = ()
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """Request to design a motion.
+
+    Attributes:
+        arm: description file, or the name of a shipped one.
+        changes: keys of the description's `design` section that shall be others.
+        knowledge: beside the description.
+        seed: of the random starts.
+        budget: of the search.
+        resume: a search to go on from.
+        length: of the motion [s]; what the description's frequency and periods make of it when None.
+    """
+
+    arm: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    knowledge: Knowledge = Knowledge()
+    seed: int = 0
+    budget: Budget = field(default_factory=Budget)
+    resume: Path | None = None
+    length: float | None = None
+
+
+def design_files(
+    request: DesignRequest,
+    folder: Path,
+    tell: Callable[[Progress], None] = lambda _: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> tuple[Designed, Preview]:
+    """Search for a motion and write the motion, the search, and a preview.
+
+    Args:
+        request: what is asked for.
+        folder: where files go; others in it stay.
+        tell: called from time to time.
+        cancelled: True ends the search with what it has.
+
+    Raises:
+        UsageError, ConfigError: the request or the description is not valid.
+        MotionRefused: limits that contradict each other, home in collision, no posture that keeps them.
+        RecordingError, ParameterError: a file of the knowledge cannot be used.
+    """
+    require_place(folder)
+    if (folder / MOTION).exists():
+        raise UsageError(f"{folder / MOTION}: exists already; give another folder")
+    model = known_model(request.arm, request.knowledge)
+    design = _changed(model.config.design, request.changes)
+    if request.length is not None:
+        design = _of_length(design, request.length, frozenset(request.changes))
+    noise = known_noise(model, request.knowledge)
+    basis, base = family(design, model)
+    limits = motion_limits(model.config)
+    whitening = np.ones_like(noise.deviation) if design.criterion == "condition_number" else noise.deviation
+    added = known_information(model, base, request.knowledge, whitening)
+    task = settled(model, design, basis, base, noise.deviation, added)
+    earlier = None if request.resume is None else read_found(request.resume, task, request.seed)
+    designed = design_motion(
+        model,
+        design,
+        seed=request.seed,
+        budget=request.budget,
+        noise=noise.deviation,
+        added=added,
+        earlier=earlier,
+        veto=lambda path: touching_stop(path, limits, model),
+        stable=lambda kp, kd: stability(model, replace(limits, kp=kp, kd=kd), delay_of(model.config)).stable,
+        tell=tell,
+        cancelled=cancelled,
+    )
+    seen = _seen(model, designed.excitation, request.knowledge)
+    with appearing_folder(folder) as staging:
+        write_atomically(staging / MOTION, designed.excitation.to_json() + "\n")
+        write_atomically(staging / SEARCH, found_to_json(designed.found, task) + "\n")
+        write_preview(staging, seen)
+    return designed, seen
+
+
+def preview_files(arm: str, motion: Path | None, knowledge: Knowledge, folder: Path | None) -> Preview:
+    """Preview a motion, and write text and drawings where a folder is given.
+
+    Args:
+        arm: description file, or the name of a shipped one.
+        motion: file of the motion; the description's own identification motion when None.
+        knowledge: beside the description.
+        folder: where the text and the drawings go; others in it stay.
+
+    Raises:
+        UsageError, ConfigError: a file that does not exist or is not valid.
+        MotionRefused: the motion was made for another arm.
+    """
+    model = known_model(arm, knowledge)
+    chosen = excitation(model, "identification", checked=False) if motion is None else read_excitation(motion)
+    seen = _seen(model, chosen, knowledge)
+    if folder is not None:
+        with appearing_folder(folder) as staging:
+            write_preview(staging, seen)
+    return seen
+
+
+def write_preview(folder: Path, seen: Preview) -> None:
+    """Write a preview's text, its values and its drawings into an existing folder."""
+    write_atomically(folder / PREVIEW, preview_text(seen) + "\n")
+    write_atomically(folder / DOCUMENT, json.dumps(preview_document(seen), indent=1, allow_nan=False) + "\n")
+    for name, text in drawings(seen).items():
+        write_atomically(folder / name, text)
+
+
+def known_model(arm: str, knowledge: Knowledge) -> ArmModel:
+    """Return the arm's model, with identified link parameters if the knowledge has some.
+
+    Raises:
+        UsageError: the parameter file has no link parameters of this arm.
+    """
+    model = arm_model(load_arm(arm))
+    if knowledge.parameters is None:
+        return model
+    table = read_parameters(knowledge.parameters, model.layout.names).content.get("link_parameters")
+    if table is None or tuple(table["names"]) != model.layout.names:
+        raise UsageError(
+            f"{knowledge.parameters}: no link parameters of {model.config.name}; give the parameters.json of a "
+            "feasible identification of this arm"
+        )
+    return replace(model, prior=np.array(table["values"], dtype=float))
+
+
+def known_noise(model: ArmModel, knowledge: Knowledge) -> NoiseModel:
+    """Return the noise model of the arm's torques, from the knowledge or else from the description."""
+    if knowledge.noise is not None:
+        return recorded_noise(knowledge.noise, model)
+    return described_noise(model, motion_limits(model.config))
+
+
+def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledge, noise: Array) -> Array | None:
+    """Return the information of the recordings, whitened by `noise` of shape (joints,); None without any."""
+    if not knowledge.recordings:
+        return None
+    opened = open_together(knowledge.recordings, model).recordings
+    for index, recording in enumerate(opened):
+        if any(overlap(recording, other) for other in opened[:index]):
+            raise UsageError(f"{recording.path}: the same recording twice would count as twice as much")
+    parts = [equations(recording, model, base).total for recording in opened]
+    R = Information.sum(parts).stacked(1.0 / noise)[:-1, :-1]
+    return np.asarray(R.T @ R)
+
+
+def _seen(model: ArmModel, motion: Excitation, knowledge: Knowledge) -> Preview:
+    noise = known_noise(model, knowledge)
+    seen = preview(model, motion, noise)
+    added = known_information(model, seen.base, knowledge, noise.deviation)
+    return seen if added is None else preview(model, motion, noise, added)
+
+
+def _changed(design: Design, changes: dict[str, Any]) -> Design:
+    try:
+        return Design.model_validate(design.model_dump() | changes)
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
+        raise UsageError(f"design: {wrong}") from None
+
+
+def _of_length(design: Design, length: float, given: frozenset[str]) -> Design:
+    """Return a design whose Fourier motion lasts `length` [s], in whole periods near the base frequency.
+
+    Raises:
+        UsageError: nothing is left between the ramps, or the length follows from what else was given.
+    """
+    if design.motion != "fourier":
+        raise UsageError("--length is for Fourier motions; a motion through postures has --postures")
+    if {"base_frequency", "periods"} <= given:
+        raise UsageError("--length follows from --base-frequency, --periods and --ramp; leave one of them out")
+    whole = length - 2.0 * design.ramp
+    if not whole > 0.0:
+        raise UsageError(f"--length {length:g}: the ramps alone take {2.0 * design.ramp:g} s; see --ramp")
+    periods = design.periods if "periods" in given else max(1, round(whole * design.base_frequency))
+    return _changed(design, {"base_frequency": periods / whole, "periods": periods})

@@ -1,0 +1,65 @@
+"""Keep drift alarms: a re-identification that found a change raises one, a person acknowledges it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from ident_service.errors import UnknownId, UsageError
+from ident_service.registry.audit import note
+from ident_service.registry.database import Database, Row
+
+LONGEST_NOTE: Final = 2000
+
+
+def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: str, now: float) -> None:
+    """Enter a drift alarm.
+
+    Args:
+        db: the registry.
+        arm: name.
+        reidentification: id.
+        run: id of the run that differs from the accepted set.
+        what: the findings, in words.
+        now: s since 1970 in UTC.
+    """
+    with db.transaction():
+        db.write(
+            "INSERT INTO alarms (arm, reidentification, run, what, at) VALUES (?, ?, ?, ?, ?)",
+            *(arm, reidentification, run, what, now),
+        )
+        note(db, "service", "drift alarm", arm, run=run, found=what)
+
+
+def alarms(
+    db: Database, arm: str | None = None, *, closed: bool = False, before: int | None = None, most: int = 100
+) -> list[Row]:
+    """Return open alarms, or `closed` ones too, the newest first, from the one before the number `before`."""
+    return db.rows(
+        "SELECT * FROM alarms WHERE (?1 IS NULL OR arm = ?1) AND (?2 OR closed IS NULL) AND id < ?3 "
+        "ORDER BY id DESC LIMIT ?4",
+        *(arm, int(closed), 2**62 if before is None else before, most),
+    )
+
+
+def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: float) -> Row:
+    """Close an alarm that a person has acknowledged.
+
+    Raises:
+        UsageError: no note.
+        UnknownId: no such alarm stands.
+    """
+    remark = remark.strip()
+    if not remark or len(remark) > LONGEST_NOTE:
+        raise UsageError(f"say what was found, in a note of 1 to {LONGEST_NOTE} characters")
+    with db.transaction():
+        row = db.row("SELECT * FROM alarms WHERE id = ? AND closed IS NULL", number)
+        if row is None:
+            raise UnknownId(f"no alarm {number} stands; the list of alarms names them")
+        db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, remark, number)
+        note(db, by, "alarm acknowledged", row["arm"], alarm=number, note=remark)
+    return db.rows("SELECT * FROM alarms WHERE id = ?", number)[0]
+
+
+def end_alarms(db: Database, arm: str, how: str, by: str, now: float) -> None:
+    """Close the alarms of an arm whose accepted set has been replaced."""
+    db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND closed IS NULL", now, by, how, arm)

@@ -1,0 +1,287 @@
+"""Identify an arm from recording files and write a folder of results, as `ident identify` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident_service.config.load import folder_of, load_arm, load_recording_format, mistake
+from ident_service.config.schema import ArmConfig, Method
+from ident_service.errors import RecordingError, SolverError, UsageError
+from ident_service.estimation.bootstrap import bootstrap
+from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
+from ident_service.estimation.essential import essential_parameters
+from ident_service.estimation.feasible.convex import convex_least_squares
+from ident_service.estimation.feasible.feasible_set import SetName
+from ident_service.estimation.feasible.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
+from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.plausibility import (
+    reasons_against,
+    reasons_in_length,
+    reasons_in_recording,
+    remarks_on_limits,
+)
+from ident_service.model.arm_model import arm_model
+from ident_service.model.chain import Array
+from ident_service.operations.recordings import (
+    open_together,
+    own_formats,
+    recording_quality,
+    standstill_left_out,
+    torque_in,
+)
+from ident_service.recordings.quality import Quality
+from ident_service.recordings.recording import Recording
+from ident_service.results.files import write_atomically
+from ident_service.results.replacing import replacing_folder, require_replaceable
+from ident_service.results.report_files import write_report
+from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
+
+
+@dataclass(frozen=True)
+class Request:
+    """Request for an identification: recordings and options.
+
+    Attributes:
+        arm: description file or name of a shipped one.
+        recordings: to fit to; a path may end in `@START:END`, the seconds of that recording to read.
+        validation: to judge on; likewise.
+        columns: a YAML file with the keys of the arm's `recording` section, instead of it.
+        columns_of: such a file for one recording each, of those above.
+        cut_standstill: whether to leave out standstill at the ends of every recording.
+        method: estimator, the arm's when None.
+        set_name: feasible set, the arm's when None.
+        prior: `none`, `euclidean` or `entropic`, the arm's when None.
+        prior_weight: of the prior, the arm's (or chosen on held-out data) when None.
+        delay: between position and torque [s], or `estimate`; the arm's when None.
+        replicates: of the bootstrap of the constrained estimate; 0 for none.
+        essential: whether to look for the smallest model that predicts as well.
+        sdpa: whether to write the optimisation problems for other solvers, `constraints.custom` left out.
+        solver: of what is posed in cvxpy; Clarabel when None.
+        second_opinion: whether to solve the constrained problem a second time, in cvxpy.
+    """
+
+    arm: str
+    recordings: tuple[Path, ...]
+    validation: tuple[Path, ...] = ()
+    columns: Path | None = None
+    columns_of: Mapping[Path, Path] = field(default_factory=dict)
+    cut_standstill: bool = False
+    method: Method | None = None
+    set_name: SetName | None = None
+    prior: str | None = None
+    prior_weight: float | None = None
+    delay: float | str | None = None
+    replicates: int = 0
+    essential: bool = False
+    sdpa: bool = False
+    solver: str | None = None
+    second_opinion: bool = False
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Result of an identification, and the files written.
+
+    Attributes:
+        estimate: with everything known of it.
+        files: names of the files in the folder.
+        warnings: what is wrong with the recordings, in words.
+        unusable: why the estimate must not be used; empty where nothing says so.
+        torque: it was identified from (`Opened.torque`).
+    """
+
+    estimate: Estimate
+    files: tuple[str, ...]
+    warnings: tuple[str, ...]
+    unusable: tuple[str, ...]
+    torque: str
+
+
+def identify_files(request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Identified:
+    """Identify an arm from files and write the results.
+
+    Args:
+        request: what is asked for.
+        folder: where results go; an earlier result there is replaced as a whole.
+        tell: called with a line at each step that takes longer.
+
+    Raises:
+        UsageError, ConfigError: the request or the arm's description is not valid, or the folder holds anything
+            else.
+        RecordingError: a recording cannot be used.
+        SolverError: a solver stopped without an optimum.
+    """
+    require_replaceable(folder)
+    described = load_arm(request.arm)
+    model = arm_model(_config(described, request))
+    custom = custom_of(request.arm, described)
+    forms = own_formats(request.columns_of, [*request.recordings, *request.validation], model)
+    opened = open_together([*request.recordings, *request.validation], model, forms)
+    recordings = opened.recordings[: len(request.recordings)]
+    validation = opened.recordings[len(request.recordings) :]
+    for recording in (*recordings, *validation):
+        start, end = standstill_left_out(recording)
+        if start or end:
+            tell(f"{recording.path.name}: standstill left out, {start:.2f} s at the start and {end:.2f} s at the end")
+    found = [(recording, recording_quality(recording, model)) for recording in opened.recordings]
+    warnings = opened.remarks
+    warnings += tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
+    try:
+        estimate = identify(
+            model,
+            recordings,
+            validation,
+            method=request.method,
+            set_name=request.set_name,
+            custom=custom,
+            solver=request.solver,
+            again=request.second_opinion,
+        )
+    except CustomError as error:
+        raise mistake(request.arm, CUSTOM, str(error)) from error
+    except SolverError as error:
+        # Values too large or small for the solver come from the recording; the error then names the reason.
+        for recording, seen in found:
+            for reason in reasons_in_recording(recording.path.name, seen.joints, model):
+                raise RecordingError(recording.path, reason) from error
+        raise
+    for recording, seen in found:
+        warnings += remarks_on_limits(recording.path.name, seen.joints, model)
+    warnings += estimate.remarks
+    unusable = unusable_because(estimate, found)
+    more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
+    if request.replicates:
+        tell(f"bootstrap of {request.replicates} replicates")
+        more["bootstrap"] = _bootstrap(estimate, request.replicates)
+    if request.essential:
+        tell("essential parameters")
+        more["essential"] = _essential(estimate)
+    with replacing_folder(folder) as staging:
+        files = write_results(staging, estimate, more, unusable, described, opened.torque)
+        if request.sdpa:
+            files += _write_sdpa(staging, estimate)
+        files += write_report(staging, estimate, recordings, validation, warnings)
+        write_manifest(staging)
+    return Identified(estimate, (*files, MANIFEST), warnings, unusable, opened.torque)
+
+
+CUSTOM = ("constraints", "custom")
+
+
+def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
+    """Load the function that a description names as `constraints.custom`, from beside it or from `sys.path`.
+
+    Args:
+        arm: description file or name of a shipped one.
+        config: what it says.
+
+    Raises:
+        ConfigError: it cannot be imported; with the place where the description names it.
+    """
+    name = config.constraints.custom
+    if name is None:
+        return None
+    try:
+        return load_custom(name, folder_of(arm, CUSTOM))
+    except CustomError as error:
+        raise mistake(arm, CUSTOM, str(error)) from error
+
+
+def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> tuple[str, ...]:
+    """Return the reasons, from its recordings and its errors, why an estimate must not be used."""
+    model = estimate.model
+    seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
+    fitted = set(estimate.recordings)
+    seconds = sum(one.duration_s for recording, one in found if (recording.path.name, recording.sha256) in fitted)
+    return (
+        *(reason for reasons in seen for reason in reasons),
+        *reasons_against(estimate),
+        *reasons_in_length(estimate, seconds),
+    )
+
+
+def _config(config: ArmConfig, request: Request) -> ArmConfig:
+    if request.columns is not None:
+        config = config.model_copy(update={"recording": load_recording_format(request.columns)})
+    if request.cut_standstill:
+        form = config.recording.model_copy(update={"standstill": "cut"})
+        config = config.model_copy(update={"recording": form})
+    options = config.identification
+    pull = options.prior
+    if request.prior is not None:
+        pull = pull.model_copy(update={"kind": request.prior})
+    if request.prior_weight is not None:
+        if pull.kind == "none":
+            raise UsageError("a prior weight without a prior; add --prior")
+        pull = pull.model_copy(update={"weight": request.prior_weight})
+    changes: dict[str, Any] = {"prior": pull}
+    if request.delay is not None:
+        changes["delay"] = request.delay
+    return config.model_copy(update={"identification": options.model_copy(update=changes)})
+
+
+def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
+    return {
+        "recording": recording.path.name,
+        "samples": seen.samples,
+        "seconds": seen.duration_s,
+        "rate_hz": seen.rate_hz,
+        "jitter_seconds": {"standard_deviation": seen.jitter_std_s, "largest": seen.jitter_max_s},
+        "gaps": len(seen.gaps),
+        "repeats": seen.repeats,
+        "skipped": seen.skipped,
+        "torque": torque_in(recording),
+        "standstill_left_out_seconds": list(standstill_left_out(recording)),
+        "torn": seen.torn,
+        "per_joint": [
+            {"joint": joint.name, "saturated": joint.saturated, "standstill": joint.standstill} for joint in seen.joints
+        ],
+    }
+
+
+def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:
+    base, conditions, known = estimate.base, estimate.conditions, estimate.custom
+    solve = None
+    if known is not None:
+
+        def solve(fit: LeastSquares) -> Array:
+            found = convex_least_squares(fit, base, conditions, custom=known.function, solver=known.solver)
+            return found.estimate.beta
+
+    drawn = bootstrap(estimate.fitted, estimate.fit, base, conditions, replicates, solve=solve)
+    return {
+        "replicates": replicates,
+        "blocks_in_a_run": drawn.run,
+        "standard_deviations": [float(value) if np.isfinite(value) else None for value in drawn.standard_deviations],
+    }
+
+
+def _essential(estimate: Estimate) -> dict[str, Any]:
+    found = essential_parameters(estimate.fitted, estimate.fit, covariance=estimate.covariance)
+    return {
+        "expressions": [estimate.base.expressions[index] for index in found.kept],
+        "values": found.beta[found.kept].tolist(),
+        "standard_deviations": found.standard_deviations[found.kept].tolist(),
+        "relative_error_percent": {
+            "all": found.full.relative_percent,
+            "essential": found.reduced.relative_percent,
+        },
+    }
+
+
+def _write_sdpa(folder: Path, estimate: Estimate) -> list[str]:
+    fit, base, conditions = estimate.fit, estimate.base, estimate.conditions
+    texts: Sequence[tuple[str, str]] = (
+        ("feasibility_test.dat-s", bpft_sdpa(fit.beta, base, conditions)),
+        ("correction.dat-s", bpfc_sdpa(fit.beta, base, conditions)),
+        ("constrained_least_squares.dat-s", fbpe_sdpa(fit, base, conditions)),
+    )
+    for name, text in texts:
+        write_atomically(folder / name, text)
+    return [name for name, _ in texts]

@@ -1,0 +1,240 @@
+"""Keep the schedules of an arm (cron, operating hours, maintenance) and what is due by them.
+
+A time that was missed, because nothing ran or the clock was wrong, is due once. It stays due until a re-identification
+of the arm came to a verdict, or a person dismisses it; meanwhile its schedule adds nothing. Operating hours count only
+the time in which runs of this registry drove the arm.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Final
+
+from ident_service.errors import UnknownId, UsageError
+from ident_service.operations.cron import parse_cron
+from ident_service.registry.audit import note
+from ident_service.registry.database import Database, Row
+from ident_service.registry.motions import known_motion
+from ident_service.registry.runs import operating_seconds
+
+MAINTENANCE: Final = "maintenance"
+LONGEST_WHAT: Final = 200
+LONGEST_NOTE: Final = 2000
+MOST_SCHEDULES: Final = 100  # of an arm
+LATE: Final = 600.0  # s after which a due re-identification does not begin without a person any more
+_HOUR = 3600.0
+_DAY = 86400.0
+_HOURS = "hours:"
+
+
+@dataclass(frozen=True)
+class When:
+    """Rule for when a re-identification is due; exactly one of these.
+
+    Attributes:
+        cron: five fields in UTC (`cron.py`); None otherwise.
+        hours: of operation, since it was last due [h]; None otherwise.
+        maintenance: after each maintenance event.
+    """
+
+    cron: str | None = None
+    hours: float | None = None
+    maintenance: bool = False
+
+
+def add_schedule(db: Database, arm: str, when: When, by: str, now: float, motion: str | None = None) -> Row:
+    """Add a schedule that counts from now.
+
+    Args:
+        db: the registry.
+        arm: name of an arm that it knows.
+        when: it is due.
+        by: who asks.
+        now: s since 1970 in UTC.
+        motion: id; the description's own if None.
+
+    Raises:
+        UsageError: not exactly one time or trigger, an invalid one, too many schedules, or a motion for another arm.
+    """
+    if sum((when.cron is not None, when.hours is not None, when.maintenance)) != 1:
+        raise UsageError("give one of: cron, operating hours, maintenance")
+    if when.hours is not None and not 0.0 < when.hours < 1e6:
+        raise UsageError("operating hours are a number above 0")
+    if motion is not None and known_motion(db, motion)["arm"] != arm:
+        raise UsageError(f"the motion {motion} was made for another arm than {arm}")
+    cron = None if when.cron is None else parse_cron(when.cron)
+    trigger = None if cron else MAINTENANCE if when.hours is None else f"{_HOURS}{when.hours!r}"
+    with db.transaction():
+        if len(schedules(db, arm)) >= MOST_SCHEDULES:
+            raise UsageError(f"{arm}: has {MOST_SCHEDULES} schedules already; remove some")
+        number = 1 + max(
+            int((db.row(f"SELECT COALESCE(MAX({column}), 0) AS id FROM {table}") or {"id": 0})["id"])  # noqa: S608
+            for table, column in (("schedules", "id"), ("dues", "schedule"))  # no number comes twice
+        )
+        db.write(
+            "INSERT INTO schedules (id, arm, cron, trigger, request, next, created, created_by, counted) "
+            "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            *(number, arm, cron and cron.text, trigger, json.dumps({"motion": motion})),
+            *(cron and cron.after(now), now, by, operating_seconds(db, arm)),
+        )
+        note(db, by, "schedule added", arm, schedule=number, when=cron.text if cron else trigger)
+    return known_schedule(db, number)
+
+
+def schedules(db: Database, arm: str | None = None) -> list[Row]:
+    """Return all schedules, or those of an arm, the earliest first; `motion` is an id or None."""
+    rows = db.rows("SELECT * FROM schedules WHERE ?1 IS NULL OR arm = ?1 ORDER BY id", arm)
+    return [{**row, "motion": json.loads(row["request"]).get("motion")} for row in rows]
+
+
+def known_schedule(db: Database, number: int) -> Row:
+    """Return the schedule of this number.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    found = [row for row in schedules(db) if row["id"] == number]
+    if not found:
+        raise UnknownId(f"no schedule {number} is known; the list of schedules names them")
+    return found[0]
+
+
+def enable_schedule(db: Database, number: int, by: str, now: float, *, enabled: bool) -> Row:
+    """Enable a schedule from now on, or disable it; what is already due by it stays due.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    with db.transaction():
+        row = known_schedule(db, number)
+        if bool(row["enabled"]) is not enabled:
+            following = parse_cron(row["cron"]).after(now) if row["cron"] and enabled else row["next"]
+            db.write(
+                "UPDATE schedules SET enabled = ?, next = ?, counted = ? WHERE id = ?",
+                *(int(enabled), following, operating_seconds(db, row["arm"]), number),
+            )
+            note(db, by, "schedule enabled" if enabled else "schedule disabled", row["arm"], schedule=number)
+    return known_schedule(db, number)
+
+
+def remove_schedule(db: Database, number: int, by: str) -> None:
+    """Remove a schedule; what is already due by it stays due.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    with db.transaction():
+        row = known_schedule(db, number)
+        db.write("DELETE FROM schedules WHERE id = ?", number)
+        note(db, by, "schedule removed", row["arm"], schedule=number, when=row["cron"] or row["trigger"])
+
+
+def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: float) -> Row:
+    """Enter maintenance that was done; schedules that follow maintenance become due.
+
+    Args:
+        db: the registry.
+        arm: name of an arm that it knows.
+        what: was done, in a few words.
+        remark: more of it; may be empty.
+        by: who says so.
+        now: s since 1970 in UTC.
+
+    Raises:
+        UsageError: nothing was said, or too much.
+    """
+    what, remark = what.strip(), remark.strip()
+    if not what or len(what) > LONGEST_WHAT or len(remark) > LONGEST_NOTE:
+        raise UsageError(f"say what was done in 1 to {LONGEST_WHAT} characters; a note has {LONGEST_NOTE} at most")
+    with db.transaction():
+        db.write(
+            "INSERT INTO maintenance_events (arm, what, note, at, who) VALUES (?, ?, ?, ?, ?)",
+            *(arm, what, remark, now, by),
+        )
+        note(db, by, "maintenance", arm, done=what)
+        for row in schedules(db, arm):
+            if row["enabled"] and row["trigger"] == MAINTENANCE:
+                _falls_due(db, row, f"maintenance: {what}", now)
+    return events(db, arm, most=1)[0]
+
+
+def events(db: Database, arm: str, *, before: int | None = None, most: int = 100) -> list[Row]:
+    """Return the maintenance of an arm, the newest first, from the event before the number `before`."""
+    last = 2**62 if before is None else before
+    return db.rows(
+        "SELECT * FROM maintenance_events WHERE arm = ? AND id < ? ORDER BY id DESC LIMIT ?", arm, last, most
+    )
+
+
+def fall_due(db: Database, now: float) -> None:
+    """Enter what has become due by cron or by operating hours until now [s since 1970 in UTC]."""
+    with db.transaction():
+        for row in schedules(db):
+            if not row["enabled"]:
+                continue
+            if row["cron"]:
+                _by_cron(db, row, now)
+            elif row["trigger"].startswith(_HOURS):
+                _by_hours(db, row, now)
+
+
+def _by_cron(db: Database, row: Row, now: float) -> None:
+    cron = parse_cron(row["cron"])
+    coming = row["next"]
+    if coming <= now:
+        _falls_due(db, row, f"cron {row['cron']}", now, late=now - coming > LATE)
+        db.write("UPDATE schedules SET last = ?, next = ? WHERE id = ?", now, cron.after(now), row["id"])
+        return
+    # If the clock was put back, a past time is not due again; but a clock that was wrong by more than a day
+    # must not silence the schedule until it is right.
+    last = row["last"] or 0.0
+    right = cron.after(max(now, last) if last - now <= _DAY else now)
+    if right < coming:
+        db.write("UPDATE schedules SET next = ? WHERE id = ?", right, row["id"])
+
+
+def _by_hours(db: Database, row: Row, now: float) -> None:
+    hours, total = float(row["trigger"].removeprefix(_HOURS)), operating_seconds(db, row["arm"])
+    if total - row["counted"] >= hours * _HOUR:
+        _falls_due(db, row, f"{hours:g} operating hours", now)
+        db.write("UPDATE schedules SET last = ?, counted = ? WHERE id = ?", now, total, row["id"])
+
+
+def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = False) -> None:
+    """Enter a schedule as due, unless it is due already."""
+    if db.write(
+        "INSERT INTO dues (arm, schedule, cause, at, late) VALUES (?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+        *(row["arm"], row["id"], cause, now, int(late)),
+    ):
+        note(db, "service", "due", row["arm"], schedule=row["id"], cause=cause)
+
+
+def dues(db: Database, arm: str | None = None) -> list[Row]:
+    """Return what is due and has not been done, the earliest first."""
+    return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (?1 IS NULL OR arm = ?1) ORDER BY id", arm)
+
+
+def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
+    """Close a due entry that is not to be done, on a person's decision.
+
+    Raises:
+        UsageError: no reason, or it is not due.
+    """
+    why = why.strip()
+    if not why or len(why) > LONGEST_NOTE:
+        raise UsageError(f"say why it is not to be done, in 1 to {LONGEST_NOTE} characters")
+    with db.transaction():
+        row = db.row("SELECT arm FROM dues WHERE id = ? AND closed IS NULL", number)
+        if row is None:
+            raise UnknownId(f"nothing of number {number} is due; the list of what is due names it")
+        db.write("UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, why, number)
+        note(db, by, "due dismissed", row["arm"], due=number, note=why)
+
+
+def close_dues(db: Database, arm: str, before: float, how: str, by: str, now: float) -> None:
+    """Close an arm's entries that were due until `before` [s since 1970 in UTC], since they are done."""
+    db.write(
+        "UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND at <= ? AND closed IS NULL",
+        *(now, by, how, arm, before),
+    )

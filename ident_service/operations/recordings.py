@@ -1,0 +1,238 @@
+"""Open recordings as a person names them: `FILE@START:END`, own columns files, standstill cut at the ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, Literal
+
+import numpy as np
+
+from ident_service.config.load import load_recording_format
+from ident_service.config.recording import RecordingFormat, disagreements, units_of_other_joints
+from ident_service.errors import RecordingError, UsageError
+from ident_service.estimation.spectra import EDGE, USUAL
+from ident_service.model.arm_model import ArmModel
+from ident_service.motion.states import State
+from ident_service.recordings.files import split_range
+from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.mcap_records import MAGIC
+from ident_service.recordings.measured import MeasuredRecording
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.part import RangeRecording, first_stamp, without_standstill
+from ident_service.recordings.quality import Quality, quality
+from ident_service.recordings.recording import Recording
+
+# `_OF_ALL`: keys of a format about how all recordings become samples, not about the layout of one file.
+_STOPPING = 40  # level of events for a fault that stopped the arm (`motion/faults.py`)
+_ENDS = (State.STOPPED.value, State.FAULTED.value)
+_OF_ALL = ("trim", "gap", "stamps", "rate")
+
+
+def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
+    """Split `FILE@START:END` into file and seconds, either of which may be left out, unless such a file exists.
+
+    Raises:
+        UsageError: the range ends before it begins.
+    """
+    named, seconds = (str(path), None) if path.exists() else split_range(str(path))
+    return Path(named), seconds
+
+
+Torque = Literal["measured", "commanded"]
+RECORDED: Final = "recorded"  # torque of another program's file, which does not say whether it is measured
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Recordings that are read for one estimate.
+
+    Attributes:
+        recordings: in the order in which they were named.
+        torque: that they give: `measured` by the drives, `commanded`, `recorded` by other programs, or those in a row.
+        remarks: what was left out to have one torque in all of them.
+    """
+
+    recordings: tuple[Recording, ...]
+    torque: str
+    remarks: tuple[str, ...]
+
+
+def open_together(
+    paths: Sequence[Path],
+    model: ArmModel,
+    forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
+    torque: Torque | None = None,
+) -> Opened:
+    """Open recordings for one estimate, with the same kind of torque in all that ident recorded.
+
+    Torques that drives measured and commanded ones differ by the error of the current loops, and each has its
+    own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
+
+    Args:
+        paths: as for `open_for`.
+        model: the arm, whose `identification.torque` may demand one of them.
+        forms: how each file is laid out, where not as the description says.
+        torque: that must be used, in place of the description's.
+
+    Raises:
+        UsageError, RecordingError: as `open_for`; a recording lacks the torque that is demanded.
+    """
+    asked = torque or model.config.identification.torque
+    found = [open_for(path, model, forms.get(path), asked) for path in paths]
+    kinds = [torque_in(recording) for recording in found]
+    remarks = tuple(
+        f"{recording.path}: left out from {recording.ended:.6g} s after its first sample on: the motion was stopped,"
+        " and what acted on the arm from then on is not the recorded torque"
+        for recording in found
+        if isinstance(recording, RangeRecording) and recording.ended is not None
+    )
+    if {"measured", "commanded"} <= set(kinds):
+        without = ", ".join(path.name for path, kind in zip(paths, kinds, strict=True) if kind == "commanded")
+        remarks = (
+            *remarks,
+            f"identified from commanded torques: drives measured none in {without}, and the two are not mixed; leave "
+            "these recordings out to use measured ones",
+        )
+        for place, kind in enumerate(kinds):
+            if kind == "measured":
+                found[place] = open_for(paths[place], model, forms.get(paths[place]), "commanded")
+        kinds = ["commanded" if kind == "measured" else kind for kind in kinds]
+    return Opened(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
+
+
+def torque_in(recording: Recording) -> str:
+    """Return which torque a recording gives: `measured`, `commanded`, or `recorded` for a file of another program."""
+    if isinstance(recording, KeptRecording | RangeRecording):
+        return torque_in(recording.whole)
+    if isinstance(recording, MeasuredRecording):
+        return "measured"
+    return "commanded" if isinstance(recording, McapRecording) and recording.own else RECORDED
+
+
+def open_for(
+    path: Path, model: ArmModel, form: RecordingFormat | None = None, torque: Torque | None = None
+) -> Recording:
+    """Open a recording, or a range of one, for an arm.
+
+    Args:
+        path: the file, or `FILE@START:END`.
+        model: the arm.
+        form: how this file is laid out; as the arm's description says when None.
+        torque: that is to be read, in place of the description's.
+
+    Raises:
+        UsageError: no such file, or no such range.
+        RecordingError: it does not fit the arm, or nothing moves where standstill is to be left out.
+    """
+    file, seconds = file_and_range(path)
+    form, gears = form or model.config.recording, model.config.transmission
+    # Cached, because quality, friction, equations and evidence each read the recording.
+    torque = torque or model.config.identification.torque
+    whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
+    recording: Recording = KeptRecording(whole)
+    if isinstance(whole, McapRecording | MeasuredRecording) and (ended := _ended(whole, recording)) is not None:
+        # A range that a person asks for beyond this end is empty, and the error says so.
+        recording = RangeRecording(recording, 0.0, ended)
+        recording.ended = ended
+    if seconds is not None:
+        recording = RangeRecording(recording, *seconds, label=path.name.removeprefix(file.name))
+    if form.standstill == "cut":
+        # Rows near the ends are not used anyway, for want of neighbours; standstill may remain there.
+        edge = model.config.identification.edge
+        recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
+    return recording
+
+
+def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> float | None:
+    """Return when a stop or a fault ended the motion in a recording by ident [s after its first sample]; None if none.
+
+    From then on brakes or the drives themselves hold the arm, and the recorded torque is not what acts on it.
+    """
+    log = whole if isinstance(whole, McapRecording) else McapRecording(whole.path)
+    if not log.own:
+        return None
+    ends = (event.stamp_ns for event in log.read_extras().events if event.name == "ident" and event.message in _ENDS)
+    ended = min(ends, default=None)
+    return None if ended is None else (ended - first_stamp(recording)) * 1e-9
+
+
+def own_formats(
+    columns: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel
+) -> dict[Path, RecordingFormat]:
+    """Read the columns files that each belong to one recording.
+
+    Args:
+        columns: the columns file of each recording.
+        recordings: all that are read, as they were named.
+        model: the arm.
+
+    Returns:
+        The format of each recording that has its own, by the name it was given with.
+
+    Raises:
+        UsageError: no such recording, or a columns file with keys that are of all recordings, or not of this arm.
+        ConfigError: mistakes in a columns file.
+    """
+    found: dict[Path, RecordingFormat] = {}
+    for wanted, file in columns.items():
+        named = [path for path in recordings if wanted in (path, file_and_range(path)[0])]
+        if not named:
+            raise UsageError(f"--columns {wanted}={file}: {wanted} is none of the recordings")
+        form = load_recording_format(file)
+        if shared := [key for key in _OF_ALL if key in form.model_fields_set]:
+            raise UsageError(f"{file}: {', '.join(shared)} is of all recordings; say it in the arm's description")
+        general = model.config.recording
+        form = form.model_copy(update={key: getattr(general, key) for key in _OF_ALL})
+        if "standstill" not in form.model_fields_set:
+            form = form.model_copy(update={"standstill": general.standstill})
+        wrong = [message for _, message in disagreements(form, model.config.transmission, model.chain.names)]
+        wrong += units_of_other_joints(form, model.chain.names, model.chain.revolute)
+        if wrong:
+            raise UsageError(f"{file}: {'; '.join(wrong)}")
+        found |= dict.fromkeys(named, form)
+    return found
+
+
+def standstill_left_out(recording: Recording) -> tuple[float, float]:
+    """Return how much standstill was left out at the start and at the end [s]."""
+    return recording.standstill if isinstance(recording, RangeRecording) else (0.0, 0.0)
+
+
+def require_no_fault(path: Path, recording: Recording) -> None:
+    """Refuse a recording made by ident in which a fault stopped the arm, unless its range ends before.
+
+    Args:
+        path: as it was named.
+        recording: what was opened for it.
+
+    Raises:
+        RecordingError: names the fault and when it was.
+    """
+    file, seconds_asked = file_and_range(path)
+    with file.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return
+    log = McapRecording(file)
+    if not log.own:
+        return
+    start, end = (-np.inf, np.inf) if seconds_asked is None else seconds_asked
+    first = first_stamp(recording)
+    for event in log.read_extras().events:
+        seconds = (event.stamp_ns - first) * 1e-9
+        if event.level >= _STOPPING and start <= seconds < end:
+            raise RecordingError(
+                recording.path,
+                f"ended in a fault {seconds:.6g} s after its first sample: {event.message}; what it recorded is not the"
+                f" motion of the arm with its load alone. Record again, or give a part before: {file.name}@0:SECONDS",
+            )
+
+
+def recording_quality(recording: Recording, model: ArmModel) -> Quality:
+    """Return the quality of a recording, judged against the arm's torque limits."""
+    joints = [model.config.joints.get(name) for name in model.chain.names]
+    limits = np.array([np.nan if joint is None or joint.torque is None else joint.torque for joint in joints])
+    return quality(recording, model.config.recording, limits)

@@ -1,0 +1,124 @@
+"""Follow a run's recording in a process of its own, at the lowest priority, until its accuracy target is reached.
+
+It reads one JSON object from standard input and prints one line of JSON, once. It reads what the recorder has flushed
+and touches nothing else: its parent keeps the lease and asks for the finish. It ends when its standard input ends.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ident_service.config.load import arm_from_json
+from ident_service.estimation.doubt import shares
+from ident_service.estimation.growing import GrowingInformation
+from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
+from ident_service.model.arm_model import arm_model
+from ident_service.recordings.open import open_recording
+from ident_service.recordings.recording import Block
+from ident_service.recordings.tail import RecordingTail
+
+_LOOK = 0.3  # s between polls
+_IN_A_ROW = 2  # consecutive steps below the target: deviations are estimates, and may dip below it once by chance
+
+
+def main() -> int:
+    """Follow the recording, and print one line of JSON if the target is reached; return 0."""
+    os.nice(19)
+    request = json.loads(sys.stdin.readline())
+    if said := watch(Path(request["folder"]), Target(request["share"], tuple(request["parameters"])), request["least"]):
+        print(json.dumps(said), flush=True)
+    return 0
+
+
+def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
+    """Wait until the target is reached; return seconds of the motion and largest share then, None if it was not.
+
+    Args:
+        folder: of the run.
+        target: to be reached.
+        least: seconds of the motion itself, before which nothing counts: its period, zero where it has none.
+
+    Raises:
+        IdentError: the recording or the description cannot be read.
+    """
+    model = arm_model(arm_from_json(folder / "arm.json"))
+    growing = GrowingInformation(model, in_blocks=True, period=least)
+    places = target.places(growing.base, model.config.name)
+    if (tail := _opened(folder)) is None:
+        return None
+    row = 0
+    while True:
+        samples = tail.read()
+        if samples is not None:
+            growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
+        elif tail.ended or _left_alone():
+            return None
+        if not growing.step() or tail.exciting_ns is None or (doubt := growing.doubt()) is None:
+            continue
+        seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
+        worst = worst_share(doubt, places)
+        row = row + 1 if seconds >= least and worst <= target.share else 0
+        if row >= _IN_A_ROW:
+            return {"seconds": round(seconds, 3), "share": worst}
+
+
+def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
+    """Return which of the chosen parameters the whole recording of a run does not determine as well as asked.
+
+    Args:
+        folder: of the run, which is over.
+        target: that was not reached on the way.
+        period: of the motion [s]; zero where it has none.
+
+    Returns:
+        Expression and share of each, the least known first; the share is None where the recording says nothing of it.
+
+    Raises:
+        IdentError: the recording or the description cannot be read.
+    """
+    model = arm_model(arm_from_json(folder / "arm.json"))
+    growing = GrowingInformation(model, in_blocks=True, period=period)
+    for block in open_recording(folder / "run.mcap", model.chain.names).blocks():
+        growing.add(block)
+        while growing.step():
+            pass
+    places, doubt = target.places(growing.base, model.config.name), growing.doubt()
+    if doubt is None or doubt.blocks < LEAST_BLOCKS:
+        known = np.full(len(places), np.inf)
+    else:
+        known = shares(doubt.beta, doubt.deviations, doubt.negligible)[places]
+    found = [
+        (growing.base.expressions[place], float(share))
+        for place, share in zip(places.tolist(), known, strict=True)
+        if not share <= target.share
+    ]
+    found.sort(key=lambda one: -one[1] if np.isfinite(one[1]) else -np.inf)
+    return [{"parameter": name, "share": share if np.isfinite(share) else None} for name, share in found]
+
+
+def _opened(folder: Path) -> RecordingTail | None:
+    """Return the recording as soon as there is one; None where nobody waits for it any more."""
+    while True:
+        for name in ("run.mcap.partial", "run.mcap"):
+            try:
+                return RecordingTail(folder / name)
+            except FileNotFoundError:
+                continue
+        if _left_alone():
+            return None
+
+
+def _left_alone() -> bool:
+    """Wait a little; return whether standard input has ended, or has data, so that nobody waits for the answer."""
+    return bool(select.select([sys.stdin.fileno()], [], [], _LOOK)[0])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

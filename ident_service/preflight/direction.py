@@ -1,0 +1,354 @@
+"""Check direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
+
+Two numbers per joint. How it follows: the displacement measured from dwell to dwell against the one asked for. And how
+it answers torque: measured acceleration against the one that the model expects of the torque that acted,
+`M^-1 (tau - g)`, friction and offset taken out. A loop closes over a wrong encoder scale as if nothing were wrong; only
+the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is wrong runs away from its
+reference, until the guard ends that at twice the amplitude; what it did on the way says whether the sign was why.
+
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident_service.config.limits import MotionLimits, Vector
+from ident_service.errors import MotionRefused
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.collision import CollisionModel
+from ident_service.model.zero_phase import local_polynomial
+from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, judged, measures
+from ident_service.motion.reference import Reference, Setpoint, rest
+from ident_service.motion.surroundings import way_clearance
+from ident_service.motion.way import RuckigReference, way
+from ident_service.preflight.delay import FREQUENCY, Delay, delay_measures, dither
+from ident_service.preflight.session import BAND, Rows, Session, Trace
+from ident_service.preflight.stability import INERTIA, drive_matrix, known_drives
+
+AMPLITUDES = (0.04, -0.04, 0.02, -0.02)  # rad or m, the first that is free
+SPEED, ACCELERATION = 0.2, 1.2  # rad/s and rad/s^2, or m: at one metre 0.2 m/s, below the 0.25 of ISO 10218
+DWELL, _SETTLED = 0.25, 0.1  # s at each end, and of it what displacements are measured in
+LEARNING = (6.0, 3.0)  # 1/s, in turn: dry friction is learned at this rate, and taken as known the last time
+FOLLOWS = (0.8, 1.25)  # measured against commanded displacement
+# Where the model lacks the drive's inertia the loop's gain is too low for it, and it overshoots.
+FOLLOWS_LOOSELY = (0.5, 2.0)
+MOST_ANSWER = 1.0 / INERTIA[0]  # how much more a joint may answer to torque than the model says, at most
+# And times the answer of the lightest arm that the description allows: torque constants by data sheet are off by that.
+MORE_TORQUE = 1.25
+LEAST_ANSWER = 1.0 / (2.0 * INERTIA[1])  # and how much less, where the model knows the drive's inertia
+# Rotors by data sheet are the least that is there: of the shipped WAM's wrist, a fifth of what is.
+LEAST_DESCRIBED = 0.1
+ODD_ANSWER = 0.5  # below which an answer is reported, although a joint with an unknown inertia may give it
+_NEAREST = "answer to torque, the nearest within its doubt"
+# Behind an inertia that is missing in the model even a healthy joint answers with next to nothing.
+_NEAREST_LOOSELY = "answer to torque (too low a scale cannot be judged until the prior has the drive inertia)"
+_DOUBT = 3.0  # standard deviations
+_EXPLAINS = 0.5  # of what is unexplained must remain at most when a wrong sign is put right
+_LEAST_CYCLES = 8
+_BEGUN = 0.95  # of the way that ended at the guard is still to come when a joint has begun to move
+_SEEN = 2e-3  # rad or m that a joint must have moved before its sign can be judged
+_WINDOW = 0.06  # s, of the filter that differentiates
+_MOVING = 0.2  # of the largest speed
+SIGN_REMEDY = (
+    "Check the sign of this joint's transmission, of its encoder and of its torque in the driver's configuration."
+)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """Represent a small test motion of one joint from where it stands and back.
+
+    Attributes:
+        joint: index.
+        amplitude: signed [rad or m].
+        duration: [s].
+    """
+
+    joint: int
+    amplitude: float
+    there: RuckigReference
+    back: RuckigReference
+
+    @property
+    def duration(self) -> float:
+        """Return the duration of both ways and the dwells [s]."""
+        return self.there.duration + self.back.duration + 3.0 * DWELL
+
+    def at(self, time: float) -> Setpoint:
+        """Return the setpoint at `time` [s]."""
+        time -= DWELL
+        if time < self.there.duration + DWELL:
+            return self.there.at(max(time, 0.0))
+        return self.back.at(time - self.there.duration - DWELL)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Represent the response of one joint to its test motion.
+
+    Attributes:
+        follows: measured over commanded displacement; NaN where the joint was not moved.
+        answers: measured over expected acceleration; NaN likewise.
+        doubt: standard deviation of `answers`.
+    """
+
+    follows: float
+    answers: float
+    doubt: float
+
+
+def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[Stroke]:
+    """Plan a small test motion for every joint, or for one, by number.
+
+    Raises:
+        MotionRefused: a joint has no room within its position limits or its surroundings.
+    """
+    collision = CollisionModel(model)
+    own = np.diag(session.mass)
+    slow = replace(
+        limits,
+        velocity=np.minimum(limits.velocity, SPEED),
+        acceleration=np.minimum(np.minimum(limits.acceleration, ACCELERATION), 0.5 * BAND * limits.torque / own),
+    )
+    found = []
+    for joint, name in enumerate(model.chain.names):
+        if only not in (None, joint):
+            continue
+        if (free := _free_stroke(session.home, joint, collision, slow, model.config.workspace.clearance)) is None:
+            raise MotionRefused(f"{name}: no room to move by {min(np.abs(AMPLITUDES)):g} either way")
+        found.append(free)
+    return found
+
+
+def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
+    """Move one joint there and back three times: twice to learn its friction, the second time shaken, and once more.
+
+    Returns:
+        The cycles of the last time, and of the time before, when the joint was shaken on its way (`delay.py`).
+
+    Raises:
+        ArmFault, DriverError: from the loop.
+    """
+    reference: Reference = stroke
+    first, second = LEARNING
+    session.follow(reference, stroke.duration, first)
+    amplitude = dither(session, session.torque_limit, stroke.joint)
+    shaken = session.follow(reference, stroke.duration, second, (amplitude, FREQUENCY))
+    return session.follow(reference, stroke.duration), shaken
+
+
+def answer(trace: Trace, stroke: Stroke, session: Session) -> Answer:
+    """Evaluate a test motion that the loop could follow to its end."""
+    answers, doubt = _answer_to_torque(trace, stroke.joint, session)
+    return Answer(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
+
+
+def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
+    """Return measured over expected acceleration and its standard deviation; NaN where the joint hardly moved."""
+    nothing = float("nan"), float("nan")
+    rate = trace.rate[:, joint]
+    window = max(5, 2 * round(0.5 * _WINDOW / trace.period) + 1)
+    if len(rate) < 2 * window:
+        return nothing
+    largest = np.abs(rate).max()
+    measured = local_polynomial(trace.position[:, joint], window, 2, 2, trace.period)
+    speed = local_polynomial(trace.position[:, joint], window, 2, 1, trace.period)
+    # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
+    expected = local_polynomial(_own_way(trace, session, joint), window, 2, 2, trace.period)
+    sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
+    if int(sliding.sum()) < 2 * window:
+        return nothing
+    ones = np.ones(int(sliding.sum()))
+    columns = np.column_stack([expected[sliding], np.sign(rate[sliding]), speed[sliding], ones])
+    return _fitted(columns, measured[sliding], window)
+
+
+def _displaced(trace: Trace, stroke: Stroke) -> float:
+    """Return the mean displacement there and back, from dwell to dwell [rad or m]."""
+    ends = (DWELL, stroke.there.duration + 2.0 * DWELL, stroke.duration)
+    last = max(1, round(_SETTLED / trace.period))
+    rows = [round(end / trace.period) for end in ends]
+    start, far, back = (float(trace.position[row - last : row, stroke.joint].mean()) for row in rows)
+    return far - 0.5 * (start + back)
+
+
+def went_against(trace: Trace, joint: int, session: Session) -> bool:
+    """Return whether the joint that left its reference accelerated against its own torque, since it last stood.
+
+    Friction holds it until the torque is large enough, and is constant afterwards, so that only what comes after it has
+    begun to move counts, with a constant torque taken out.
+    """
+    position = trace.position[:, joint]
+    away = np.abs(position - position[-1])
+    begin = int(np.flatnonzero(away > _BEGUN * away.max())[-1]) if away.max() > _SEEN else len(position)
+    rows = slice(max(begin - _LEAST_CYCLES, 0), None)
+    moved, push = position[rows], (trace.torque[rows, joint] - session.gravity[joint]) / session.inertia[joint, joint]
+    if len(moved) < _LEAST_CYCLES or not np.isfinite(moved).all():
+        return False
+    speed = np.concatenate([[0.0], np.cumsum(push)[:-1]]) * trace.period
+    expected = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * trace.period
+    time = np.linspace(0.0, 1.0, len(moved))
+    gain, _ = _fitted(np.column_stack([expected, time**2, time, np.ones_like(time)]), moved, 1.0)
+    return gain < 0.0
+
+
+def wrong_signs(trace: Trace, session: Session) -> list[int]:
+    """Return the joints whose wrong sign explains how the guard ended a loop.
+
+    Measured displacements against the twice integrated accelerations that the model expects, constant torques that the
+    model does not know (gravity's for example) taken out on both sides. Joints are coupled, so that one wrong sign
+    makes others go the wrong way too: a sign of torque or of position is wrong when turning it round explains at least
+    half of what is otherwise unexplained.
+
+    Returns:
+        Indices; empty where no sign explains it, or nothing has moved far enough to say.
+    """
+    moved = trace.position - trace.position[0]
+    cycles, joints = moved.shape
+    if cycles < _LEAST_CYCLES or np.abs(moved).max() < _SEEN or not np.isfinite(moved).all():
+        return []
+    time = np.linspace(0.0, 1.0, cycles)
+    basis = np.linalg.qr(np.column_stack([np.ones(cycles), time, time**2]))[0]
+
+    def varying(values: Vector) -> Vector:
+        return np.asarray(values - basis @ (basis.T @ values))
+
+    seen = varying(moved)
+    size = np.maximum(np.linalg.norm(seen, axis=0), 1e-9)
+
+    def unexplained(torque_sign: Vector, position_sign: Vector) -> float:
+        expected = varying(expected_way(trace, session, torque_sign)) * position_sign
+        # How much more or less inertia there is than the model knows is not the question, but no less than none.
+        gain = (seen * expected).sum(axis=0) / np.maximum((expected**2).sum(axis=0), 1e-30)
+        return float((((seen - np.maximum(gain, 0.0) * expected) / size) ** 2).sum())
+
+    signs = [np.ones(joints), np.ones(joints)]
+    left = unexplained(*signs)
+    found: list[int] = []
+    while len(found) < joints:
+        tried = []
+        for kind in (0, 1):
+            for joint in range(joints):
+                other = [one.copy() for one in signs]
+                other[kind][joint] *= -1.0
+                tried.append((unexplained(*other), joint, other))
+        best, joint, other = min(tried, key=lambda one: one[0])
+        if best > _EXPLAINS * left or joint in found:
+            break
+        left, signs = best, other
+        found.append(joint)
+    return sorted(found)
+
+
+def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
+    """Return the failed direction check of an arm with joints that went the wrong way."""
+    names = ", ".join(model.chain.names[joint] for joint in joints)
+    return failed("direction", f"{names}: seems to move against its torque ({why})", SIGN_REMEDY)
+
+
+def direction_check(
+    answers: Sequence[Answer], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
+) -> Check:
+    """Evaluate all test motions of a session, and the delays measured on them, as one check."""
+    names, ones = model.chain.names, ("",) * model.chain.joints
+    nothing = np.zeros(len(names))
+    follows = np.array([one.follows for one in answers])
+    # What the drives are known to have does not get lighter with the links: doubled torque shows the sooner.
+    most = np.minimum(MOST_ANSWER, MORE_TORQUE * np.diag(session.inertia) / session.lightest)
+    known = nothing if model.prior is None else np.diag(drive_matrix(model, model.prior))
+    said = known_drives(model)
+    least = np.where(known > 0.0, LEAST_ANSWER, np.where(said > 0.0, LEAST_DESCRIBED, 0.0))
+    response = np.array([one.answers for one in answers])
+    doubt = np.array([one.doubt for one in answers])
+    # The doubt is on the arm's side: only an answer that is certainly out of bounds is.
+    nearest = np.clip(response, least, most)
+    judged_at = np.where(np.abs(response - nearest) <= _DOUBT * doubt, nearest, response)
+    found: list[Measure] = [
+        *measures("displacement, measured against commanded", follows, ones, names,
+                  least=np.where(known > 0.0, FOLLOWS[0], FOLLOWS_LOOSELY[0]),
+                  most=np.where(known > 0.0, FOLLOWS[1], FOLLOWS_LOOSELY[1])),
+        *measures("answer to torque, measured against the model", response, ones, names),
+        *(replace(one, what=_NEAREST if drive > 0.0 else _NEAREST_LOOSELY) for one, drive in zip(
+            measures(_NEAREST, judged_at, ones, names, least=least, most=most), known + said, strict=True)),
+    ]  # fmt: skip
+    # Where the response to torque cannot be told from friction, only following can be judged.
+    found = [one for one in found if one.value is not None or one.what.startswith("displacement")]
+    found += delay_measures(delays, model, session.period)
+    told = [
+        f"{name} answers torque {value:.2g} times as the model expects: a gear ratio configured twice too large gives "
+        f"0.25, half of the torque 0.5, rotors heavier than described less than 1"
+        for name, value, sure in zip(names, response, np.abs(response) + _DOUBT * doubt, strict=True)
+        if sure < ODD_ANSWER
+    ]
+    check = judged(
+        "direction",
+        found,
+        "Check this joint's gear ratio, encoder steps per turn and torque constant in the driver's configuration, and "
+        "that no brake and nothing else holds it; a joint that answers too little may lack drive inertia in the prior. "
+        "A hidden delay is in the drive's filters or its interpolation, or belongs into identification.delay.",
+    )
+    if told and check.verdict is Verdict.PASSED:
+        return replace(check, reason="; ".join([*told, "`ident check ARM --scale` tells which"]))
+    return check
+
+
+def _free_stroke(
+    home: Vector, joint: int, collision: CollisionModel, slow: MotionLimits, clearance: float
+) -> Stroke | None:
+    for amplitude in AMPLITUDES:
+        target = home.copy()
+        target[joint] += amplitude
+        if not slow.lower[joint] <= target[joint] <= slow.upper[joint]:
+            continue
+        try:
+            there, back = way(rest(home), rest(target), slow), way(rest(target), rest(home), slow)
+        except MotionRefused:
+            continue
+        if not collision.pairs or way_clearance(collision, there, slow, clearance).proven:
+            return Stroke(joint, amplitude, there, back)
+    return None
+
+
+def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
+    """Return the displacement that the model expects of the torque times `sign` [rad or m], (cycles, joints)."""
+    acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
+    return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
+
+
+def _own_way(trace: Trace, session: Session, joint: int) -> Vector:
+    """Return how far the model expects a joint's own torque to have moved it while the others stand, shape (cycles,).
+
+    Others are held by friction and by torques that move nothing.
+    """
+    push = (trace.torque[:, [joint]] - session.gravity[joint]) / session.inertia[joint, joint]
+    return _integrated_twice(push, trace.period)[:, 0]
+
+
+def _integrated_twice(acceleration: Vector, period: float) -> Vector:
+    """Return the way [rad or m] of accelerations held for a period each, both of shape (cycles, joints)."""
+    start = np.zeros((1, acceleration.shape[1]))
+    speed = np.vstack([start, np.cumsum(acceleration, axis=0)[:-1]]) * period
+    steps = period * (speed + 0.5 * period * acceleration)
+    return np.vstack([start, np.cumsum(steps, axis=0)[:-1]])
+
+
+def _fitted(columns: Vector, values: Vector, correlated: float) -> tuple[float, float]:
+    """Return the first coefficient of a least-squares fit and its standard deviation.
+
+    Args:
+        columns: shape (samples, unknowns).
+        values: shape (samples,).
+        correlated: over how many samples residuals are not independent.
+    """
+    size = np.linalg.norm(columns, axis=0)
+    size = np.where(size > 0.0, size, 1.0)
+    solution, _, rank, _ = np.linalg.lstsq(columns / size, values, rcond=None)
+    if rank < columns.shape[1]:
+        return float("nan"), float("nan")
+    left = values - (columns / size) @ solution
+    variance = float(left @ left) / max(len(values) - columns.shape[1], 1) * correlated
+    inverse = np.linalg.inv((columns / size).T @ (columns / size))
+    return float(solution[0] / size[0]), float(np.sqrt(variance * inverse[0, 0]) / size[0])

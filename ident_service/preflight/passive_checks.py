@@ -1,0 +1,300 @@
+"""Check an arm without torque: identities of the drives, rest, regular cycles, and noise of positions.
+
+Only `exchange(None)` is used; no drive is energised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.arm import Arm, ArmDescription, Sample, Vector
+from drivers.axis_status import AxisStatus
+from ident_service.config.limits import MotionLimits
+from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
+from ident_service.model.arm_model import ArmModel
+from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
+from ident_service.motion.preflight_check import Check, Verdict, failed, joint_units, judged, measure, measures, skipped
+
+DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
+LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)
+LATE_SHARE = 0.05  # of the cycles may be late (FIELDBUS.md 5.2)
+LONGEST_GAP = 20.0  # periods in which the arm is not supervised (FIELDBUS.md 5.2: whole bus silent)
+PERIOD_ERROR = 0.02  # of a period: what the median may differ by
+STEPS_OF_NOISE = 3.0  # encoder steps: an axis at rest stays on one, or between two
+VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
+TORQUE_NOISE = 0.05  # of the torque limit, standard deviation, that the gains make of the noise
+LOST = 0.01  # of all answers
+RATE_REMEDY = (
+    "Give the process a core of its own and real-time priority (`ident doctor ARM` says what is missing), stop "
+    "other load, or lower control.rate."
+)
+
+
+@dataclass(frozen=True)
+class Looked:
+    """Hold cycles recorded without torque.
+
+    Attributes:
+        samples: in the order of cycles.
+        woken_ns: time of the loop's clock when each exchange returned [ns], shape (cycles,).
+        period: of the description [s].
+    """
+
+    samples: tuple[Sample, ...]
+    woken_ns: Vector
+    period: float
+
+    @property
+    def position(self) -> Vector:
+        """Return the positions [rad or m], shape (cycles, joints)."""
+        return np.array([sample.position for sample in self.samples])
+
+    @property
+    def usable(self) -> bool:
+        """Return whether every axis has answered with finite positions, in the first, the last and almost all cycles.
+
+        Positions of lost answers repeat the last ones, which is right for an arm at rest.
+        """
+        valid = np.array([sample.valid for sample in self.samples])
+        enough = bool((valid.mean(axis=0) >= 1.0 - LOST).all() and valid[0].all() and valid[-1].all())
+        return enough and bool(np.isfinite(self.position).all())
+
+
+def look(arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None) -> Looked:
+    """Record cycles of an open arm without torque.
+
+    Args:
+        arm: open.
+        cycles: how many.
+        period: of its description [s].
+        work: done in every cycle, so that the rate is measured under the load of a run.
+
+    Raises:
+        DriverError: the arm does not answer at all.
+    """
+    samples, woken = [], []
+    for _ in range(cycles):
+        sample = arm.exchange(None)
+        woken.append(arm.clock.now_ns())
+        samples.append(sample)
+        work(sample)
+    return Looked(tuple(samples), np.array(woken, dtype=float), period)
+
+
+def identities_check(
+    described: ArmDescription, model: ArmModel, limits: MotionLimits, expected: Sequence[str] | None, looked: Looked
+) -> Check:
+    """Check that every axis answers, and is the drive that the description means.
+
+    Args:
+        described: by the open arm.
+        model: of the arm.
+        limits: of the description; the driver must not clip below them, or what was proven of torques is not true.
+        expected: identities from an earlier check, in the order of the axes; None accepts whatever answers.
+        looked: at the arm.
+    """
+    code, names = "identities", model.chain.names
+    if described.joint_names != names:
+        return failed(
+            code,
+            f"the arm on the bus has the joints {', '.join(described.joint_names)}, the description {', '.join(names)}",
+            "Give the description of this arm, or connect the arm that the description means.",
+        )
+    if expected is not None and tuple(expected) != described.identities:
+        theirs = [*described.identities, *["nothing"] * len(expected)]
+        changed = [
+            f"{name}: {is_!r} instead of {was!r}"
+            for name, was, is_ in zip(names, expected, theirs, strict=False)
+            if was != is_
+        ]
+        return failed(
+            code,
+            "; ".join(changed) or "other drives than expected",
+            "If a drive was exchanged on purpose, calibrate its zero and torque constant and accept the new identity.",
+        )
+    last = looked.samples[-1]
+    stopped = [
+        f"{name}: {' and '.join(flag.name.lower().replace('_', ' ') for flag in flags if flag.name)}"
+        for name, word in zip(names, last.status, strict=False)
+        if (flags := AxisStatus(word) & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP))
+    ]
+    if stopped:
+        return failed(
+            code,
+            "; ".join(stopped),
+            "Release the emergency stop, or read the drive's fault code, mend its cause and reset it.",
+        )
+    answers = np.array([sample.valid & np.isfinite(sample.position) for sample in looked.samples])
+    nothing = np.zeros(len(names))
+    found = [
+        *measures("answers missing", 1.0 - answers.mean(axis=0), ("",) * len(names), names, most=nothing + LOST),
+        *measures(
+            "torque limit of the driver",
+            described.torque_limit,
+            joint_units(model.chain.revolute, "N m", "N"),
+            names,
+            # A driver clips to whole steps of its torque.
+            least=limits.torque - described.torque_resolution * 1.001,
+        ),
+        measure(
+            "rate of the driver",
+            described.rate,
+            "1/s",
+            least=0.999 * model.config.control.rate,
+            most=1.001 * model.config.control.rate,
+        ),
+    ]
+    # An infinite limit is no finite number, but clips nothing.
+    found = [one for one in found if not (one.what.startswith("torque limit") and one.value is None)]
+    return judged(
+        code,
+        found,
+        "Check power, cables and bus termination of the axes that do not answer; bring limits and rate of driver and "
+        "description into agreement.",
+    )
+
+
+def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None) -> Check:
+    """Check that the arm stands still without torque, inside its limits, and no motor whole turns elsewhere.
+
+    Args:
+        looked: at the arm.
+        model: of the arm.
+        limits: of the arm.
+        closed: where it stood when it was closed last, where that is known.
+    """
+    code, names = "at_rest", model.chain.names
+    if not looked.usable:
+        return failed(code, "not every axis answers as it should", "Check bus and encoders of the axes named above.")
+    position = looked.position
+    drift = np.abs(position[-1] - position[0]) / (looked.period * (len(position) - 1))
+    speed = joint_units(model.chain.revolute, "rad/s", "m/s")
+    angle = joint_units(model.chain.revolute, "rad", "m")
+    found = [
+        *measures("drift", drift, speed, names, most=DRIFT * limits.velocity),
+        *measures("position", position[-1], angle, names, least=limits.lower, most=limits.upper),
+    ]
+    if closed is not None:
+        found += measures("moved since it was closed last", position[-1] - closed.position, angle, names)
+        if words := turned(closed, position[-1], model.config):
+            return failed(code, words, LOOK_AT_IT, found)
+    return judged(
+        code, found, "Let the arm come to rest on its support, inside its position limits, and keep hands off."
+    )
+
+
+def rate_check(looked: Looked, lock_step: bool) -> Check:
+    """Check that this machine keeps the rate: median period, and lateness of cycles.
+
+    Args:
+        looked: cycles of the arm, with the work of a run in each.
+        lock_step: whether time is virtual.
+    """
+    code = "rate"
+    if lock_step:
+        return skipped(code, "time is virtual: it waits for whoever is late, so there is nothing to measure")
+    period = looked.period
+    gaps = np.diff(looked.woken_ns) * 1e-9
+    late = np.maximum(gaps - period, 0.0)
+    found = [
+        measure("median period", float(np.median(gaps)) * 1e3, "ms",
+                least=(1.0 - PERIOD_ERROR) * period * 1e3, most=(1.0 + PERIOD_ERROR) * period * 1e3),
+        measure("lateness of 99 % of the cycles", float(np.quantile(late, 0.99)) * 1e3, "ms"),
+        measure("worst lateness", float(late.max()) * 1e3, "ms", most=LONGEST_GAP * period * 1e3),
+        measure("late cycles", float((late > LATE * period).mean()), "", most=LATE_SHARE),
+    ]  # fmt: skip
+    return judged(
+        code,
+        found,
+        RATE_REMEDY,
+    )
+
+
+def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: Check) -> Check:
+    """Check the rate of the whole loop under holding torque, in addition to the rate measured without torque.
+
+    Args:
+        stamps_ns: of the cycles [ns], shape (cycles,).
+        period: [s].
+        lock_step: whether time is virtual.
+        before: the check of the rate without torque.
+    """
+    if lock_step or before.verdict is not Verdict.PASSED:
+        return before
+    gaps = np.diff(stamps_ns) * 1e-9
+    late = np.maximum(gaps - period, 0.0)
+    seconds = f"with torque frames for {float(gaps.sum()):.0f} s"
+    found = [
+        *before.measures,
+        measure(f"lateness of 99.9 % of the cycles, {seconds}", float(np.quantile(late, 0.999)) * 1e3, "ms"),
+        measure(f"worst lateness, {seconds}", float(late.max()) * 1e3, "ms", most=LONGEST_GAP * period * 1e3),
+        measure(f"late cycles, {seconds}", float((late > LATE * period).mean()), "", most=LATE_SHARE),
+    ]
+    return judged(before.code, found, RATE_REMEDY)
+
+
+def noise_check(
+    looked: Looked, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass: Vector
+) -> Check:
+    """Check the position noise of an arm at rest, and what filter and gains make of it.
+
+    Args:
+        looked: at the arm, at rest.
+        described: for the encoders' steps.
+        model: for the control section.
+        limits: for the gains.
+        mass: the model's mass matrix where the arm stands, shape (joints, joints).
+    """
+    if not looked.usable:
+        return failed("noise", "not every axis answers as it should", "Check bus and encoders.")
+    names, period = model.chain.names, looked.period
+    position = looked.position
+    time = np.linspace(-1.0, 1.0, len(position))[:, None]
+    slope = (time * position).sum(axis=0) / (time**2).sum()
+    noise = position - position.mean(axis=0) - slope * time
+    gain = 1.0 - np.exp(-2.0 * np.pi * np.asarray(model.config.control.velocity_cutoff) * period)
+    velocity = np.zeros_like(noise)
+    for k in range(1, len(noise)):
+        velocity[k] = velocity[k - 1] + gain * ((noise[k] - noise[k - 1]) / period - velocity[k - 1])
+    torque = (limits.kp * noise + limits.kd * velocity) @ mass.T
+    angle = joint_units(model.chain.revolute, "rad", "m")
+    speed = joint_units(model.chain.revolute, "rad/s", "m/s")
+    force = joint_units(model.chain.revolute, "N m", "N")
+    step = described.position_resolution
+    # Where the driver does not state its encoder's resolution, only the effect of noise on the loop can be judged.
+    steps = np.where(step > 0.0, STEPS_OF_NOISE * step, np.inf)
+    found = [
+        *measures("position noise, standard deviation", noise.std(axis=0), angle, names, most=steps),
+        *measures("position noise, peak", np.abs(noise).max(axis=0), angle, names),
+        *measures("velocity after the filter, standard deviation", velocity.std(axis=0), speed, names),
+        *measures(
+            "velocity after the filter, peak", np.abs(velocity).max(axis=0), speed, names,
+            most=VELOCITY_NOISE * limits.velocity,
+        ),
+        *measures(
+            "torque that the gains make of it, standard deviation", torque.std(axis=0), force, names,
+            most=TORQUE_NOISE * limits.torque,
+        ),
+    ]  # fmt: skip
+    return judged(
+        "noise",
+        found,
+        "Check shielding and grounding of the encoder, keep the arm's surroundings still, or lower "
+        "control.velocity_cutoff and kd.",
+    )
+
+
+def unreachable(error: ArmError) -> Check:
+    """Return the failed check of an arm that could not be opened or recorded, with the reason."""
+    remedy = "Check power, cables and that no other program has the arm."
+    if isinstance(error, PositionUnknown):
+        remedy = "Do what this says; nobody else knows where the arm stands."
+    elif isinstance(error, AnotherDrive):
+        remedy = (
+            "Put the drives back in their places; after a repair calibrate zero and torque scale, then enter the new "
+            "identity."
+        )
+    return Check("identities", Verdict.FAILED, (), str(error), remedy)

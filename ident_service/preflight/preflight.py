@@ -1,0 +1,403 @@
+"""Run all preflight checks, in an order in which none endangers the arm for what a later check would have found.
+
+First the checks that need no arm, then those without torque, then those that hold the arm, move it a little, and at
+last let the drives stop it. The first failed check that makes touching the arm unsafe ends preflight; the rest are
+skipped and name that check. Whatever happens, the arm is without torque and closed afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import timedelta
+
+import numpy as np
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind
+from drivers.axis_status import AxisStatus
+from drivers.clock import Clock, RealClock
+from ident_service.config.limits import MotionLimits, Vector, motion_limits
+from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
+from ident_service.excitation.excitation import Excitation
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.expected_friction import ExpectedFriction, expected_friction
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.threads import one_blas_thread
+from ident_service.motion.attended import attended
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.last_position import LastPosition
+from ident_service.motion.outside import admitting, reachable
+from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
+from ident_service.motion.reference import hold, rest
+from ident_service.motion.ticket import VALID, Ticket, new_ticket, subject_of
+from ident_service.preflight import gravity as weight
+from ident_service.preflight.delay import delay_of
+from ident_service.preflight.direction import (
+    DWELL,
+    Stroke,
+    answer,
+    direction_check,
+    expected_way,
+    follow_stroke,
+    sign_failure,
+    strokes,
+    went_against,
+)
+from ident_service.preflight.passive_checks import (
+    Looked,
+    at_rest_check,
+    identities_check,
+    look,
+    loop_rate_check,
+    noise_check,
+    rate_check,
+    unreachable,
+)
+from ident_service.preflight.remedy import remedy_of
+from ident_service.preflight.session import Rows, Session, trace_of
+from ident_service.preflight.static_checks import (
+    away_from_home,
+    configuration_check,
+    motion_fits_check,
+    motion_proven_check,
+    stability_check,
+    way_home_check,
+    ways_check,
+)
+from ident_service.preflight.watchdog import CODE, Confirm, Consent, consent, watchdog_check
+
+LOOK = 1.0  # s
+RESTS = 3.0  # s that an arm may take to come to rest when its drives have stopped
+REST_REMEDY = "Support the arm where every joint has room to move a little, keep hands off, and check again."
+_LEAST_CYCLES = 100
+_LOOK_AGAIN = 20  # cycles
+
+Tell = Callable[[Check], None]
+
+
+@one_blas_thread()  # a second one would compete for the other core, and be waited for
+def preflight(
+    arm: Arm,
+    model: ArmModel,
+    excitation: Excitation | None,
+    *,
+    confirm: Confirm = lambda question: "",
+    clock: Clock | None = None,
+    identities: Sequence[str] | None = None,
+    tell: Tell = lambda check: None,
+    valid: timedelta = VALID,
+    look_seconds: float = LOOK,
+    rate_seconds: float = 0.0,
+    closed: LastPosition | None = None,
+) -> Ticket:
+    """Check an arm and a motion.
+
+    Args:
+        arm: not open; it stands on its support, without torque.
+        model: of the arm.
+        excitation: to be run; None to check the arm for a way home or out of a limit, which may begin a little outside
+            the position limits.
+        confirm: shows a question and returns what a person typed; asked once, before anything is energised.
+        clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
+        identities: of the drives, as an earlier ticket has them; None accepts whatever answers.
+        tell: called with every check as soon as it is made.
+        valid: how long the ticket counts.
+        look_seconds: how long rate and noise are measured.
+        rate_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
+        closed: where the arm stood when it was closed last, where that is known.
+
+    Returns:
+        The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
+    """
+    clock = RealClock() if clock is None else clock
+    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds, closed)
+    flight.run()
+    subject = subject_of(model, excitation, flight.described)
+    return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
+
+
+def _felt_friction(model: ArmModel, limits: MotionLimits) -> ExpectedFriction:
+    """Return the friction that joints feel, of whichever drives move them."""
+    return expected_friction(model, limits, model.config.design.friction_guess).at_joints(model.chain)
+
+
+@dataclass(frozen=True)
+class _Gravity:
+    torque: Vector
+    limits: MotionLimits
+    friction: ExpectedFriction
+
+    def carried_by(self, held: Vector) -> bool:
+        """Return whether the torque that holds the arm is near enough to the model's; fast enough between cycles."""
+        difference, most = weight.differences(held, self.torque, self.limits, self.friction)
+        return bool((difference <= most).all())
+
+
+class _Ended(Exception):
+    """Signal that the arm is without torque again, with the reason among the checks."""
+
+
+class _Preflight:
+    def __init__(
+        self,
+        arm: Arm,
+        model: ArmModel,
+        excitation: Excitation | None,
+        confirm: Confirm,
+        identities: Sequence[str] | None,
+        tell: Tell,
+        look_seconds: float,
+        rate_seconds: float,
+        closed: LastPosition | None,
+    ) -> None:
+        self.arm, self.model, self.excitation = arm, model, excitation
+        self.confirm, self.identities, self.tell = confirm, identities, tell
+        self.look_seconds, self.rate_seconds, self.closed = look_seconds, rate_seconds, closed
+        self.described: ArmDescription | None = None
+        self.away = ""  # from home, in words
+        self.checks: dict[str, Check] = {}
+
+    def run(self) -> None:
+        """Make every check that can be made safely."""
+        if not self._passed(configuration_check(self.model)):
+            return
+        limits = motion_limits(self.model.config)
+        motion = self.excitation
+        stable = stability_check(self.model, limits, motion)
+        # Through a loop that is not stable no arm follows any motion; another motion is no remedy.
+        if (
+            motion is not None
+            and self._passed(motion_fits_check(self.model, motion))
+            and stable.verdict is Verdict.PASSED
+        ):
+            self._passed(motion_proven_check(self.model, limits, motion))
+        self._passed(stable)
+        try:
+            with self.arm:
+                try:
+                    self._opened(limits)
+                except _Ended:
+                    return
+                finally:
+                    self.arm.stop(StopKind.TORQUE_OFF)
+        except ArmError as error:
+            self._broken(error)
+        finally:
+            self.arm.close()  # once more, for an arm that failed while it was opened
+
+    def all_checks(self) -> list[Check]:
+        """Return every check; those that were not made name the one that failed."""
+        because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
+        why = "nothing before it failed, but it was not reached" if because is None else f"because {because} failed"
+        made = dict(self.checks)
+        if self.excitation is None:
+            made |= {code: skipped(code, "no motion is asked about") for code in ("motion_fits", "motion_proven")}
+        return [made.get(code) or skipped(code, why) for code in CODES]
+
+    def _opened(self, limits: MotionLimits) -> None:
+        self.described = self.arm.describe()
+        period = 1.0 / self.described.rate
+        first = self.arm.exchange(None)
+        cycles = max(_LEAST_CYCLES, round(self.look_seconds / period))
+        looked = look(self.arm, cycles, period, self._load(first, limits, period))
+        # Drives would take us for dead, above all while a person thinks.
+        with attended(self.arm):
+            agreed = self._agreed(looked, limits)
+        if agreed is None:
+            return
+        # A person may have taken minutes to answer, and may have moved the arm meanwhile.
+        again = look(self.arm, _LOOK_AGAIN, period)
+        if (still := at_rest_check(again, self.model, self._bounds(limits))).verdict is not Verdict.PASSED:
+            self._passed(still)
+            return
+        home = again.samples[-1].position
+        with attended(self.arm):
+            limits = limits if self.excitation is not None else admitting(home, limits)
+            friction = _felt_friction(self.model, limits)
+            session = Session(self.arm, self.model, limits, self.described, home, friction)
+            planned = self._planned(session)
+        self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
+
+    def _bounds(self, limits: MotionLimits) -> MotionLimits:
+        """Return where the run may begin: inside the limits, or for a way home as far outside as `reachable` allows."""
+        return limits if self.excitation is not None else reachable(limits)
+
+    def _agreed(self, looked: Looked, limits: MotionLimits) -> Consent | None:
+        """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
+        if self.described is None or not self._passed(
+            identities_check(self.described, self.model, limits, self.identities, looked)
+        ):
+            return None
+        if not self._passed(at_rest_check(looked, self.model, self._bounds(limits), self.closed)):
+            return None
+        home = looked.samples[-1].position.copy()
+        if self.excitation is not None:
+            self.away = away_from_home(self.model, limits, home)
+        if self.excitation is None:
+            self._passed(way_home_check(self.model, limits, home))
+            limits = admitting(home, limits)
+        elif self.checks["motion_fits"].verdict is Verdict.PASSED:
+            self._passed(ways_check(self.model, limits, self.excitation, home), of_place=True)
+        self._passed(rate_check(looked, self.arm.clock.lock_step))
+        friction = _felt_friction(self.model, limits)
+        session = Session(self.arm, self.model, limits, self.described, home, friction)
+        self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
+        if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
+            return None
+        if (impossible := weight.holdable(session.gravity, self.model, limits)) is not None:
+            self._passed(impossible, of_place=True)
+            return None
+        agreed = consent(self.model, looked.samples[-1], self.confirm)
+        if agreed.check is not None:
+            self._passed(agreed.check)
+        return agreed
+
+    def _planned(self, session: Session) -> list[Stroke]:
+        """Plan a small test motion of every joint; none, and a failed check, where a joint has no room."""
+        try:
+            # Of a joint that stands outside its limits none leads farther out.
+            room = admitting(session.home, motion_limits(self.model.config), 0.0)
+            return strokes(session, self.model, room)
+        except (ModelError, MotionRefused) as error:
+            remedy = "Move the arm by hand to where every joint has room."
+            self._passed(failed("direction", str(error), remedy), of_place=True)
+            return []
+
+    def _touched(self, session: Session, planned: Sequence[Stroke], gravity: _Gravity, *, try_watchdog: bool) -> None:
+        """Hold the arm, move it a little, and fall silent; judge the findings after torque is off."""
+        held: Rows = ()
+        moved: list[tuple[Rows, Rows]] = []
+        silent: Check | None = None
+        try:
+            session.energise()
+            held = session.follow(hold(session.home), weight.SETTLE + max(weight.HOLD, self.rate_seconds))
+            if planned and gravity.carried_by(weight.held_torque(held, session.period)):
+                moved += (follow_stroke(session, one) for one in planned)
+                session.follow(hold(session.home), weight.SETTLE)
+                if try_watchdog:
+                    silent = watchdog_check(self.arm, self.model, session, hold(session.home).at)
+            if silent is None:
+                session.release()
+        except ArmError as error:
+            self.arm.stop(StopKind.TORQUE_OFF)
+            self._judged(session, gravity, held, planned, moved)
+            if not isinstance(error, ArmFault):
+                raise
+            self._faulted(session, gravity, error)
+            raise _Ended from error
+        with attended(self.arm):
+            self._judged(session, gravity, held, planned, moved)
+        if silent is not None and silent.verdict is Verdict.PASSED:
+            silent = self._silent_in_motion(silent)
+        if silent is not None:
+            self._passed(silent)
+
+    def _silent_in_motion(self, at_rest: Check) -> Check:
+        """Fall silent again, in the middle of a small motion of one joint; returns both watchdog checks in one."""
+        try:
+            self.arm.close()  # what the silence has left behind in drives ends with the session
+            self.arm.open()
+            limits, described = motion_limits(self.model.config), self.arm.describe()
+            period = 1.0 / described.rate
+            for _ in range(max(1, round(RESTS / (_LOOK_AGAIN * period)))):
+                looked = look(self.arm, _LOOK_AGAIN, period)
+                if at_rest_check(looked, self.model, reachable(limits)).verdict is Verdict.PASSED:
+                    break
+            else:
+                return failed(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
+            home = looked.samples[-1].position
+            if any(AxisStatus(word) & AxisStatus.FAULT for word in looked.samples[-1].status):
+                self.arm.reset()  # the host's own silence was the fault
+            with attended(self.arm):
+                limits = admitting(home, limits)
+                friction = _felt_friction(self.model, limits)
+                session = Session(self.arm, self.model, limits, described, home, friction)
+                room = admitting(home, motion_limits(self.model.config), 0.0)
+                stroke = strokes(session, self.model, room, only=0)[0]
+            session.energise()
+            session.follow(hold(home), weight.SETTLE)
+            half = DWELL + 0.5 * stroke.there.duration
+            session.follow(stroke, half)
+            moving = watchdog_check(self.arm, self.model, session, lambda time: stroke.at(half + time), stroke.joint)
+        except (MotionRefused, ArmFault) as error:
+            self.arm.stop(StopKind.TORQUE_OFF)
+            return failed(CODE, f"in motion: {error}", REST_REMEDY, at_rest.measures)
+        return replace(moving, measures=(*at_rest.measures, *moving.measures))
+
+    def _judged(
+        self,
+        session: Session,
+        gravity: _Gravity,
+        held: Rows,
+        planned: Sequence[Stroke],
+        moved: Sequence[tuple[Rows, Rows]],
+    ) -> None:
+        if held:
+            stamps = np.array([sample.stamp_ns for sample, _ in held], dtype=float)
+            before = self.checks["rate"]
+            rate = loop_rate_check(stamps, session.period, self.arm.clock.lock_step, before)
+            if rate is not before:
+                self._passed(rate)
+            torque = weight.held_torque(held, session.period)
+            self._passed(weight.gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
+        if planned and len(moved) == len(planned):
+            answers = [
+                answer(trace_of(rows, session.period), stroke, session)
+                for (rows, _), stroke in zip(moved, planned, strict=True)
+            ]
+            traces = [trace_of(shaken, session.period) for _, shaken in moved]
+            delays = [
+                delay_of(trace, expected_way(trace, session), stroke.joint)
+                for trace, stroke in zip(traces, planned, strict=True)
+            ]
+            self._passed(direction_check(answers, self.model, session, [one for one in delays if one]))
+
+    def _load(self, first: Sample, limits: MotionLimits, period: float) -> Callable[[Sample], None]:
+        """Return a function that computes the control law of a run and discards the result, as load on the rate."""
+        prior = np.zeros(self.model.layout.size) if self.model.prior is None else self.model.prior
+        if first.position.shape != (self.model.chain.joints,) or not np.isfinite(first.position).all():
+            return lambda sample: None
+        dynamics = InverseDynamics(self.model.chain, self.model.layout, prior)
+        cutoff = self.model.config.control.velocity_cutoff
+        control = ComputedTorque(dynamics, limits, period, cutoff, first.position)
+        still = rest(first.position)
+
+        def work(sample: Sample) -> None:
+            control.torque(np.nan_to_num(sample.position), sample.valid, still)
+
+        return work
+
+    def _faulted(self, session: Session, gravity: _Gravity, error: ArmFault) -> None:
+        """Find out what ended the loop: what the fault names, a joint that went the wrong way, or another cause."""
+        if "gravity" not in self.checks:
+            self._passed(weight.not_held(session, self.model, gravity.limits, gravity.friction, error))
+            return
+        if (remedy := remedy_of(error)) is not None:
+            self._passed(failed("direction", str(error), remedy))
+            return
+        trace = session.trace()
+        astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
+        name = self.model.chain.names[astray]
+        if went_against(trace, astray, session):
+            self._passed(sign_failure([astray], self.model, str(error)))
+        else:
+            remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
+            self._passed(failed("direction", f"{name} went astray: {error}", remedy))
+
+    def _broken(self, error: ArmError) -> None:
+        """Record a failed check for an arm that could not be opened, recorded or energised, or that fell silent."""
+        if self.described is None or "identities" not in self.checks:
+            self._passed(unreachable(error))
+        else:
+            # None about the motion: a way home may begin although one of them failed. The last where all are made.
+            left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
+            code = next(left, CODES[-1])
+            remedy = "Check power, cables, bus and the drives' own fault codes."
+            self._passed(failed(code, str(error), remedy))
+
+    def _passed(self, check: Check, *, of_place: bool = False) -> bool:
+        if of_place and check.verdict is Verdict.FAILED and self.away:
+            check = replace(check, reason=f"the arm is not at home ({self.away}): `ident home`; {check.reason}")
+        self.checks[check.code] = check
+        self.tell(check)
+        return check.verdict is Verdict.PASSED

@@ -1,0 +1,289 @@
+"""Run the part of preflight with torque: a control loop that may move the arm by next to nothing.
+
+The arm has just been seen at rest without torque, so it is supported where it stands. The loop is that of a run, but
+its guard stops it `FARTHEST` from where it should be, at a crawl, and its torque is kept to a band around the model's
+gravity torque: a wrong sign or a wrong scale then drives the arm no farther than a few hundredths of a radian, from
+where it can be let go. So every end here, good or bad, is torque off; a drive's own quick stop would trust the very
+sign that has not been proven yet.
+
+While the torque is on nothing is worked out between two cycles, for drives give up within a few cycles without torque
+frames: what was recorded is evaluated when torque is off again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from drivers.arm import Arm, ArmDescription, Flags, Sample, StopKind, Vector
+from ident_service.config.limits import MotionLimits
+from ident_service.errors import ArmFault
+from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.expected_friction import ExpectedFriction
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.control import ComputedTorque
+from ident_service.motion.deadlines import Elapsed
+from ident_service.motion.guard import Guard, Reaction
+from ident_service.motion.reference import Reference, Setpoint
+from ident_service.preflight.stability import INERTIA, known_drives
+
+FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motions that prove directions
+FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by far
+BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
+_CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
+RELEASE = 0.5  # s over which torque is led to zero
+SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and torque is taken off at once
+
+Rows = Sequence[tuple[Sample, Setpoint]]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Hold the cycles of a loop as arrays, one row per period from the first cycle's stamp on.
+
+    In a period in which no cycle came, because the machine was late, positions and references are between those around
+    it, and the torque before it acted on.
+
+    Attributes:
+        position: measured [rad or m], shape (cycles, joints).
+        torque: that acts from each stamp on [N m or N], shape (cycles, joints).
+        reference: position asked for [rad or m], shape (cycles, joints).
+        rate: velocity asked for [rad/s or m/s], shape (cycles, joints).
+        period: [s].
+    """
+
+    position: Vector
+    torque: Vector
+    reference: Vector
+    rate: Vector
+    period: float
+
+
+def trace_of(rows: Rows, period: float) -> Trace:
+    """Return cycles with their references, the earliest first, as a trace.
+
+    Args:
+        rows: at least one; stamps rise.
+        period: [s].
+    """
+    stamps = np.array([sample.stamp_ns for sample, _ in rows])
+    index = np.rint((stamps - stamps[0]) * 1e-9 / period).astype(int)
+    position = np.array([sample.position for sample, _ in rows])
+    torque = np.array([sample.torque for sample, _ in rows])
+    reference = np.array([setpoint.position for _, setpoint in rows])
+    rate = np.array([setpoint.velocity for _, setpoint in rows])
+    grid = np.arange(index[-1] + 1)
+    if len(grid) != len(rows):
+        position, reference, rate = (
+            np.column_stack([np.interp(grid, index, column) for column in values.T])
+            for values in (position, reference, rate)
+        )
+        torque = torque[np.searchsorted(index, grid, side="right") - 1]
+    return Trace(position, torque, reference, rate, period)
+
+
+class Session:
+    """Run a guarded loop on an open arm at rest.
+
+    Attributes:
+        home: where the arm stood [rad or m], shape (joints,).
+        gravity: the model's torque there [N m or N], shape (joints,).
+        mass: the model's mass matrix there, shape (joints, joints).
+        inertia: the same with the drive inertia that the description knows of and the prior lacks.
+        lightest: the least inertia that each joint may have [kg m^2 or kg], shape (joints,): links lighter than
+            modelled, and all of the described drive inertia.
+        period: [s].
+        torque_limit: of the description [N m or N], shape (joints,).
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        model: ArmModel,
+        limits: MotionLimits,
+        described: ArmDescription,
+        home: Vector,
+        friction: ExpectedFriction,
+    ) -> None:
+        """Prepare the loop; nothing is sent.
+
+        Args:
+            arm: open, at rest, not enabled.
+            model: with a prior.
+            limits: of the arm.
+            described: description of the open arm.
+            home: where it stands [rad or m], shape (joints,).
+            friction: widens the band of torques.
+        """
+        period = 1.0 / described.rate
+        known = control_model(model).prior
+        dynamics = InverseDynamics(model.chain, model.layout, np.zeros(model.layout.size) if known is None else known)
+        still = np.zeros_like(home)
+        self.home = home.copy()
+        self.gravity = dynamics.torque(home, still, still)
+        self.mass = dynamics.mass_matrix(home)
+        self.inertia = self.mass + np.diag(known_drives(control_model(model)))
+        prior = np.zeros(model.layout.size) if model.prior is None else model.prior
+        links = InverseDynamics(model.chain, model.layout, prior).mass_matrix(home)
+        self.lightest = np.diag(self.inertia - (1.0 - INERTIA[0]) * links)
+        self._arm = arm
+        self.period = period
+        self.torque_limit = limits.torque
+        self._band = np.minimum(BAND * limits.torque + friction.coulomb, limits.torque)
+        narrow = replace(
+            limits,
+            following_error=np.minimum(limits.following_error, FARTHEST),
+            velocity=np.minimum(limits.velocity, FASTEST),
+        )
+        self._guard = Guard(
+            model.chain.names, narrow, period, home, revolute=model.chain.revolute, max_age=described.lost_cycles
+        )
+        self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
+        self._since = Elapsed(period)
+        self._torque = self.gravity.copy()
+        self._rows: list[tuple[Sample, Setpoint]] = []
+        self._words: tuple[int, ...] = ()
+        self._friction = still
+        self._coupling = model.chain.coupling
+        to_drives = np.linalg.inv(self._coupling).T
+        self._stiffness = to_drives**2 @ (limits.kp * np.diag(self.mass))
+        self._most = (np.abs(to_drives) * self._band).max(axis=1)
+
+    def energise(self) -> None:
+        """Enable the arm; the first cycle of `follow` sends the torque that holds it.
+
+        Raises:
+            DriverError: the drives refuse.
+        """
+        self._arm.enable()
+        self._torque = self._limited(self.gravity)
+
+    def follow(
+        self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
+    ) -> Rows:
+        """Follow a reference for some time.
+
+        Args:
+            reference: from here on.
+            seconds: how long.
+            learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
+                of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
+                WAM's first joint takes 13 mrad of error.
+            shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top.
+
+        Returns:
+            The cycles with their references, for `trace_of`.
+
+        Raises:
+            ArmFault: the guard or a drive found something that is more than a warning; `trace` tells the story.
+            DriverError: the arm does not answer.
+        """
+        self._rows = []
+        learned: dict[bool, list[Vector]] = {}
+        begin_ns: int | None = None
+        while True:
+            sample = self._arm.exchange(self._torque)
+            if begin_ns is None:
+                begin_ns = sample.stamp_ns
+            elapsed = (sample.stamp_ns - begin_ns) * 1e-9
+            setpoint = reference.at(elapsed)
+            self._rows.append((sample, setpoint))
+            self._words = sample.status
+            wanted = self._led(sample, setpoint, np.zeros(len(self.home), dtype=bool))
+            if shaking is not None:
+                # On its way only: a joint that sticks would look like one whose encoder does.
+                moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
+                wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
+            self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
+            if learning and setpoint.velocity.any():
+                learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
+            if elapsed >= seconds:
+                if learned:
+                    # What the model lacks of gravity is taken for friction on one way, and against it on the other.
+                    # The first half of a way is where it is still being learned.
+                    halves = [np.mean(way[len(way) // 2 :], axis=0) for way in learned.values()]
+                    self._friction = np.mean(halves, axis=0)
+                return self._rows
+
+    @property
+    def torque(self) -> Vector:
+        """Return the torque that is sent next [N m or N], shape (joints,)."""
+        return self._torque
+
+    def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
+        """Check a cycle in which a signal is withheld from drives on purpose, and compute the next torque.
+
+        What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
+        have given up torque, but for their position limits. Every other joint is held and guarded as before.
+
+        Args:
+            sample: of this cycle.
+            setpoint: for the joints that are held.
+            given_up: which joints no longer are, shape (joints,).
+            sends: whether torque is sent; where it is what drives miss, the last one stays the last one.
+
+        Raises:
+            ArmFault: the guard found something that is more than a warning.
+        """
+        self._rows.append((sample, setpoint))
+        undisturbed = replace(sample, status=self._words, events=(), torque=self._torque, torque_difference=None)
+        there = np.where(given_up, sample.position, setpoint.position)
+        going = np.where(given_up, 0.0, setpoint.velocity)
+        asked = Setpoint(there, going, np.where(given_up, 0.0, setpoint.acceleration))
+        wanted = self._led(undisturbed, asked, given_up) + self._against_friction(asked, 0.0)
+        if sends:
+            self._torque = self._limited(wanted)
+
+    def wait_in_silence(self) -> None:
+        """Repeat the torque that was sent last, through the guard, while drives report no positions.
+
+        Raises:
+            ArmFault: the guard found something that is more than a warning.
+        """
+        self._torque = self._limited(self._torque)
+
+    def trace(self) -> Trace:
+        """Return the cycles of the last `follow` as a trace, also of one that a fault ended."""
+        return trace_of(self._rows, self.period)
+
+    def release(self) -> None:
+        """Hand the arm back to its support: torque fades, then the drives are switched off."""
+        cycles = max(1, round(RELEASE / self.period))
+        held = self._torque
+        for left in range(cycles - 1, -1, -1):
+            sample = self._arm.exchange(self._torque)
+            if not bool((np.abs(sample.position - self.home) <= SUNK).all()):
+                break
+            self._torque = self._limited(held * (left / cycles), band=False)
+        self._arm.stop(StopKind.TORQUE_OFF)
+
+    def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
+        """Check a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
+        since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
+        velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
+        known = self._since.known
+        usable, fault = self._guard.feedback(sample, setpoint, velocity, correction, elapsed=since, known=known)
+        if fault is not None and fault.reaction is not Reaction.WARN:
+            raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
+        return control.torque(sample.position, usable, setpoint, since if known else 0.0)
+
+    def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
+        """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,).
+
+        Friction is the drives': one that moves several joints lags by what all of them do, and pushes all of them.
+        """
+        rate = self._coupling @ setpoint.velocity
+        direction = np.where(np.abs(rate) > _CREEP, np.sign(rate), 0.0)
+        lag = self._coupling @ (setpoint.position - self._control.position) * direction
+        self._friction = np.clip(self._friction + learning * self.period * self._stiffness * lag, 0.0, self._most)
+        return np.asarray(self._coupling.T @ (self._friction * np.clip(rate / _CREEP, -1.0, 1.0)))
+
+    def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:
+        if band:
+            wanted = np.clip(wanted, self.gravity - self._band, self.gravity + self._band)
+        torque, fault = self._guard.torque(wanted)
+        if fault is not None and fault.reaction is not Reaction.WARN:
+            raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
+        return torque

@@ -1,0 +1,193 @@
+"""Check what is known before an arm is opened: its description, the motion made for it, what is proven of that."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.canopen.bus_load import budget
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.limits import MotionLimits, Vector, motion_limits
+from ident_service.errors import IdentError, ModelError, MotionRefused
+from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.proof import objections, proof_of
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.collision import CollisionModel
+from ident_service.model.rigid_body import InverseDynamics
+from ident_service.motion.after_stop import after_stop, falling_joints
+from ident_service.motion.attended import unhurried
+from ident_service.motion.plans import Destination, GoTo
+from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, joint_units, judged, measure, measures
+from ident_service.motion.reference import PathReference, rest
+from ident_service.motion.stop import require_stops_within_limits
+from ident_service.motion.surroundings import stop_clearance, way_clearance
+from ident_service.motion.way import way
+from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
+
+# What drives may take to notice that the host is gone where joints can fall: what falls freely has sunk 5 cm after it
+# and moves at 1 m/s, and others take no longer (moteus 0.1 s).
+LONGEST_SILENCE = 0.1
+NEAR_HOME = 0.1  # rad or m: people lead an arm home to a few hundredths
+HOLDABLE = 0.8  # of a torque limit: what holding may take, so that something is left to correct with
+_POSTURES = 8  # of the motion, at which the coupled loop is judged
+
+
+@unhurried()
+def configuration_check(model: ArmModel) -> Check:
+    """Check that the description has all that motion needs: limits, gains, a prior of a real body, room on the bus."""
+    code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
+    try:
+        limits = motion_limits(model.config)
+        if model.prior is None:
+            raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
+        dynamics = InverseDynamics(model.chain, model.layout, model.prior)
+        after_stop(model, limits)
+        smallest = float(np.linalg.eigvalsh(dynamics.mass_matrix(limits.home)).min())
+    except IdentError as error:
+        return failed(code, str(error), remedy)
+    if not smallest > 0.0:
+        return failed(
+            code,
+            "the prior's mass matrix at home is not positive definite: no real body has these parameters",
+            "Give prior parameters of a feasible identification or of a CAD model.",
+        )
+    seconds = getattr(model.config.driver, "watchdog", None)
+    reason = getattr(model.config.driver, "watchdog_reason", "")
+    long = isinstance(seconds, int | float) and seconds > LONGEST_SILENCE and not reason
+    if long and (falling := falling_joints(model, limits)):
+        return failed(
+            code,
+            f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
+            f"{LONGEST_SILENCE:g} s",
+            "Shorten the drives' watchdog (torque_deadline, heartbeats.host_timeout, guarding, watchdog_time), or say "
+            "in driver.watchdog_reason why this arm may go on for longer.",
+        )
+    if isinstance(model.config.driver, CanopenDriver):
+        load = budget(model.config.driver, model.config.control.rate)
+        if not load.fits:
+            return failed(code, load.reason, load.remedy)
+    return Check(code, Verdict.PASSED)
+
+
+def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
+    """Check that the motion was made for this description of the arm (`motion_sha256`)."""
+    code, remedy = "motion_fits", "Design the motion again for the description as it is now."
+    if excitation.arm_sha256 != model.config.motion_sha256:
+        return failed(code, f"the {excitation.name} motion was made for another description of the arm", remedy)
+    if excitation.path.joints != model.chain.joints:
+        return failed(code, f"a motion of {excitation.path.joints} joints for an arm of {model.chain.joints}", remedy)
+    return Check(code, Verdict.PASSED)
+
+
+@unhurried()
+def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excitation) -> Check:
+    """Check that the motion, the way to it from home, and every stop out of it are proven to keep all limits."""
+    code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
+    try:
+        proof = proof_of(excitation.path, model, limits, CollisionModel(model))
+        found = objections(proof, model, limits)
+        nearest = stop_clearance(excitation.path, limits, model)
+    except (ModelError, MotionRefused) as error:
+        return failed(code, str(error), remedy)
+    try:
+        require_stops_within_limits(excitation.path, limits, model.chain.names)
+    except MotionRefused as error:
+        found.append(str(error))
+    asked, names = proof.demands, model.chain.names
+    taken: list[Measure] = []
+    for key in ("velocity", "torque"):
+        if (peak := getattr(asked, key)) is not None:
+            share = peak / getattr(limits, key)
+            taken += measures(f"{key}, share of the limit", share, ("",) * len(names), names, most=np.ones(len(names)))
+    least = model.config.workspace.clearance
+    for what, clearance in (("clearance", proof.clearance), ("clearance of the way from home", proof.approach)):
+        if clearance is not None and clearance.pair is not None:
+            taken.append(measure(what, clearance.lower_bound, "m", least=least))
+    if nearest.pair is not None:
+        taken.append(measure("clearance of stops", nearest.distance, "m", least=0.0))
+        if nearest.distance <= 0.0:
+            found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
+    return failed(code, "; ".join(found), remedy, taken) if found else judged(code, taken, remedy)
+
+
+@unhurried()
+def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
+    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion."""
+    path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path
+    postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
+    if path is not None:
+        postures = np.vstack([postures, path.at(np.linspace(0.0, path.duration, _POSTURES))[0]])
+    report = stability(model, limits, delay_of(model.config), postures)
+    names, ones = model.chain.names, ("",) * model.chain.joints
+    radius, gain, more = (
+        np.array([getattr(one, key) for one in report.joints]) for key in ("radius", "gain_margin", "delay_margin")
+    )
+    most = np.full(len(names), np.nextafter(1.0, 0.0))
+    found = [
+        *measures("largest spectral radius", radius, ones, names, most=most),
+        *measures("gain margin", gain, ones, names, least=np.full(len(names), LEAST_GAIN_MARGIN)),
+        *measures("delay margin", more * 1e3, ("ms",) * len(names), names),
+    ]
+    if report.coupled_radius is not None:
+        found.append(measure("largest spectral radius, all joints", report.coupled_radius, "", most=float(most[0])))
+    return judged(
+        "stability",
+        found,
+        f"Lower kp and kd, raise control.velocity_cutoff or control.rate, or give the prior its drive inertia; inertia "
+        f"is taken to be {INERTIA[0]:g} to {INERTIA[1]:g} times the model's.",
+    )
+
+
+def away_from_home(model: ArmModel, limits: MotionLimits, position: Vector) -> str:
+    """Describe how far an arm stands from where motions begin, in words; empty where that is near.
+
+    Args:
+        model: of the arm.
+        limits: of the arm, with its home.
+        position: where it stands [rad or m], shape (joints,).
+    """
+    units = joint_units(model.chain.revolute, "rad", "m")
+    far = np.abs(position - limits.home)
+    return ", ".join(
+        f"{name} {away:.2g} {unit} away"
+        for name, away, unit in zip(model.chain.names, far, units, strict=True)
+        if away > NEAR_HOME
+    )
+
+
+def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
+    """Check that the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
+    code = "ways_clear"
+    try:
+        ((_, leg),) = GoTo(Destination.HOME).legs(model, position, limits)
+    except (ModelError, MotionRefused) as error:
+        return failed(code, str(error), "Move the arm by hand to where the straight way home is free.")
+    return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
+
+
+def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
+    """Check that the ways from where the arm stands to the motion and back are within limits and clear.
+
+    Args:
+        model: of the arm.
+        limits: of the arm.
+        excitation: the motion.
+        position: where the arm stands [rad or m], shape (joints,).
+    """
+    code = "ways_clear"
+    motion = PathReference(excitation.path)
+    least = model.config.workspace.clearance
+    found: list[Measure] = []
+    try:
+        collision = CollisionModel(model)
+        ends = (motion.at(0.0), motion.at(motion.duration))
+        for what, leg in (
+            ("the way to the motion", way(rest(position), ends[0], limits)),
+            ("the way back", way(ends[1], rest(position), limits)),
+        ):
+            found.append(measure(f"{what}, length", leg.duration, "s"))
+            if collision.pairs:
+                clearance = way_clearance(collision, leg, limits, least)
+                found.append(measure(f"{what}, clearance", clearance.lower_bound, "m", least=least))
+    except (ModelError, MotionRefused) as error:
+        return failed(code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found)
+    return judged(code, found, "Move the arm by hand to where motions begin (home), then check again.")

@@ -1,0 +1,202 @@
+"""Prove that the drives stop by themselves when the host falls silent: the one protection that works when it dies.
+
+Done last, where the arm has just been held, and again in the middle of a small motion: what the drives' watchdogs watch
+is withheld, and looked at what the drives say of themselves. An arm without brakes then sinks onto its support, so a
+person must have typed the arm's name first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.arm import Arm, Flags, Sample, StopKind, Vector, Watchdog
+from drivers.axis_status import AxisStatus
+from ident_service.errors import ArmFault
+from ident_service.model.arm_model import ArmModel
+from ident_service.motion.preflight_check import Check, Verdict, failed, judged, measure, skipped
+from ident_service.motion.reference import Setpoint
+from ident_service.preflight.session import Session
+from ident_service.preflight.static_checks import LONGEST_SILENCE
+
+CODE = "watchdog"
+_STOPS = 0.5  # s that a slow joint is given to come to rest
+_WORDS = {
+    "heartbeat": "heartbeat",
+    "node_guarding": "node guarding",
+    "vendor": "torque frames",
+    "rpdo_timer": "torque frames",
+    "torque_frames": "torque frames",
+    "sync_loss": "SYNC",
+}
+_ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
+_LATER = 2.0  # times the configured time, plus some cycles and the report's delay, until a drive must have reported
+_CYCLES = 10
+REMEDY = (
+    "Set the drives' own watchdog (CANopen: 1400h:05, or another of drives.watchdog, and 6007h for its reaction), or "
+    "stop here: without it nothing stops the arm when this computer dies."
+)
+
+Confirm = Callable[[str], str]
+
+
+@dataclass(frozen=True)
+class Consent:
+    """Represent whether the drives' watchdog may be tried.
+
+    Attributes:
+        given: it may.
+        check: the check to report where it may not, else None.
+    """
+
+    given: bool
+    check: Check | None
+
+
+def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
+    """Ask a person whether the drives' watchdog may be tried, before anything is energised.
+
+    Args:
+        model: of the arm; its name must be typed.
+        sample: of the arm without torque; without status words the drives' reaction cannot be seen.
+        confirm: shows a question and returns what the person typed.
+    """
+    if not sample.status:
+        why = "the driver does not tell what the drives do, so their watchdog cannot be seen to act"
+        return Consent(False, skipped(CODE, why, "Prove it by hand: pull the bus cable while the arm is supported."))
+    name = model.config.name
+    typed = confirm(
+        f"The drives' own watchdog is tried at the end, at rest and in a small motion: they hear no more of what "
+        f"it watches, must give up torque by themselves, and an arm without brakes sinks. If {name} is supported where "
+        f"it stands and nobody is within its reach, type its name: "
+    )
+    if typed.strip() == name:
+        return Consent(True, None)
+    wrong = f"{typed.strip()!r} is not" if typed.strip() else "nobody typed"
+    why = f"{wrong} the arm's name, {name}, so the drives' watchdog was not tried"
+    remedy = "Support the arm, step out of its reach, check again and type its name when asked."
+    return Consent(False, Check(CODE, Verdict.NEEDS_PERSON, (), why, remedy))
+
+
+def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
+    """Return the signal that each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
+    seconds = getattr(model.config.driver, "watchdog", None)
+    most = float(seconds) if isinstance(seconds, int | float) else None
+    return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", most) for name in model.chain.names)
+
+
+def watchdog_check(
+    arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
+) -> Check:
+    """Fall silent while the arm is held, and check that its drives stop; the arm is without torque afterwards.
+
+    What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
+    another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have
+    not given up yet; only where SYNC is withheld, and no position comes, the last torque goes on.
+
+    Args:
+        arm: enabled, held by `session`.
+        model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
+        session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
+        setpoint_at: where the joints that are held should be, by the time since the silence began [s].
+        moving: number of the joint that moves, whose travel is measured; None at standstill.
+
+    Raises:
+        DriverError: the arm does not answer.
+    """
+    period = session.period
+    dogs = watchdogs_of(arm, model)
+    told = float(getattr(model.config.driver, "report_delay", 0.0))
+    where = "at rest" if moving is None else "in motion"
+    gave_up: dict[int, tuple[float, AxisStatus]] = {}
+    strange: list[str] = []
+    begun = 0
+    at: Vector = np.zeros(0)
+    try:
+        for kind in sorted({dog.kind for dog in dogs}, key=_ORDER.index):
+            watched = [number for number, dog in enumerate(dogs) if dog.kind == kind]
+            most = max(_most(dogs[number], period, told) for number in watched)
+            of_torque = dogs[watched[0]].of_torque
+            if not of_torque:
+                arm.withhold(kind)
+            begin_ns: int | None = None
+            while True:
+                sample = arm.exchange(None if of_torque else session.torque)
+                status = arm.drive_status() or tuple(AxisStatus(word) for word in sample.status)
+                if begin_ns is None:
+                    begin_ns = sample.stamp_ns
+                    if not at.size:
+                        begun, at = sample.stamp_ns, sample.position
+                        if not all(word & AxisStatus.POWERED for word in status):
+                            return failed(CODE, "the drives do not report that they have power", REMEDY)
+                silent = (sample.stamp_ns - begin_ns) * 1e-9
+                for number, word in enumerate(status):
+                    if word & AxisStatus.EMERGENCY_STOP:
+                        strange.append(f"{dogs[number].drive} reports an emergency stop")
+                    if number in gave_up or word & AxisStatus.POWERED:
+                        continue
+                    gave_up[number] = silent, word
+                    if number not in watched:
+                        strange.append(f"{dogs[number].drive} stopped when {_WORDS[kind]} stayed away, not by its own")
+                if strange:
+                    break
+                if kind == "sync_loss":
+                    session.wait_in_silence()
+                else:
+                    setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)
+                    session.lead_in_silence(sample, setpoint, _joints_of(gave_up, model), sends=not of_torque)
+                if all(number in gave_up for number in watched) or silent > most:
+                    break
+            if strange:
+                break
+        travel = _travel(arm, at, moving) if moving is not None else None
+    except ArmFault as ended:
+        why = f"{where}, while drives missed {_WORDS[kind]} and before all had said that they stopped: {ended}"
+        return failed(CODE, f"{why}; the arm was let go", REMEDY)
+    finally:
+        arm.stop(StopKind.TORQUE_OFF)
+    found = []
+    for number, dog in enumerate(dogs):
+        seconds, word = gave_up.get(number, (None, AxisStatus(0)))
+        what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
+        found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, told)))
+        # A host that is gone may be a fault to a drive; any other fault is no watchdog.
+        fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
+        if fault:
+            strange.append(f"{dog.drive} gave up for another reason ({word!r})")
+    if moving is not None and travel is not None:
+        unit = "rad" if model.chain.revolute[moving] else "m"
+        found.append(measure("in motion, way until it rests", travel, unit, joint=model.chain.names[moving]))
+    return failed(CODE, "; ".join(strange), REMEDY, found) if strange else judged(CODE, found, REMEDY)
+
+
+def _most(dog: Watchdog, period: float, told: float) -> float:
+    """Return how long a drive may take until it has reported that it stopped [s]."""
+    return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + told
+
+
+def _joints_of(drives: Collection[int], model: ArmModel) -> Flags:
+    """Return which joints these drives, given by number, move, shape (joints,)."""
+    coupling = model.chain.coupling
+    return np.asarray((coupling[list(drives)] != 0.0).any(axis=0))
+
+
+def _reaction(word: AxisStatus) -> str:
+    """Describe in words how a drive has reacted by itself."""
+    if word & AxisStatus.FAULT:
+        return "fault"
+    return "quick stop" if word & AxisStatus.IDLE else "torque off"
+
+
+def _travel(arm: Arm, begin: Vector, joint: int) -> float:
+    """Measure how far a joint moves from where its host fell silent until it rests, or for `_STOPS` [rad or m]."""
+    now = begin
+    last_ns: int | None = None
+    while True:
+        sample = arm.exchange(None)
+        last_ns = sample.stamp_ns if last_ns is None else last_ns
+        now = np.where(sample.valid, sample.position, now)
+        if (sample.stamp_ns - last_ns) * 1e-9 > _STOPS:
+            return float(abs(now[joint] - begin[joint]))

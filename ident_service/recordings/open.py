@@ -1,0 +1,90 @@
+"""Open a recording by what is in the file, whatever its name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal
+
+from ident_service.config.recording import RecordingFormat, Transmission
+from ident_service.errors import RecordingError, UsageError
+from ident_service.recordings.csv_file import GZIP_MAGIC, CsvRecording
+from ident_service.recordings.files import require_file
+from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.mcap_records import MAGIC
+from ident_service.recordings.measured import ENOUGH, MeasuredRecording
+from ident_service.recordings.recording import Recording
+from ident_service.recordings.transmission import JointSideRecording
+
+PLAIN: Final = RecordingFormat()
+
+
+def open_recording(
+    path: Path | str,
+    joints: Sequence[str] | None = None,
+    *,
+    fmt: RecordingFormat = PLAIN,
+    transmission: Transmission | None = None,
+    torque: Literal["measured", "commanded"] | None = "commanded",
+) -> Recording:
+    """Open an MCAP or CSV recording for reading; its blocks are on the joint side.
+
+    A recording that this package wrote names its joints as the arm does and is on the joint side already: of `fmt`,
+    topic, names and side are for the files of others.
+
+    Args:
+        path: the file.
+        joints: the arm's joints. An MCAP file's columns come in this order; a CSV file must have as many.
+        fmt: how the file is to be read.
+        transmission: the arm's gears, needed for a file that was recorded on the motor side.
+        torque: of this package's recordings, the commanded torque, the measured one, or the latter where
+            nearly every sample has it (None); files of others have one torque.
+
+    Returns:
+        The recording; its file is read when its blocks are.
+
+    Raises:
+        UsageError: no such file; motor side, but no transmission.
+        RecordingError: neither MCAP nor CSV, not of these joints, or without the torque that is asked for.
+    """
+    path = Path(path)
+    require_file(path)
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(4096)
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read: {error.strerror}") from error
+    if not start:
+        raise RecordingError(path, "is empty")
+    recording: McapRecording | CsvRecording
+    if start.startswith(MAGIC):
+        recording = McapRecording(path, order=joints, bag=fmt)
+        if recording.own:
+            return _with_torque(recording, torque)
+    elif not start.startswith(GZIP_MAGIC) and b"\x00" in start:
+        raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
+    else:
+        skip = fmt.missing == "skip"
+        recording = CsvRecording(path, columns=fmt.columns or None, joints=joints, skip_missing=skip)
+    if not any(fmt.motor_sides):
+        return recording
+    if transmission is None:
+        raise UsageError(f"{path}: recorded on the motor side, but no transmission leads from there to the joints")
+    positions, torques = fmt.motor_sides
+    return JointSideRecording(recording, transmission, positions=positions, torques=torques)
+
+
+def _with_torque(recording: McapRecording, torque: Literal["measured", "commanded"] | None) -> Recording:
+    """Return a recording of this package with the torque that is asked for."""
+    if torque == "commanded":
+        return recording
+    measured = MeasuredRecording(recording)
+    if measured.share >= ENOUGH:
+        return measured
+    if torque == "measured":
+        raise RecordingError(
+            recording.path,
+            f"drives measured their torque in {100.0 * measured.share:.0f} % of the samples; let them tell it with "
+            "their positions (driver.measured_torque: cyclic), or set identification.torque to commanded",
+        )
+    return recording

@@ -1,0 +1,321 @@
+"""Assess a recording before anything is identified from it: rate, jitter, gaps, saturation, standstill.
+
+A drive at its limit no longer gives the torque that was asked for, and a joint that stands still has a friction torque
+that is not determined: neither may enter an equation, and a person should know how much of the recording that is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.recording import RecordingFormat
+from ident_service.errors import UsageError
+from ident_service.recordings.grid import Grid, Segment, grid, trimmed
+from ident_service.recordings.recording import Block, Matrix, Recording, cut, join
+from ident_service.recordings.timing import Timing
+
+Array = NDArray[np.float64]
+
+SATURATED: Final = 0.999  # of the limit
+PLATEAU: Final = 5  # so many samples in a row exactly at the extreme value look like a limit where none is known
+STANDSTILL: Final = 0.005  # [rad/s or m/s]
+STANDSTILL_OVER: Final = 0.02  # [s]
+MUCH_JITTER: Final = 0.05  # of a period, standard deviation
+_MUCH_SATURATION: Final = 0.001
+_MUCH_STANDSTILL: Final = 0.5
+_LEAST_STEP: Final = 1e-12  # below is the rounding of numbers of the size of an angle
+
+
+@dataclass(frozen=True)
+class JointQuality:
+    """Describe one joint in a recording.
+
+    Attributes:
+        name: of the joint, or its number from 1.
+        saturated: share of samples at the torque limit; where none is known, share of samples that sit exactly at the
+            extreme torque five times in a row or more.
+        standstill: share of the time that the joint is slower than 0.005 rad/s or m/s over 20 ms.
+        position: smallest and largest [rad or m].
+        position_at: when it is there [s] after the first sample.
+        torque: smallest and largest [N m or N].
+        smallest_step: of the position between samples [rad or m], which estimates the encoder's resolution; 0 for a
+            joint that never moves.
+        largest_step: of the position between neighbouring samples [rad or m].
+        speed: at that step [rad/s or m/s].
+        where: that step ends [s] after the first sample.
+        usual_step: root mean square of all other steps [rad or m].
+        steps: their number.
+    """
+
+    name: str
+    saturated: float
+    standstill: float
+    position: tuple[float, float]
+    torque: tuple[float, float]
+    smallest_step: float
+    largest_step: float = 0.0
+    speed: float = 0.0
+    where: float = 0.0
+    usual_step: float = 0.0
+    steps: int = 0
+    position_at: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Describe the quality of a recording's stamps and joints.
+
+    Attributes:
+        samples: their number after trimming.
+        duration_s: from the first to the last sample [s].
+        rate_hz: the usual rate [Hz].
+        jitter_std_s: standard deviation of the steps, gaps excepted, from the usual step [s].
+        jitter_max_s: largest difference [s].
+        gaps: from the last sample before to the first one after each.
+        longest_gap_s: [s], 0 without gaps.
+        repeats: samples left out because they repeat the one before.
+        arrival: whether the motion goes on evenly where the stamps do not, so that they say when a sample arrived and
+            not when it was taken; None where too few steps are off by more than 5 % to tell.
+        declared: kind of stamps that the configuration states.
+        resampled: whether the samples are read off curves between the recorded ones.
+        torn: whether the file was cut off or damaged.
+        first_ns: stamp of the first sample [ns].
+        joints: in order.
+        skipped: samples left out because a value is missing.
+    """
+
+    samples: int
+    duration_s: float
+    rate_hz: float
+    jitter_std_s: float
+    jitter_max_s: float
+    gaps: tuple[Segment, ...]
+    longest_gap_s: float
+    repeats: int
+    arrival: bool | None
+    declared: Literal["sampled", "arrival"]
+    resampled: bool
+    torn: bool
+    first_ns: int
+    joints: tuple[JointQuality, ...]
+    skipped: int = 0
+
+    def warnings(self) -> tuple[str, ...]:
+        """Return warnings about the recording for a person, in words; empty for a good recording."""
+        found = []
+        if self.torn:
+            found.append(f"the file is torn; it was read up to {self.duration_s:.4g} s after its first sample")
+        if self.gaps:
+            longest = max(self.gaps, key=lambda gap: gap.duration_s)
+            after = (longest.first_ns - self.first_ns) * 1e-9
+            count = f"{len(self.gaps)} gaps" if len(self.gaps) > 1 else "a gap"
+            found.append(f"{count}, the longest {self.longest_gap_s:.4g} s, {after:.4g} s after the first sample")
+        if self.repeats:
+            found.append(f"{self.repeats} samples repeat the one before; they are left out")
+        if self.skipped:
+            share = 100.0 * self.skipped / (self.samples + self.skipped)
+            found.append(f"{self.skipped} samples ({share:.2g} %) lack a value; they are left out")
+        if self.jitter_std_s * self.rate_hz > MUCH_JITTER:
+            found.append(
+                f"stamps jitter by {self.jitter_std_s * 1e3:.3g} ms, "
+                f"{100.0 * self.jitter_std_s * self.rate_hz:.3g} % of a period"
+            )
+        if self.arrival is True and self.declared == "sampled":
+            found.append(
+                "the stamps jitter but the motion does not, they tell when a sample arrived; set recording.stamps"
+            )
+        if self.arrival is False and self.declared == "arrival":
+            found.append(
+                "the motion jitters as the stamps do, they tell when a sample was taken; leave out recording.stamps"
+            )
+        for joint in self.joints:
+            if joint.saturated > _MUCH_SATURATION:
+                found.append(f"joint {joint.name}: torque saturated in {100.0 * joint.saturated:.2g} % of the samples")
+            if joint.torque[0] == joint.torque[1]:
+                found.append(f"joint {joint.name}: torque is always {joint.torque[0]:g}")
+            if joint.standstill > _MUCH_STANDSTILL:
+                found.append(f"joint {joint.name}: at standstill {100.0 * joint.standstill:.2g} % of the time")
+        return tuple(found)
+
+
+def quality(
+    recording: Recording, fmt: RecordingFormat, torque_limit: Array | None = None, known: Grid | None = None
+) -> Quality:
+    """Assess a recording, in constant memory.
+
+    Args:
+        recording: read once more after `grid`.
+        fmt: seconds to trim, and length of a gap.
+        torque_limit: of each joint [N m or N], shape (joints,), NaN where it is not known.
+        known: `grid(recording, fmt)`, where that has been found already.
+
+    Raises:
+        UsageError: not one limit a joint.
+        RecordingError: what `grid` and the recording's blocks raise.
+    """
+    if torque_limit is not None and torque_limit.shape != (recording.joints,):
+        raise UsageError(f"{torque_limit.shape=} but the recording has {recording.joints} joints")
+    stamps = known or grid(recording, fmt)
+    limit = np.full(recording.joints, np.nan) if torque_limit is None else torque_limit
+    names = recording.joint_names or [str(joint + 1) for joint in range(recording.joints)]
+    joints = _Joints(names, limit, stamps)
+    for block in trimmed(recording.blocks(), fmt.trim):
+        joints.add(block)
+    return Quality(
+        samples=stamps.samples,
+        duration_s=(stamps.last_ns - stamps.first_ns) * 1e-9,
+        rate_hz=1.0 / stamps.own_period_s,
+        jitter_std_s=stamps.jitter_std_s,
+        jitter_max_s=stamps.jitter_max_s,
+        gaps=stamps.gaps,
+        longest_gap_s=max((gap.duration_s for gap in stamps.gaps), default=0.0),
+        repeats=stamps.repeats,
+        arrival=joints.arrival(),
+        declared=fmt.stamps,
+        resampled=stamps.resampled,
+        torn=recording.torn,
+        first_ns=stamps.first_ns,
+        joints=joints.result(),
+        skipped=stamps.skipped,
+    )
+
+
+class _Joints:
+    """Collect the statistics of all joints, block by block."""
+
+    def __init__(self, names: Sequence[str], limit: Array, stamps: Grid) -> None:
+        joints = len(names)
+        self._names, self._limit, self._stamps = names, limit, stamps
+        self._lag = max(1, round(STANDSTILL_OVER / stamps.own_period_s))
+        self._tail: Block | None = None
+        self._position = (np.full(joints, np.inf), np.full(joints, -np.inf))
+        self._position_at = np.zeros((2, joints))
+        self._torque = (np.full(joints, np.inf), np.full(joints, -np.inf))
+        self._step = np.full(joints, np.inf)
+        self._largest, self._squares = np.zeros((3, joints)), np.zeros(joints)
+        self._steps = 0
+        self._at_limit = np.zeros(joints)
+        self._still, self._pairs = np.zeros(joints), 0
+        self._timing = Timing(stamps)
+        self._plateaus = [(_Plateau(), _Plateau()) for _ in names]
+
+    def add(self, block: Block) -> None:
+        """Add the next samples to the statistics."""
+        position, torque = block.position, block.torque
+        for side, (index, farther) in enumerate(
+            ((position.argmin(axis=0), np.less), (position.argmax(axis=0), np.greater))
+        ):
+            beyond = farther(np.take_along_axis(position, index[None], axis=0)[0], self._position[side])
+            elapsed = (block.stamp_ns[index] - self._stamps.first_ns) * 1e-9
+            self._position_at[side] = np.where(beyond, elapsed, self._position_at[side])
+        self._position = _wider(self._position, position)
+        self._torque = _wider(self._torque, torque)
+        self._timing.add(block)
+        self._at_limit += (np.abs(torque) >= SATURATED * self._limit).sum(axis=0)
+        for joint, (top, bottom) in enumerate(self._plateaus):
+            top.add(torque[:, joint])
+            bottom.add(-torque[:, joint])
+        run = block if self._tail is None else join([self._tail, block])
+        fresh = len(run.stamp_ns) - len(block.stamp_ns)
+        steps = np.abs(np.diff(run.position[max(0, fresh - 1) :], axis=0))
+        self._count(steps, run.stamp_ns[max(0, fresh - 1) :])
+        moved = np.where(steps > _LEAST_STEP, steps, np.inf)
+        self._step = np.minimum(self._step, moved.min(axis=0, initial=np.inf))
+        # Each pair's later sample is of this block, so that every pair counts once.
+        begin, lag = max(0, fresh - self._lag), self._lag
+        elapsed = (run.stamp_ns[begin + lag :] - run.stamp_ns[begin:-lag]) * 1e-9
+        whole = elapsed <= (lag - 1) * self._stamps.own_period_s + self._stamps.gap_s
+        speed = np.abs(run.position[begin + lag :] - run.position[begin:-lag]) / elapsed[:, None]
+        self._still += (speed[whole] < STANDSTILL).sum(axis=0)
+        self._pairs += int(whole.sum())
+        self._tail = cut(run, max(0, len(run.stamp_ns) - lag), len(run.stamp_ns))
+
+    def _usual(self, joint: int) -> float:
+        largest = self._largest[0, joint] ** 2
+        # A jump comes with the way back, and both are left out.
+        others = self._squares[joint] - largest * (2.0 if self._squares[joint] > 2.0 * largest else 1.0)
+        usual = float(np.sqrt(max(others, 0.0) / max(self._steps - 2, 1)))
+        return float(f"{usual:.6g}")  # the same wherever the file was cut into blocks
+
+    def _count(self, steps: Array, stamps_ns: NDArray[np.int64]) -> None:
+        taken = np.diff(stamps_ns) * 1e-9
+        near = (taken > 0.0) & (taken <= self._stamps.gap_s)
+        steps, taken, ends = steps[near], taken[near], stamps_ns[1:][near]
+        if not len(steps):
+            return
+        self._squares += np.einsum("sj,sj->j", steps, steps)
+        self._steps += len(steps)
+        largest = np.argmax(steps, axis=0)
+        size = steps[largest, np.arange(steps.shape[1])]
+        since = (ends[largest] - self._stamps.first_ns) * 1e-9
+        now = np.vstack([size, size / np.maximum(taken[largest], 0.5 * self._stamps.own_period_s), since])
+        self._largest = np.where(size > self._largest[0], now, self._largest)
+
+    def arrival(self) -> bool | None:
+        """Return whether stamps are of arrival; see `Quality`."""
+        return self._timing.arrival()
+
+    def result(self) -> tuple[JointQuality, ...]:
+        """Return the quality of all joints."""
+        samples = self._stamps.samples
+        found = []
+        for k, name in enumerate(self._names):
+            top, bottom = self._plateaus[k]
+            varies = self._torque[0][k] < self._torque[1][k]
+            guessed = top.samples() + bottom.samples() if varies else 0
+            at_limit = guessed if np.isnan(self._limit[k]) else self._at_limit[k]
+            found.append(
+                JointQuality(
+                    name=name,
+                    saturated=float(at_limit / samples),
+                    standstill=float(self._still[k] / self._pairs) if self._pairs else 0.0,
+                    position=(float(self._position[0][k]), float(self._position[1][k])),
+                    torque=(float(self._torque[0][k]), float(self._torque[1][k])),
+                    smallest_step=float(self._step[k]) if np.isfinite(self._step[k]) else 0.0,
+                    largest_step=float(self._largest[0, k]),
+                    speed=float(self._largest[1, k]),
+                    where=float(self._largest[2, k]),
+                    usual_step=self._usual(k),
+                    steps=self._steps,
+                    position_at=(float(self._position_at[0, k]), float(self._position_at[1, k])),
+                )
+            )
+        return tuple(found)
+
+
+def _wider(extremes: tuple[Array, Array], values: Matrix) -> tuple[Array, Array]:
+    return np.minimum(extremes[0], values.min(axis=0)), np.maximum(extremes[1], values.max(axis=0))
+
+
+class _Plateau:
+    """Count the samples in long runs at the largest value seen so far."""
+
+    def __init__(self) -> None:
+        self._value = -np.inf
+        self._counted = 0
+        self._run = 0  # samples at the value at the end of what was seen
+
+    def add(self, values: Array) -> None:
+        """Add the next samples, shape (samples,)."""
+        if (largest := float(values.max())) > self._value:
+            self._value, self._counted, self._run = largest, 0, 0
+        at_value = np.concatenate([[False], values == self._value, [False]])
+        edges = np.flatnonzero(np.diff(at_value))
+        begins, lengths = edges[::2], edges[1::2] - edges[::2]
+        if len(begins) and begins[0] == 0:
+            lengths[0] += self._run
+        elif self._run:
+            self._counted += self._run if self._run >= PLATEAU else 0
+        open_end = bool(at_value[-2])
+        closed = lengths[:-1] if open_end else lengths
+        self._counted += int(closed[closed >= PLATEAU].sum())
+        self._run = int(lengths[-1]) if open_end else 0
+
+    def samples(self) -> int:
+        """Return the number of samples in runs of at least `PLATEAU`."""
+        return self._counted + (self._run if self._run >= PLATEAU else 0)

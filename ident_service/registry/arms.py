@@ -1,0 +1,208 @@
+"""Keep arms by name: the shipped ones, and uploaded descriptions, each in a folder named after its hash.
+
+An uploaded description is read by the loader that reads every other, from a folder of its own which nothing in it may
+lead out of: files that it names are uploaded with it, and what it `extends` is a shipped arm.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import secrets
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from ident_service.config.load import load_arm
+from ident_service.config.schema import ArmConfig
+from ident_service.config.shipped import shipped_arms
+from ident_service.errors import AlreadyThere, ConfigError, Problem, UnknownId, UsageError
+from ident_service.registry.audit import note
+from ident_service.registry.database import Database, Row
+from ident_service.results.files import appearing_folder
+
+DESCRIPTIONS: Final = "descriptions"
+ARM_FILE: Final = "arm.yaml"
+MOST_BYTES: Final = 8 * 2**20  # of a description and its files together
+_MOST_FILES = 16
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+@dataclass(frozen=True)
+class KnownArm:
+    """Arm that the service knows.
+
+    Attributes:
+        name: which is its id.
+        path: of its description, to give to the commands.
+        config: its description, read just now.
+        source: `shipped` or `uploaded`.
+    """
+
+    name: str
+    path: Path
+    config: ArmConfig
+    source: str
+
+
+def resources(config: ArmConfig) -> tuple[str, ...]:
+    """Return what a motion of this arm must have for itself: the arm, and every bus that it is on."""
+    buses = getattr(config.driver, "buses", ())
+    # A bus in lock step is not shared: it is within one process.
+    wires = {f"bus {bus.interface} {bus.channel}" for bus in buses if bus.interface != "lock_step"}
+    return (f"arm {config.name}", *sorted(wires))
+
+
+def know_shipped(db: Database) -> None:
+    """Enter the shipped arms in the registry; an uploaded one of the same name stays.
+
+    Their descriptions are read when they are asked for: reading all of them takes longer than a start may.
+    """
+    with db.transaction():
+        for name in shipped_arms():
+            db.write(
+                "INSERT OR IGNORE INTO arms VALUES (?, '', '', 'shipped', NULL, ?, 0, ?, 'service')",
+                *(name, json.dumps([f"arm {name}"]), time.time()),
+            )
+
+
+def arm_names(db: Database) -> list[Row]:
+    """Return name, source and description data of every arm."""
+    return db.rows("SELECT name, source, description, sha256, added, added_by FROM arms ORDER BY name")
+
+
+def known_arm(db: Database, state: Path, name: str) -> KnownArm:
+    """Return the arm of this name.
+
+    Raises:
+        UnknownId: there is none.
+        ConfigError: its description has become unreadable.
+    """
+    row = db.row("SELECT * FROM arms WHERE name = ?", name)
+    if row is None:
+        raise UnknownId(f"no arm {name!r} is known; the list of arms names them")
+    path = shipped_arms().get(name) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
+    if path is None:
+        raise UsageError(f"the arm {name!r} was shipped with other software than this; upload its description")
+    try:
+        config = load_arm(path)
+    except (ConfigError, UsageError):
+        if db.row("SELECT 1 FROM arms WHERE name = ?", name) is None:  # deleted meanwhile
+            raise UnknownId(f"no arm {name!r} is known; the list of arms names them") from None
+        raise
+    if row["sha256"] != config.sha256:
+        db.write(
+            "UPDATE arms SET sha256 = ?, description = ?, resources = ? WHERE name = ?",
+            *(config.sha256, config.description, json.dumps(resources(config)), name),
+        )
+    return KnownArm(name, path, config, row["source"])
+
+
+def add_arm(
+    db: Database,
+    state: Path,
+    text: str,
+    files: Mapping[str, str],
+    by: str,
+    *,
+    replace: bool = False,
+    judge: Callable[[Path], object] = lambda _: None,
+) -> KnownArm:
+    """Add an uploaded description; a replaced one of the same name stays on the disk.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        text: the YAML.
+        files: name to content of the files that it names.
+        by: who.
+        replace: whether it may take the place of another of its name, a shipped one included.
+        judge: raises where something is wrong with the arm of a description that was not known; it takes seconds.
+
+    Raises:
+        AlreadyThere: its name is taken by another description.
+        UsageError: too large, or files whose names are none.
+        ConfigError: every mistake in it, each with line and column.
+    """
+    with uploaded(state, text, files) as path:
+        config = load_arm(path, upload=True)
+        _require_free(db, config, replace=replace)
+        folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
+        if not folder.exists():
+            judge(path)
+        with db.transaction():  # so that deleting or adding the same arm happens before or after
+            _require_free(db, config, replace=replace)
+            if not folder.exists():
+                with appearing_folder(folder) as built:
+                    for part in path.parent.iterdir():
+                        shutil.copyfile(part, built / part.name)
+            db.write(
+                "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
+                "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
+                "folder = excluded.folder, resources = excluded.resources, added = excluded.added, "
+                "added_by = excluded.added_by",
+                *(config.name, config.sha256, config.description, str(folder.relative_to(state))),
+                *(json.dumps(resources(config)), time.time(), by),
+            )
+            note(db, by, "arm added", config.name, sha256=config.sha256)
+    return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
+
+
+def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:
+    row = db.row("SELECT source, sha256 FROM arms WHERE name = ?", config.name)
+    same = row is not None and (row["source"], row["sha256"]) == ("uploaded", config.sha256)
+    if row is not None and not (replace or same):
+        raise AlreadyThere(
+            f"{config.name!r} is the name of an arm already, {row['source']}; ask for replacing it (`replace`), "
+            "or give another name"
+        )
+
+
+@contextmanager
+def uploaded(state: Path, text: str, files: Mapping[str, str]) -> Iterator[Path]:
+    """Yield the file of an uploaded description, beside the files that it names, for the duration of the block.
+
+    Args:
+        state: the state folder.
+        text: the YAML.
+        files: name to content of the files that it names.
+
+    Raises:
+        UsageError: too large, or files whose names are none.
+        ConfigError: as the block does, without the place of the upload.
+    """
+    if len(text) + sum(len(content) for content in files.values()) > MOST_BYTES:
+        raise UsageError(f"a description and its files have {MOST_BYTES} bytes at most")
+    if len(files) > _MOST_FILES:
+        raise UsageError(f"a description comes with {_MOST_FILES} files at most")
+    for name in files:
+        if not _NAME.fullmatch(name) or name == ARM_FILE:
+            raise UsageError(f"{name!r}: a file's name is a plain one, and not {ARM_FILE}")
+        if name in shipped_arms():  # `extends` would take it for the shipped arm
+            raise UsageError(f"{name!r}: is the name of a shipped arm; give the file another")
+    place = state / DESCRIPTIONS
+    # Under its own name only after it has been checked.
+    staging = place / f".{time.time_ns():x}.{secrets.token_hex(4)}.partial"
+    try:
+        staging.mkdir(parents=True)
+        for name, content in {ARM_FILE: text, **files}.items():
+            (staging / name).write_text(content, encoding="utf-8", errors="strict")
+        yield staging / ARM_FILE
+    except ConfigError as error:
+        # The place of the upload means nothing to whoever sent it.
+        raise ConfigError(
+            [
+                Problem(Path(one.path.name), one.line, one.column, one.message.replace(f"{staging.resolve()}/", ""))
+                for one in error.problems
+            ]
+        ) from None
+    except UnicodeEncodeError:
+        raise UsageError("the description is not text that can be written as UTF-8") from None
+    except OSError as error:
+        raise UsageError(f"{place}: cannot be written: {error.strerror}") from None
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)

@@ -1,0 +1,157 @@
+"""Store jobs by id: the request, who made it, the outcome; their numbers are the order of the queue.
+
+| state | what it means |
+|---|---|
+| queued | waits for an arm, a bus or a processor |
+| running | its process lives |
+| done | exit code 0, and a motion that went to its end |
+| refused | exit code 3: done, but the verdict is no |
+| failed | exit code 1 or 2, or no answer |
+| faulted | exit code 4: a fault stopped the arm |
+| cancelled | somebody stopped it, or nobody renewed its lease |
+| interrupted | the service died meanwhile; `detail` says what its folder shows |
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any, Final
+
+from ident_service.errors import AlreadyThere, UnknownId
+from ident_service.registry.database import Database, Row
+
+STATES: Final = ("queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted")
+KEY_SECONDS: Final = 24 * 3600.0
+LIVE: Final = ("queued", "running")
+
+
+def add_job(
+    db: Database,
+    job: str,
+    kind: str,
+    arm: str | None,
+    request: dict[str, Any],
+    words: list[str],
+    by: str,
+    *,
+    motion: bool,
+    run: str | None,
+) -> Row:
+    """Enter a queued job."""
+    db.write(
+        "INSERT INTO jobs (id, kind, arm, state, motion, request, words, run, created, created_by) "
+        "VALUES (?, ?, ?, 'queued', ?, ?, ?, ?, ?, ?)",
+        *(job, kind, arm, int(motion), json.dumps(request), json.dumps(words), run, time.time(), by),
+    )
+    return known_job(db, job)
+
+
+def known_job(db: Database, job: str) -> Row:
+    """Return the job of this id.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    row = db.row("SELECT * FROM jobs WHERE id = ?", job)
+    if row is None:
+        raise UnknownId(f"no job {job!r} is known; the list of jobs names them")
+    return _read(row)
+
+
+def jobs(
+    db: Database,
+    *,
+    states: tuple[str, ...] = STATES,
+    arm: str | None = None,
+    before: int | None = None,
+    most: int = 100,
+) -> list[Row]:
+    """Return jobs in some states, of an arm if one is named, the newest first."""
+    marks = ", ".join("?" * len(states))
+    rows = db.rows(
+        f"SELECT * FROM jobs WHERE state IN ({marks}) AND (? IS NULL OR arm = ?) AND number < ? "  # noqa: S608 - marks
+        "ORDER BY number DESC LIMIT ?",
+        *(*states, arm, arm, 2**62 if before is None else before, most),
+    )
+    return [_read(row) for row in rows]
+
+
+def queue(db: Database) -> list[Row]:
+    """Return the queued jobs, the earliest first."""
+    return [_read(row) for row in db.rows("SELECT * FROM jobs WHERE state = 'queued' ORDER BY number")]
+
+
+def started(db: Database, job: str, process: str) -> bool:
+    """Mark a queued job as running; False where it is not queued any more."""
+    return bool(
+        db.write(
+            "UPDATE jobs SET state = 'running', started = ?, process = ? WHERE id = ? AND state = 'queued'",
+            *(time.time(), process, job),
+        )
+    )
+
+
+def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None = None) -> bool:
+    """Mark a job as ended; False where it is marked already."""
+    return bool(
+        db.write(
+            "UPDATE jobs SET state = ?, detail = ?, exit_code = ?, ended = ? "
+            "WHERE id = ? AND state IN ('queued', 'running')",
+            *(state, detail, exit_code, time.time(), job),
+        )
+    )
+
+
+def explain(db: Database, job: str, detail: str) -> None:
+    """Replace the detail of a job that has ended."""
+    db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job)
+
+
+def enter_key(db: Database, who: str, key: str, request: str, job: str) -> None:
+    """Store for a day that a request with an idempotency key made a job.
+
+    Args:
+        db: the registry.
+        who: name of the token.
+        key: of the request; each token has its own.
+        request: SHA-256 of the request's content.
+        job: id.
+
+    Raises:
+        sqlite3.IntegrityError: the key has made a job already.
+    """
+    db.write("DELETE FROM idempotency_keys WHERE at < ?", time.time() - KEY_SECONDS)
+    db.write("INSERT INTO idempotency_keys VALUES (?, ?, ?, ?, ?)", who, key, request, job, time.time())
+
+
+def job_of_key(db: Database, who: str, key: str, request: str) -> Row | None:
+    """Return the job that a request with an idempotency key has made within a day, or None.
+
+    Raises:
+        AlreadyThere: the key was used to ask for something else.
+    """
+    row = db.row(
+        "SELECT request, job FROM idempotency_keys WHERE who = ? AND key = ? AND at >= ?",
+        *(who, key, time.time() - KEY_SECONDS),
+    )
+    if row is None:
+        return None
+    if row["request"] != request:
+        raise AlreadyThere(f"the idempotency key {key!r} was used for another request; give each its own")
+    return known_job(db, row["job"])
+
+
+def typical_seconds(db: Database, kind: str, arm: str | None) -> float | None:
+    """Return the median duration of the last completed jobs of a kind [s]; None before there was one."""
+    rows = db.rows(
+        "SELECT ended - started AS seconds FROM jobs WHERE kind = ? AND arm IS ? AND state IN ('done', 'refused') "
+        "ORDER BY number DESC LIMIT 9",
+        *(kind, arm),
+    )
+    lengths = sorted(row["seconds"] for row in rows)
+    return lengths[len(lengths) // 2] if lengths else None
+
+
+def _read(row: Row) -> Row:
+    return {**row, "request": json.loads(row["request"]), "words": json.loads(row["words"])}

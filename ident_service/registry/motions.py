@@ -1,0 +1,92 @@
+"""Store motions by id, designed here or uploaded; each is one `motion.json` in a folder below the state folder."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from ident_service.errors import UnknownId, UsageError
+from ident_service.excitation.excitation import excitation_from_json, read_excitation
+from ident_service.registry.audit import note
+from ident_service.registry.database import Database, Row
+from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.manifest import file_sha256
+
+MOTIONS: Final = "motions"
+MOTION_FILE: Final = "motion.json"
+
+
+def new_id(arm: str) -> str:
+    """Return a new id: time, arm, and random digits."""
+    return f"{datetime.now(UTC).strftime('%Y%m%dT%H%M%SZ')}-{arm}-{secrets.token_hex(3)}"
+
+
+def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> None:
+    """Enter the motion that is in its folder in the registry.
+
+    Raises:
+        UsageError: it is not one.
+    """
+    path = state / MOTIONS / motion / MOTION_FILE
+    seen = read_excitation(path)
+    db.write(
+        "INSERT OR IGNORE INTO motions VALUES (?, ?, ?, ?, ?, ?, ?)",
+        *(motion, arm, seen.name, seen.duration, file_sha256(path), time.time(), by),
+    )
+
+
+def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: int) -> Row:
+    """Take an uploaded motion.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        arm: name of the arm that it is for.
+        text: content of the motion's file.
+        by: who.
+        joints: how many the arm has.
+
+    Raises:
+        UsageError: not a motion, or one of an arm with another number of joints; the message says what is wrong.
+    """
+    found = excitation_from_json(text).path.joints
+    if found != joints:
+        raise UsageError(f"a motion of {found} joints, but {arm} has {joints}; upload one that was designed for it")
+    motion = new_id(arm)
+    with appearing_folder(state / MOTIONS / motion) as folder:
+        write_atomically(folder / MOTION_FILE, text)
+    with db.transaction():
+        index_motion(db, state, motion, arm, by)
+        note(db, by, "motion added", motion, arm=arm, sha256=hashlib.sha256(text.encode()).hexdigest())
+    return known_motion(db, motion)
+
+
+def known_motion(db: Database, motion: str) -> Row:
+    """Return the motion of this id.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    row = db.row("SELECT * FROM motions WHERE id = ?", motion)
+    if row is None:
+        raise UnknownId(f"no motion {motion!r} is known; the list of motions names them")
+    return row
+
+
+def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
+    """Return motions, or those of an arm, the newest first, from the one after the id `before`; as `known_motion`."""
+    at = None if before is None else known_motion(db, before)["added"]
+    return db.rows(
+        "SELECT * FROM motions WHERE (?1 IS NULL OR arm = ?1) AND (?2 IS NULL OR added < ?2 OR added = ?2 AND id > ?3) "
+        "ORDER BY added DESC, id LIMIT ?4",
+        *(arm, at, before, most),
+    )
+
+
+def motion_path(db: Database, state: Path, motion: str) -> Path:
+    """Return the file of a motion, from the id in the registry, never from a word of the request."""
+    return state / MOTIONS / str(known_motion(db, motion)["id"]) / MOTION_FILE

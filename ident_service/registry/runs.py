@@ -1,0 +1,218 @@
+"""Store runs by id, the name of their folder: what each holds, how it ended, and its recordings.
+
+The folder is the truth: rows are made from its manifest, and can be made again.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from ident_service.errors import IdentError, ParameterError, UnknownId, UsageError
+from ident_service.motion.ending import ENDED
+from ident_service.registry.database import Database, Row
+from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
+
+RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
+TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
+"""Kinds of jobs that make files for download, in a folder of their own below `EXPORTS`."""
+UPLOAD, COLUMNS = "upload.json", "columns.yaml"
+"""Files of a run that is an uploaded recording: its announcement, and the layout of its columns."""
+KILLED: Final = "killed"
+_ARM, _PARAMETERS, _SCORE = "arm.json", "parameters.json", "score.json"
+_MOST_BYTES = 64 * 2**20
+_RECORDING = ".mcap"
+
+
+def index_run(db: Database, state: Path, run: str) -> Row:
+    """Enter a run's folder in the registry, or enter it again.
+
+    Raises:
+        UsageError: no such folder, or no arm in it.
+        ParameterError: its files are not what its manifest names.
+    """
+    folder = state / RUNS / run
+    # A run without a manifest was killed.
+    whole = (folder / MANIFEST).is_file()
+    gone = frozenset(row["name"] for row in db.rows("SELECT name FROM recordings WHERE run = ? AND deleted > 0", run))
+    files = dict(verified_files(folder, but=gone)) if whole else {}
+    arm = _document(folder / _ARM)
+    ended = _document(folder / ENDED) if (folder / ENDED).is_file() else None
+    own = str(_document(folder / UPLOAD).get("name")) if UPLOAD in files else ""
+    sizes = {
+        name: (folder / name).stat().st_size
+        for name in files
+        if (name.endswith(_RECORDING) or name == own) and name not in gone
+    }
+    table = _document(folder / _PARAMETERS) if _PARAMETERS in files else None
+    name = str(arm.get("name", ""))
+    if not name:
+        raise UsageError(f"{folder / _ARM}: names no arm")
+    with db.transaction():
+        values = (
+            *(_kind(files), name, None if table is None else table.get("arm", {}).get("sha256")),
+            *(_began(folder), _ending(files, ended), file_sha256(folder / MANIFEST) if whole else None, time.time()),
+            _driven(arm, ended),
+        )
+        db.write(
+            "INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (id) DO UPDATE SET kind = excluded.kind, "
+            "arm = excluded.arm, arm_sha256 = excluded.arm_sha256, ending = excluded.ending, manifest_sha256 = "
+            "excluded.manifest_sha256, indexed = excluded.indexed, seconds = excluded.seconds",
+            *(run, *values),
+        )
+        for recording, size in sizes.items():
+            db.write(
+                "INSERT OR REPLACE INTO recordings VALUES (?, ?, ?, ?, NULL)", run, recording, files[recording], size
+            )
+        if table is not None:
+            db.write(
+                "INSERT OR REPLACE INTO parameter_sets VALUES (?, ?, ?, ?, ?, ?)",
+                *(run, files[_PARAMETERS], name, str(table.get("method", "")), _feasible(table)),
+                table.get("fit", {}).get("relative_error_percent"),
+            )
+    return known_run(db, run)
+
+
+def rebuild_runs(db: Database, state: Path) -> list[str]:
+    """Enter every run folder that the registry does not know; return the folders that cannot be read, and why."""
+    known = {row["id"] for row in db.rows("SELECT id FROM runs")}
+    busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state = 'running' AND run IS NOT NULL")}
+    told = []
+    place = state / RUNS
+    for folder in sorted(place.iterdir()) if place.is_dir() else ():
+        if folder.name.startswith(".") or folder.name in known | busy or folder.is_symlink():
+            continue
+        try:
+            index_run(db, state, folder.name)
+        except (IdentError, OSError) as error:
+            told.append(f"{folder.name}: {error}")
+    return told
+
+
+def known_run(db: Database, run: str) -> Row:
+    """Return the run of this id.
+
+    Raises:
+        UnknownId: there is none.
+    """
+    row = db.row("SELECT * FROM runs WHERE id = ?", run)
+    if row is None:
+        raise UnknownId(f"no run {run!r} is known; the list of runs names them")
+    return row
+
+
+def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
+    """Return runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
+    at = None if before is None else known_run(db, before)["created"]
+    return db.rows(
+        "SELECT * FROM runs WHERE (?1 IS NULL OR arm = ?1) "
+        "AND (?2 IS NULL OR created < ?2 OR created = ?2 AND id > ?3) ORDER BY created DESC, id LIMIT ?4",
+        *(arm, at, before, most),
+    )
+
+
+def recordings(db: Database, run: str) -> list[Row]:
+    """Return the recordings of a run."""
+    return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
+
+
+def recording_name(db: Database, run: str) -> str:
+    """Return the name of the only recording of a run; `run.mcap` where it has several, or none.
+
+    Raises:
+        UnknownId: no such run.
+    """
+    names = [row["name"] for row in recordings(db, str(known_run(db, run)["id"]))]
+    return str(names[0]) if len(names) == 1 else "run.mcap"
+
+
+def parameter_set(db: Database, run: str) -> Row | None:
+    """Return the entry of the parameters that a run holds; None where it holds none."""
+    return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
+
+
+def run_folder(db: Database, state: Path, run: str) -> Path:
+    """Return the folder of a run, from the id in the registry, never from a word of the request."""
+    return state / RUNS / str(known_run(db, run)["id"])
+
+
+def run_files(db: Database, state: Path, run: str) -> dict[str, str]:
+    """Return name and SHA-256 of the files of a run that its manifest names and that exist."""
+    folder = run_folder(db, state, run)
+    if not (folder / MANIFEST).is_file():
+        return {}
+    return {name: sha256 for name, sha256 in named_files(folder).items() if _own(folder / name)}
+
+
+def run_file(db: Database, state: Path, run: str, name: str) -> Path:
+    """Return the path of a file that the manifest of a run names.
+
+    Raises:
+        UnknownId: no such run, or no such file in it.
+    """
+    if name not in run_files(db, state, run):
+        gone = db.row("SELECT deleted FROM recordings WHERE run = ? AND name = ? AND deleted > 0", run, name)
+        if gone is not None:
+            when = datetime.fromtimestamp(gone["deleted"], UTC).strftime("%Y-%m-%d")
+            raise UnknownId(
+                f"the recording {name} of the run {run} was deleted on {when} to make room (`ident prune`); what was "
+                "identified from it stays, and another recording is needed for more"
+            )
+        raise UnknownId(f"the run {run} has no file {name!r}; its manifest names them")
+    return run_folder(db, state, run) / name
+
+
+def _own(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
+def _document(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ParameterError(f"{path}: larger than {_MOST_BYTES} bytes")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise ParameterError(f"{path}: not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise ParameterError(f"{path}: not a JSON object")
+    return content
+
+
+def _kind(files: dict[str, str]) -> str:
+    if UPLOAD in files:
+        return "recording"
+    if _SCORE in files:
+        return "simulation"
+    return "identification" if _PARAMETERS in files else "motion"
+
+
+def _ending(files: dict[str, str], ended: dict[str, Any] | None) -> str:
+    if ended is not None:
+        return str(ended.get("error") or ended.get("state") or "unknown")
+    return "uploaded" if UPLOAD in files else "done" if _PARAMETERS in files else KILLED
+
+
+def _driven(arm: dict[str, Any], ended: dict[str, Any] | None) -> float | None:
+    """Return how long the control loop drove the arm [s]; None where that is not recorded."""
+    cycles, rate = (ended or {}).get("cycles"), arm.get("control", {}).get("rate")
+    return cycles / rate if isinstance(cycles, int | float) and isinstance(rate, int | float) and rate > 0 else None
+
+
+def operating_seconds(db: Database, arm: str) -> float:
+    """Return how long the runs of this registry drove an arm in total [s]; other use is not counted."""
+    row = db.row("SELECT TOTAL(seconds) AS seconds FROM runs WHERE arm = ?", arm)
+    return float(row["seconds"]) if row is not None else 0.0
+
+
+def _feasible(table: dict[str, Any]) -> int | None:
+    feasible = table.get("feasibility", {}).get("feasible")
+    return None if feasible is None else int(bool(feasible))
+
+
+def _began(folder: Path) -> float:
+    return min((path.stat().st_mtime for path in folder.iterdir()), default=time.time())

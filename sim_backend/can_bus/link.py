@@ -1,0 +1,203 @@
+"""Connect to a wire: a connection, and the Link on it that needs no python-can.
+
+One system call a frame, or for several at once; the stamp of a frame is the wire's, when the frame ended on it, and the
+clock is the same in all processes of a machine.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections import deque
+from collections.abc import Sequence
+
+from drivers.can.bus_errors import BusError, BusOffWatch, kind_of
+from drivers.can.can_frame import Frame
+from drivers.can.kernel_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, pack_frames, unpack_frames
+from drivers.can.receive_filter import HEARD, MOST_AT_ONCE
+from drivers.can.sendable import check_sendable
+from drivers.clock import RealClock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+from sim_backend.can_bus import address, packets
+
+_WELCOME_S = 10.0  # the host of a wire may still be loading a model
+_ANSWERS = {
+    packets.OTHER_VERSION: "runs in another version of this software; restart it",
+    packets.CROWDED: "has no room for another end; close one",
+}
+
+
+def from_config(config: ArmConfig, bus_number: int) -> WireLink:
+    """Open the link of one bus of an arm; entry point `ident_wire`.
+
+    Raises:
+        BusError: no process runs the wire, or it refuses.
+        DriverError: the driver section is not CANopen's, or an unknown option; `pace` is the host's.
+    """
+    if not isinstance(config.driver, CanopenDriver):
+        raise DriverError(f"{config.name}: the driver is not CANopen's")
+    bus = config.driver.buses[bus_number]
+    if unknown := sorted(set(bus.options) - {"pace"}):
+        raise DriverError(f"driver.buses.{bus_number}.options: ident_wire has only pace, found {', '.join(unknown)}")
+    fd = bus.data_bitrate is not None
+    return WireLink(Connection(bus.channel, packets.Hello("driver", filters=HEARD, fd=fd)), fd=fd)
+
+
+class Connection:
+    """Connect to a wire and exchange greetings.
+
+    Attributes:
+        name: of the bus, for messages.
+        welcome: answer of the wire, with its properties.
+    """
+
+    def __init__(self, channel: str, hello: packets.Hello) -> None:
+        """Connect to the wire and greet it.
+
+        Args:
+            channel: name or path of the wire.
+            hello: label, filters and CAN FD of this end.
+
+        Raises:
+            BusError: no process runs the wire, or it refuses.
+        """
+        self.name = f"ident_wire {channel}"
+        self._socket = address.connect(channel)
+        self._socket.settimeout(_WELCOME_S)
+        try:
+            self._socket.send(packets.pack_hello(hello))
+            self.welcome = packets.unpack_welcome(self._socket.recv(MAX_PACKET_BYTES))
+        except (OSError, DriverError) as error:
+            self._socket.close()
+            raise BusError("refused", self.name, remedy=f"does not answer as a wire does: {error}") from None
+        if self.welcome.answer != packets.ACCEPTED:
+            self._socket.close()
+            raise BusError("refused", self.name, remedy=_ANSWERS.get(self.welcome.answer, "refuses"))
+        self._socket.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor, -1 when closed."""
+        return self._socket.fileno()
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Send frames in their order, in one packet for each 64, stamped with now: a wire's host may be late itself.
+
+        Raises:
+            BusError: the wire is gone, or takes no more.
+        """
+        now = time.monotonic_ns()
+        try:
+            for first in range(0, len(frames), MAX_PACKET_FRAMES):
+                some = frames[first : first + MAX_PACKET_FRAMES]
+                self._socket.send(pack_frames([(frame._replace(stamp_ns=now), False) for frame in some]))
+        except OSError as error:
+            raise self._failure(error) from None
+
+    def take(self, until_ns: int = 0) -> list[tuple[Frame, bool]]:
+        """Return the frames of the next packet, with whether they are this end's own; empty from `until_ns` on.
+
+        Raises:
+            BusError: the wire is gone.
+        """
+        while True:
+            try:
+                data = self._socket.recv(MAX_PACKET_BYTES)
+            except BlockingIOError:
+                remaining = until_ns - time.monotonic_ns()
+                if remaining <= 0:
+                    return []
+                self._wait(remaining * 1e-9)
+                continue
+            except OSError as error:
+                raise self._failure(error) from None
+            if not data:
+                raise BusError("gone", self.name, remedy="the process that runs this wire has ended; start it again")
+            return unpack_frames(data)
+
+    def close(self) -> None:
+        """Close the connection to the wire."""
+        self._socket.close()
+
+    def _wait(self, seconds: float) -> None:
+        try:
+            select.select([self._socket], [], [], seconds)
+        except (OSError, ValueError) as error:
+            raise self._failure(error) from None
+
+    def _failure(self, error: OSError | ValueError) -> BusError:
+        if isinstance(error, BlockingIOError):
+            remedy = "the wire takes no more frames: its pace is too slow for what is sent, or its host hangs"
+            return BusError("full", self.name, remedy=remedy)
+        code = error.errno if isinstance(error, OSError) else None
+        return BusError(kind_of(code, "gone"), self.name, remedy="the wire has gone", detail=str(error))
+
+
+class WireLink:
+    """Implement a Link on a connection; the thread that opened it is its only user."""
+
+    def __init__(self, connection: Connection, *, fd: bool | None = None) -> None:
+        """Use an open connection, and close it with the link.
+
+        Args:
+            connection: greeted.
+            fd: whether data frames are sent as CAN FD's; by default where the wire carries them.
+        """
+        self.clock = RealClock()
+        self._connection = connection
+        self._fd = connection.welcome.fd if fd is None else fd
+        self._waiting: deque[Frame] = deque()
+        self._watch = BusOffWatch()
+
+    def send(self, frame: Frame) -> None:
+        """Send one frame to the wire.
+
+        Raises:
+            BusError: bus-off, the wire is gone or takes no more.
+            DriverError: a frame that cannot exist.
+        """
+        self.send_all((frame,))
+
+    def send_all(self, frames: Sequence[Frame]) -> None:
+        """Send several frames in one system call, in their order; raises as `send` does, and then nothing is sent."""
+        for frame in frames:
+            check_sendable(frame, fd=self._fd)
+        if self._watch.off:
+            remedy = "bus-off: some ends know CAN FD (data_bitrate) and some do not, or errors were injected"
+            raise BusError("off", self._connection.name, remedy=remedy)
+        if self._fd:
+            frames = [frame if frame.remote else frame._replace(fd=True) for frame in frames]
+        self._connection.send(frames)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """Return the next frame, None when there is none until the deadline [ns of the clock].
+
+        Raises:
+            BusError: the wire is gone.
+        """
+        if not self._waiting:
+            self._keep(self._connection.take(deadline_ns))
+        return self._waiting.popleft() if self._waiting else None
+
+    def drain(self) -> Sequence[Frame]:
+        """Return all frames that wait, hardly more than `MOST_AT_ONCE`; does not wait.
+
+        Raises:
+            BusError: the wire is gone.
+        """
+        while len(self._waiting) < MOST_AT_ONCE and (taken := self._connection.take()):
+            self._keep(taken)
+        frames = tuple(self._waiting)
+        self._waiting.clear()
+        return frames
+
+    def close(self) -> None:
+        """Close the connection to the wire."""
+        self._connection.close()
+
+    def _keep(self, taken: list[tuple[Frame, bool]]) -> None:
+        for frame, _ in taken:
+            if frame.error:
+                self._watch.heard(frame)
+            self._waiting.append(frame)

@@ -1,0 +1,397 @@
+"""Emulate a CANopen torque drive: frames and times in, frames out; it has neither clock nor bus.
+
+A host configures it by SDO alone; all it does follows from its object dictionary. At a SYNC the position is sampled
+and told, then the torque that came before the SYNC begins to act.
+
+What makes it stop by itself, each by the option in 6007h (0 nothing, 1 fault, 2 disable voltage, 3 quick stop;
+CiA 402-2, 10.3.2): a heartbeat or a question of node guarding that stays away (1016h, 100Ch and 100Dh, after which the
+node also leaves `operational`, 1029h:01), an RPDO that stays away for longer than its event timer, SYNC that stays away
+for 2F70h of its periods (1006h), a target torque that does for 2F75h [ms], and NMT commands that end `operational`. The
+two entries of the maker's stand for those of real ones.
+"""
+
+from __future__ import annotations
+
+import math
+
+from drivers.can.can_frame import Frame
+from sim_backend.canopen_device import nmt
+from sim_backend.canopen_device.emergency import Emergency
+from sim_backend.canopen_device.makers import MakersWatchdogs
+from sim_backend.canopen_device.mapping import COMMUNICATION, MAPPING, check_write
+from sim_backend.canopen_device.nmt import Nmt, State
+from sim_backend.canopen_device.node import Node
+from sim_backend.canopen_device.objects import WRONG_STATE, WRONG_VALUE, Objects, SdoAbort
+from sim_backend.canopen_device.pdo import RPDO_TIMEOUT, Pdos
+from sim_backend.canopen_device.personality import LIKE_NEW, Firmware, Personality
+from sim_backend.canopen_device.power import PowerStage, PowerState
+from sim_backend.canopen_device.sdo_server import SdoServer
+from sim_backend.canopen_device.torque import TorqueLoop
+from sim_backend.emulator.face import Traffic
+from sim_backend.emulator.motor import Motor
+
+BOOT_NS = 20_000_000  # from a reset to the boot-up message
+NO_HEARTBEAT, SYNC_LENGTH, NO_VOLTAGE, POWER_STAGE = 0x8130, 0x8240, 0x3220, 0x5400
+_PDO_PARAMETERS = {index for group in (*COMMUNICATION, *MAPPING) for index in group}
+_DRIVE_OBJECTS = 0x6000
+_FAULT = 1  # of 6007h
+_WARNING, _REMOTE, _LIMITED, _FOLLOWS, _VOLTAGE = 0x0080, 0x0200, 0x0800, 0x1000, 0x0010
+# Key of the position entry; a TPDO without it is no feedback.
+_POSITION = 0x606400
+
+
+class CanopenDrive:
+    """Emulate one node with its motor; implements the interface of `sim_backend/emulator/face.py`.
+
+    Attributes:
+        objects: its object dictionary.
+        motor: that it drives.
+        emergency: its errors.
+        nmt: its state in the network.
+        power: its state as a drive.
+        sync_identifier: identifier of SYNC frames.
+        deaf: whether a defect makes it go on when its watchdogs should stop it.
+    """
+
+    def __init__(
+        self, eds: str, number: int, motor: Motor, own: dict[int, int] | None = None, like: Personality = LIKE_NEW
+    ) -> None:
+        """Create a drive without power.
+
+        Args:
+            eds: text of its electronic data sheet.
+            number: node id.
+            motor: that it drives.
+            own: numbers that its entries have instead of what the EDS says, by key.
+            like: its properties that are not in the EDS.
+
+        Raises:
+            DriverError: an EDS that cannot be read.
+        """
+        self._personality = like
+        self.objects = Objects(eds, number, {0x608F01: motor.counts_per_turn, **dict(like.motor), **(own or {})})
+        self.motor = motor
+        self._node = node = Node(number, self.objects)
+        self._sdo = SdoServer(self.objects)
+        self.emergency = Emergency(node)
+        self.nmt = Nmt(
+            node, boot_ns=BOOT_NS, entered=self._entered, reset=self._reset, lost=self._lost, found=self._found
+        )
+        self.power = PowerStage(node, motor)
+        self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
+        self._torque = TorqueLoop(self.objects, motor, self._personality)
+        self._firmware = Firmware(node, self._personality, self._control)
+        self._makers = MakersWatchdogs(node, self.emergency, self._late, there=like.shipped)
+        self._failure = 0
+        self._warned = self._evaluated = False
+        self._ears: set[int] = set()
+        self.sync_identifier = 0
+        self.deaf = False
+        self.objects.before_read = self._about_to_read
+        self.objects.veto = self._veto
+        self.objects.written = self._written
+        self._like_new()
+
+    @property
+    def number(self) -> int:
+        """Return the node id."""
+        return self._node.number
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """Return when `tick` has something to do [ns]; None for never."""
+        timers = self._node.timers
+        return min(timers.values()) if timers else None
+
+    @property
+    def state(self) -> str:
+        """Describe the state of the network, of the drive, and its errors, in words."""
+        errors = "".join(f", error 0x{code:04X}" for code in self.emergency.active)
+        return f"{self.nmt.state.name}, {self.power.state.name}".lower().replace("_", " ") + errors
+
+    @property
+    def released(self) -> bool:
+        """Return whether a host has switched the drive off and has left it pre-operational."""
+        off = self.power.state is PowerState.SWITCH_ON_DISABLED
+        return off and self.nmt.commanded and self.nmt.state is State.PRE_OPERATIONAL
+
+    def power_up(self, now_ns: int) -> None:
+        """Power the drive up; the boot-up message follows at once."""
+        self._node.now_ns = now_ns
+        self.motor.power_up(now_ns)
+        self._like_new()
+        self.nmt.boot(0)
+
+    def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
+        """Process a frame of another node.
+
+        Args:
+            frame: of any kind; what is not for this drive does nothing.
+            now_ns: when, not before the last call.
+
+        Returns:
+            What the drive sends, in order.
+        """
+        if frame.error or frame.extended:
+            return []
+        self._node.now_ns = now_ns
+        if frame.remote:
+            if frame.identifier == 0x700 + self._node.number and self.nmt.state is not State.INITIALISING:
+                self.nmt.asked()
+            return self._finish()
+        identifier, state = frame.identifier, self.nmt.state
+        if identifier == 0:
+            self.nmt.command(frame.data)
+        elif state is State.INITIALISING:
+            return []
+        elif identifier == self.sync_identifier:
+            if state is not State.STOPPED:
+                self._sync(frame.data)
+        elif identifier == 0x600 + self._node.number:
+            if state is not State.STOPPED and (answer := self._sdo.answer(frame.data)) is not None:
+                self._node.send(0x580 + self._node.number, answer)
+        elif identifier in self._pdos.rpdos:
+            self._pdos.receive(identifier, frame.data)
+        elif 0x700 < identifier < 0x780:
+            self.nmt.heard(frame)
+        return self._finish()
+
+    def tick(self, now_ns: int) -> list[Frame]:
+        """Process the timers that are due, in their order; returns the frames that the drive sends."""
+        timers = self._node.timers
+        while timers:
+            name = min(timers, key=timers.__getitem__)
+            if timers[name] > now_ns:
+                break
+            self._node.now_ns = max(timers.pop(name), self._node.now_ns)
+            for part in (self.nmt, self._makers, self._pdos, self.power, self.emergency, self._firmware):
+                part.due(name)
+            self._refresh()
+            self._pdos.changes()
+        self._node.now_ns = max(now_ns, self._node.now_ns)
+        return self._finish()
+
+    def watch(self, now_ns: int) -> None:
+        """Sample position and speed between frames, as a drive does all the time."""
+        if self.power.state is PowerState.OPERATION_ENABLED:
+            self._sample(now_ns)
+            self._torque.evaluate(now_ns)
+
+    def listens(self, identifier: int) -> bool:
+        """Return whether a frame of this identifier means anything to this drive."""
+        return identifier in self._ears or 0x700 < identifier < 0x780
+
+    def traffic(self, frame: Frame) -> Traffic:
+        """Return the kind of a frame that this drive has sent."""
+        if frame.identifier == 0x700 + self._node.number:
+            return Traffic.HEARTBEAT
+        for number, index in enumerate(COMMUNICATION[1]):
+            if self.objects.number(index, 1) & 0x7FF == frame.identifier:
+                entries = range(1, self.objects.number(MAPPING[1][number]) + 1)
+                keys = [self.objects.number(MAPPING[1][number], k) >> 8 for k in entries]
+                return Traffic.FEEDBACK if _POSITION in keys else Traffic.OTHER
+        return Traffic.OTHER
+
+    def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
+        """Simulate a fault that the drive finds in itself.
+
+        Args:
+            code: of the emergency message, which is also in 603Fh.
+            now_ns: when.
+            lasting: whether it is the power stage that fails: the motor coasts at once, and no reset helps until
+                `repaired`.
+        """
+        self._node.now_ns = now_ns
+        if lasting:
+            self._failure = code
+        self.emergency.occurs(code)
+        self.power.trip(coasting=lasting)
+        return self._finish()
+
+    def repaired(self) -> None:
+        """End a lasting fault; it still has to be reset."""
+        self._failure = 0
+
+    def ignore_watchdogs(self, deaf: bool) -> None:
+        """Set whether a defect makes the drive go on although its host is gone."""
+        self.deaf = deaf
+
+    def warn(self, warned: bool, now_ns: int) -> list[Frame]:
+        """Set or clear the warning bit of the statusword."""
+        self._node.now_ns = now_ns
+        self._warned = warned
+        return self._finish()
+
+    def supply(self, on: bool, now_ns: int) -> list[Frame]:
+        """Switch the power of the motor, not of the firmware, on or off."""
+        self._node.now_ns = now_ns
+        self.power.supply(on)
+        if on:
+            self.emergency.is_over(NO_VOLTAGE)
+        else:
+            self.emergency.occurs(NO_VOLTAGE)
+        return self._finish()
+
+    def reboot(self, now_ns: int) -> list[Frame]:
+        """Restart the firmware by itself, as after a brown-out."""
+        self._node.now_ns = now_ns
+        self.nmt.reset(nmt.Command.RESET_NODE)
+        return self._finish()
+
+    def evaluate(self, now_ns: int) -> None:
+        """Evaluate position, speed and torque anew after a defect has changed."""
+        self.watch(now_ns)
+
+    # Called by the parts of the drive.
+
+    def _sync(self, data: bytes) -> None:
+        if data:
+            self.emergency.occurs(SYNC_LENGTH)  # without a counter (1019h is 0) it has none (CiA 301, 7.2.5)
+            return
+        if self.nmt.state is State.OPERATIONAL:
+            self._makers.synced()
+        self._sample(self._node.now_ns)
+        self._evaluated = False
+        self._pdos.sync()  # limits depend on where the motor is, whether a torque has come or not
+        if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
+            self._torque.evaluate(self._node.now_ns)
+
+    def _sample(self, now_ns: int) -> None:
+        values = self.objects.values
+        values[_POSITION] = self.motor.encoder(now_ns)
+        speed = self.motor.speed(now_ns) * self.motor.counts_per_turn / (2.0 * math.pi)
+        values[0x606C00] = round(speed)
+
+    def _arrived(self, keys: tuple[int, ...]) -> None:
+        """Handle objects that an RPDO or an SDO has set."""
+        if self._personality.target in keys and self.nmt.state is State.OPERATIONAL:
+            self._makers.targeted()
+        self._firmware.arrived(keys)
+        if self.power.state is PowerState.OPERATION_ENABLED:
+            self._torque.evaluate(self._node.now_ns)
+            self._evaluated = True
+
+    def _control(self, word: int) -> None:
+        if self.power.control(word) and not self._failure:
+            self.power.reset_fault()
+            waiting = {NO_HEARTBEAT} if self.nmt.silent_nodes else set()
+            waiting |= {NO_VOLTAGE} if not self.power.voltage else set()
+            self.emergency.is_over(*[code for code in self.emergency.active if code not in waiting])
+
+    def _late(self) -> None:
+        self._abort_connection()
+
+    def _lost(self, number: int) -> None:
+        self.emergency.occurs(NO_HEARTBEAT)
+        self._abort_connection()
+        if self.objects.number(0x1029, 1) == 0 and self.nmt.state is State.OPERATIONAL:
+            self.nmt.leave_operational()
+
+    def _found(self, number: int) -> None:
+        if not self.nmt.silent_nodes:
+            self.emergency.is_over(NO_HEARTBEAT)
+
+    def _abort_connection(self) -> None:
+        if self.deaf:
+            return
+        match self.objects.number(0x6007) if 0x600700 in self.objects.entries else _FAULT:  # its maker's
+            case 1:
+                self.power.trip()
+            case 2:
+                self.power.disable_voltage()
+            case 3:
+                self.power.quick_stop()
+
+    def _entered(self, before: State) -> None:
+        if self.nmt.state is State.OPERATIONAL:
+            self._pdos.start()
+        elif before is State.OPERATIONAL:
+            self._pdos.stop()
+            self._makers.stop()
+            self.emergency.is_over(RPDO_TIMEOUT)
+            self._abort_connection()
+        if before is State.INITIALISING and self.power.state is PowerState.NOT_READY:
+            self.power.start()
+
+    def _reset(self, command: nmt.Command) -> None:
+        self._sdo.reset()
+        self.emergency.reset()
+        if command is nmt.Command.RESET_NODE:
+            self.power.down()
+            self.motor.power_up(self._node.now_ns)
+            self._like_new()
+        else:
+            self._abort_connection()
+            self._communication_like_new()
+
+    def _like_new(self) -> None:
+        self.objects.reset(_DRIVE_OBJECTS)
+        self.power.down()
+        self._torque.release()
+        self._communication_like_new()
+
+    def _communication_like_new(self) -> None:
+        self.objects.reset(last=_DRIVE_OBJECTS - 1)
+        self._configure()
+
+    def _configure(self) -> None:
+        self._pdos.configure()
+        self.sync_identifier = self.objects.number(0x1005) & 0x7FF or 0x80
+        self._ears = {0, self.sync_identifier, 0x600 + self._node.number, *self._pdos.rpdos}
+
+    def _about_to_read(self, key: int) -> None:
+        if key in (_POSITION, 0x606C00):
+            self._sample(self._node.now_ns)
+
+    def _veto(self, key: int, value: int) -> None:
+        check_write(self.objects, key, value)
+        index = key >> 8
+        if index in _PDO_PARAMETERS and not self._personality.shipped and self.nmt.state is State.OPERATIONAL:
+            raise SdoAbort(WRONG_STATE)
+        if key == 0x100300 and value:
+            raise SdoAbort(WRONG_VALUE)
+        if index in (0x1005, 0x1014) and value & 0x7FFF_F800:
+            raise SdoAbort(WRONG_VALUE)  # extended identifiers, and producing SYNC
+
+    def _written(self, key: int) -> None:
+        index = key >> 8
+        # Process data and the history of errors are no configuration (CiA 301, 7.5.2.21).
+        if index not in (0x1003, 0x1020) and not self.objects.entries[key].mappable:
+            self.objects.put(0x1020, 0, 1)
+            self.objects.put(0x1020, 0, 2)
+        if index in _PDO_PARAMETERS or index == 0x1005:
+            self._configure()
+        elif index == 0x1016:
+            self.nmt.configure_consumers()
+        elif index == 0x1017:
+            self.nmt.configure_producer()
+        elif index in (0x100C, 0x100D):
+            self.nmt.configure_guarding()
+        elif key == 0x100300:
+            for number in range(1, 9):
+                self.objects.put(0x1003, 0, number)
+        elif index >= _DRIVE_OBJECTS:
+            self._arrived((key,))
+
+    def _refresh(self) -> None:
+        """Update the statusword (CiA 402-2, table 29)."""
+        state = self.power.state
+        if state is not PowerState.OPERATION_ENABLED and (self._torque.follows or self._torque.limited):
+            self._torque.release()
+        word = int(state) | _REMOTE
+        if self.power.voltage:
+            word |= _VOLTAGE
+        if self._warned or (self.emergency.active and not state & 0x08):
+            word |= _WARNING
+        if self._torque.limited:
+            word |= _LIMITED
+        if self._torque.follows:
+            word |= _FOLLOWS
+        self.objects.values[0x604100] = word
+
+    def _finish(self) -> list[Frame]:
+        if self.nmt.state is not State.INITIALISING:
+            self._refresh()
+            self._pdos.changes()
+        out, self._node.out = self._node.out, []
+        return out

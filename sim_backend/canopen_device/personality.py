@@ -1,0 +1,140 @@
+"""Describe an emulated drive: how it makes torque, and how promptly its firmware works.
+
+The shipped data sheet's drive does all at once. A drive made from a maker's file is like its family says
+(`drivers/canopen/profiles`), and where neither says anything like the worst drive known: two control words within a
+millisecond are read as one, a mode of operation takes effect late, PDO parameters do not change while operational.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from drivers.canopen.capabilities import TORQUE_UNITS
+from drivers.canopen.families import entry_of, family_of
+from ident_service.config.canopen import CanopenDrive
+from ident_service.config.eds import DataSheet, data_sheet
+from ident_service.config.family import Family, TorqueUnit
+from sim_backend.canopen_device.node import Node
+from sim_backend.canopen_device.objects import Objects
+
+_MODE, _CONTROL = "mode of operation", "control word"
+_LOOP_NS, _MODE_NS = 1_000_000, 20_000_000
+_SOME_CONSTANT = 0.05  # N m/A, of a motor whose description has none
+# Objects without which a mode makes no sense, by the mode's number (CiA 402-2).
+_MODES = {1: (0x607A,), 3: (0x60FF,), 4: (0x6071, 0x6087), 6: (0x6098,), 10: (0x6071,)}
+_SERVO = 0x0002_0192
+
+
+def _key(text: str) -> int:
+    entry = entry_of(text, "")
+    return entry.index << 8 | entry.sub
+
+
+@dataclass(frozen=True)
+class Personality:
+    """Describe the properties of one drive; the defaults are the shipped data sheet's.
+
+    Attributes:
+        modes: of operation in which it follows a torque, as 6061h tells them.
+        target: key of the entry that takes the torque.
+        limits: keys of what limits it, in counts, or in thousandths of the second key's value.
+        rated: key of what a thousandth is of; None where a count is `scale`.
+        scale: N m per unit of `rated`, or per count.
+        shipped: whether it is the shipped data sheet's drive: it does at once what frames ask for, and has the
+            watchdogs of `makers.py`.
+        motor: values that its maker's tool has entered, by key.
+    """
+
+    modes: tuple[int, ...] = (10,)
+    target: int = 0x607100
+    limits: tuple[tuple[int, int | None], ...] = ((0x607200, None), (0x607300, None))
+    rated: int | None = 0x607600
+    scale: float = 1e-3
+    shipped: bool = True
+    motor: tuple[tuple[int, int], ...] = ()
+
+    def reach(self, objects: Objects) -> int:
+        """Return the largest torque that the drive's limits let through [counts]."""
+        found = [0x7FFF]
+        for key, per in self.limits:
+            if key in objects.entries:
+                value = objects.number(key >> 8, key & 0xFF)
+                whole = 1000 if per is None else objects.number(per >> 8, per & 0xFF)
+                found.append(1000 * value // whole if whole else 0)
+        return min(found)
+
+    def torque(self, counts: float, objects: Objects) -> float:
+        """Convert counts of torque to [N m]."""
+        if self.rated is None:
+            return counts * self.scale
+        return counts * self.scale * objects.number(self.rated >> 8, self.rated & 0xFF) * 1e-3
+
+
+LIKE_NEW = Personality()
+
+
+def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> Personality:
+    """Derive the properties of a drive from a maker's file, with the motor of a description.
+
+    Args:
+        text: of the EDS or DCF.
+        drive: the section that describes it.
+        families: of the description, which count before the shipped ones.
+    """
+    sheet = data_sheet(text)
+    told = {name: sheet.identity[sub] for sub, name in ((1, "vendor"), (2, "product")) if sub in sheet.identity}
+    family = family_of(told, families)
+    paths = [path for path in family.torque if sheet.has(_key(path.target) >> 8)]
+    unit = family.unit or TorqueUnit(rated="6076:0/u32", unit="mNm")
+    constant = drive.torque_constant or _SOME_CONSTANT
+    scale = TORQUE_UNITS[unit.unit] * (constant if unit.unit == "mA" else 1.0) * (unit.count or 1.0)
+    limits = {(_key(one.entry), None if one.per is None else _key(one.per)) for one in family.torque_limit}
+    amperes = drive.rated_torque / constant
+    motor = {0x607500: round(1e3 * amperes), 0x607600: round(1e3 * drive.rated_torque)}
+    if unit.rated is not None:
+        motor[_key(unit.rated)] = round(drive.rated_torque / scale)
+    return Personality(
+        modes=tuple(path.mode for path in paths),
+        target=_key(paths[0].target) if paths else 0x607100,
+        limits=tuple(sorted(limits, key=str)),
+        rated=None if unit.rated is None else _key(unit.rated),
+        scale=scale,
+        shipped=False,
+        motor=(*_unspecified(sheet, [key for key, _ in limits]), *motor.items()),
+    )
+
+
+def _unspecified(sheet: DataSheet, limits: list[int]) -> list[tuple[int, int]]:
+    """Return values that every drive has, for entries that the file lists without a value."""
+    modes = sum(1 << mode - 1 for mode, needs in _MODES.items() if all(sheet.has(index) for index in needs))
+    values = [(0x100000, _SERVO), (0x650200, modes), (0x608F02, 1), (0x608000, 0xFFFF), (0x608500, 0xFFFF)]
+    values += [(0x101800 | sub, number) for sub, number in sheet.identity.items()]
+    values += [(key, 0xFFFF) for key in limits]
+    return [(key, value) for key, value in values if key in sheet.entries and not sheet.entries[key].number(0)]
+
+
+class Firmware:
+    """Delay the effect of modes of operation and control words as a drive's firmware does."""
+
+    def __init__(self, node: Node, personality: Personality, control: Callable[[int], None]) -> None:
+        """Use the given node; `control` is called with each control word that takes effect."""
+        self._node, self._personality, self._control = node, personality, control
+
+    def arrived(self, keys: tuple[int, ...]) -> None:
+        """Note that frames have set these entries."""
+        for key, name, delay in ((0x606000, _MODE, _MODE_NS), (0x604000, _CONTROL, _LOOP_NS)):
+            if key in keys and self._personality.shipped:
+                self.due(name)
+            elif key in keys and name not in self._node.timers:
+                self._node.after(name, delay)
+
+    def due(self, name: str) -> None:
+        """Handle the due timer of this name."""
+        number = self._node.objects.number
+        if name == _CONTROL:
+            self._control(number(0x6040))
+        elif name == _MODE:
+            mode = number(0x6060)
+            if mode in self._personality.modes or (1 <= mode <= 32 and number(0x6502) >> (mode - 1) & 1):
+                self._node.objects.put(0x6061, mode)

@@ -1,0 +1,184 @@
+"""Simulate the arm behind emulated motors: the plant, moved to whatever time it is queried at.
+
+Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
+is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
+position and speed can. A step of exactly the nominal period is the simulated arm's. The arm is supported until all
+motors are powered and one of them has been given torque: drives are enabled with none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import ceil
+
+import numpy as np
+
+from drivers.arm import Vector
+from ident_service.errors import DriverError
+from sim_backend.emulator.gears import Gears
+from sim_backend.emulator.motor import Motor, Power
+from sim_backend.machine import Truth
+from sim_backend.plant import Plant
+
+# An interval of up to this many nominal periods is one step.
+_LONGEST = 1.5
+_OVERDUE = 1.2  # periods; less than one step
+
+
+class Body:
+    """Simulate a plant moved by motors through gears.
+
+    Attributes:
+        plant: body of the arm.
+        gears: between motors and joints.
+        motors: in the order of the configuration.
+        now_ns: the time that the plant has been moved to.
+        watch: called after each step but the last of a longer silence, with the time.
+        supported: whether the arm is still supported.
+    """
+
+    def __init__(self, plant: Plant, gears: Gears, noise: Vector, seed: int) -> None:
+        """Place the arm at rest at time 0.
+
+        Args:
+            plant: body of the arm; its period is the nominal one.
+            gears: between motors and joints.
+            noise: standard deviation per cycle of what acts on powered joints besides the torque, shape (joints,).
+            seed: of the noise.
+        """
+        self.plant, self.gears = plant, gears
+        self.motors: tuple[Motor, ...] = ()
+        self.now_ns = 0
+        self.watch: Callable[[int], None] = lambda now_ns: None
+        self.supported = True
+        self._period_ns = round(plant.period * 1e9)
+        self._noise_level = noise
+        self._random = np.random.default_rng(seed) if noise.any() else None
+        self._noise: Vector | None = None
+        self._drawn_ns = -self._period_ns
+        self._angles: list[float] = []
+        self._speeds: list[float] = []
+        self._seen: Vector | None = None
+        self._outputs: tuple[tuple[Power, float], ...] = ()
+        self._torque = np.zeros(plant.chain.joints)
+        self._driven = np.zeros(plant.chain.joints)
+
+    def start(self, now_ns: int) -> None:
+        """Start at this time, before anything has happened."""
+        self.now_ns = now_ns
+        self._drawn_ns = now_ns - self._period_ns
+
+    def angle(self, motor: int, now_ns: int) -> float:
+        """Return the angle of a motor [rad]."""
+        self.advance(now_ns)
+        self._look()
+        return self._angles[motor]
+
+    def speed(self, motor: int, now_ns: int) -> float:
+        """Return the speed of a motor [rad/s]."""
+        self.advance(now_ns)
+        self._look()
+        return self._speeds[motor]
+
+    def changes(self, now_ns: int) -> None:
+        """Advance the plant to a time at which a motor or a load changes: the old state acts until then."""
+        self.advance(now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Advance the plant to this time; does nothing when it is there.
+
+        Raises:
+            DriverError: the plant ran away.
+        """
+        begun = self.now_ns
+        interval = now_ns - begun
+        if interval <= 0:
+            return
+        steps = ceil(interval / (_LONGEST * self._period_ns))
+        for number in range(1, steps + 1):
+            end = begun + interval * number // steps
+            self._step(end)
+            if number < steps:
+                self.watch(end)
+
+    def support(self, now_ns: int) -> None:
+        """Support the arm where it stands, until all motors are powered and given torque again."""
+        if not self.supported:
+            self.advance(now_ns)
+            self.plant.rest()
+            self._seen = None
+            self.supported = True
+
+    def lead(self, position: Vector, now_ns: int) -> None:
+        """Move the supported arm to another position, at rest.
+
+        Args:
+            position: of the joints [rad or m], shape (joints,).
+            now_ns: time of the move.
+
+        Raises:
+            DriverError: the arm is not supported.
+        """
+        if not self.supported:
+            raise DriverError("nobody holds the arm: its drives have it, or it sinks")
+        self.advance(now_ns)
+        self.plant.place(position)
+
+    def catch_up(self, now_ns: int) -> None:
+        """Move the plant after a silence of more than a step, before what ends the silence has any effect."""
+        if now_ns - self.now_ns > _LONGEST * self._period_ns:
+            self.advance(now_ns)
+
+    @property
+    def overdue_ns(self) -> int | None:
+        """Return when a moving plant's next cycle is clearly overdue [ns]; None while the arm is supported."""
+        return None if self.supported else self.now_ns + round(_OVERDUE * self._period_ns)
+
+    def truth(self, stamp_ns: int) -> Truth:
+        """Return the present motion of the plant; torques at the joints, without noise and braking."""
+        plant = self.plant
+        self._collect()
+        return Truth(stamp_ns, plant.position, plant.velocity, plant.acceleration, self._torque)
+
+    def _step(self, end_ns: int) -> None:
+        interval, begun = end_ns - self.now_ns, self.now_ns
+        self.now_ns = end_ns
+        self._collect()
+        if self.supported:
+            return
+        torque = self._torque
+        if self._random is not None and self._driven.any():
+            # Once per cycle, however a cycle is divided: two buses have their SYNCs a little apart.
+            if 2 * (begun - self._drawn_ns) >= self._period_ns or self._noise is None:
+                self._noise = self._noise_level * self._random.standard_normal(torque.size)
+                self._drawn_ns = begun
+            torque = torque + self._noise * self._driven
+        if interval == self._period_ns:
+            self.plant.step(torque)
+        else:
+            self.plant.step(torque, interval * 1e-9)
+
+    def _collect(self) -> None:
+        """Collect the motors' torques and braking at the joints; computed again only when a motor changed."""
+        outputs = tuple([(motor.power, motor.torque) for motor in self.motors])
+        if outputs == self._outputs:
+            return
+        before, self._outputs = self._outputs, outputs
+        self._torque = self.gears.joint_torque(np.array([torque for _, torque in outputs]))
+        self._torque.setflags(write=False)
+        if self.supported:
+            self.supported = not (all(power is Power.TORQUE for power, _ in outputs) and self._torque.any())
+        if [power for power, _ in before] == [power for power, _ in outputs]:
+            return
+        powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)
+        self._driven = self.gears.driven(powered)
+        braked = np.array([motor.damping for motor in self.motors])
+        damping = self.gears.joint_damping(braked)
+        self.plant.brake(damping if (damping != np.diag(np.diag(damping))).any() else np.diag(damping).copy())
+
+    def _look(self) -> None:
+        """Compute the motors' angles and speeds where the plant is; its arrays are replaced, never written into."""
+        if self._seen is not self.plant.position:
+            self._seen = self.plant.position
+            self._angles = self.gears.motor_position(self.plant.position).tolist()
+            self._speeds = self.gears.motor_velocity(self.plant.velocity).tolist()

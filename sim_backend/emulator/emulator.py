@@ -1,0 +1,223 @@
+"""Emulate drives on their buses, with one arm behind them: frames and times in, frames out.
+
+It has neither a clock nor a bus: `lock_step.py` runs it in virtual time, `process.py` on real interfaces. Callers call
+`tick` for what is due before they hand over what has come since.
+
+Faults of the configuration count from the first SYNC. The arm is supported where it stands when its host has switched
+all drives off and has left in order; after anything else it sinks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+from drivers.can.can_frame import Frame
+from ident_service.errors import DriverError
+from sim_backend.emulator.body import Body
+from sim_backend.emulator.face import Face
+from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.injection import Injection, Sent
+from sim_backend.machine import Truth
+
+# An arm that moves is brought forward this often when nothing else happens [ns].
+_IDLE_NS = 20_000_000
+
+
+class Emulator:
+    """Emulate all drives of an arm.
+
+    Attributes:
+        body: the arm.
+        faces: the drives' protocol implementations, in the order of the motors.
+        names: of the joints.
+        observer: called with the truth at every SYNC, when the last bus has had it.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        faces: Sequence[Face],
+        buses: Sequence[int],
+        names: Sequence[str],
+        faults: Sequence[PuckFault] = (),
+    ) -> None:
+        """Assemble the emulator; nothing has power yet.
+
+        Args:
+            body: the arm.
+            faces: the drives' protocol implementations, in the order of the motors.
+            buses: index of each one's bus.
+            names: of the joints.
+            faults: to inject, counted from the first SYNC.
+        """
+        self.body, self.faces, self.names = body, tuple(faces), tuple(names)
+        self.observer: Callable[[Truth], None] | None = None
+        self._buses = tuple(buses)
+        self._on_bus: dict[int, list[tuple[int, Face]]] = {bus: [] for bus in self._buses}
+        for drive, face in enumerate(self.faces):
+            self._on_bus[self._buses[drive]].append((drive, face))
+        self._injection = Injection(body, self.faces, self._buses)
+        self._period_ns = round(body.plant.period * 1e9)
+        self._configured: tuple[PuckFault, ...] = tuple(faults)
+        self._to_begin: list[tuple[int, int | None, PuckFault]] = []
+        self._to_end: list[tuple[int, PuckFault]] = []
+        self._synced: set[int] = set()
+        self._now_ns = 0
+        self._deadline: tuple[int | None] | None = None  # as computed last, while it holds
+        body.watch = self._watch
+
+    @property
+    def bus_numbers(self) -> tuple[int, ...]:
+        """Return the index of each drive's bus."""
+        return self._buses
+
+    @property
+    def gone(self) -> bool:
+        """Return whether a fault has taken the bus."""
+        return any(fault.kind == "bus_gone" for fault in self._injection.active)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Describe the state of each drive, in words."""
+        return tuple("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
+
+    @property
+    def active(self) -> tuple[PuckFault, ...]:
+        """Return the faults that act at present."""
+        return tuple(self._injection.active)
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """Return when `tick` has something to do [ns]; None for never."""
+        if self._deadline is not None:
+            return self._deadline[0]
+        times = [begin for begin, _, _ in self._to_begin] + [end for end, _ in self._to_end]
+        for drive, face in enumerate(self.faces):
+            deadline = face.next_deadline_ns
+            if deadline is not None and not self._injection.dead(drive):
+                times.append(deadline)
+        if not self.body.supported:
+            times.append(self.body.now_ns + _IDLE_NS)
+        self._deadline = (min(times, default=None),)
+        return self._deadline[0]
+
+    def power_up(self, now_ns: int) -> None:
+        """Give power to all drives; they send their boot-up messages with the next `tick`."""
+        self._now_ns = now_ns
+        self.body.start(now_ns)
+        for face in self.faces:
+            face.power_up(now_ns)
+        self._deadline = None
+
+    def receive(self, bus: int, frame: Frame, now_ns: int, sender: int | None = None) -> list[Sent]:
+        """Process a frame that has come over a bus.
+
+        Args:
+            bus: its index.
+            frame: of any kind.
+            now_ns: time of reception.
+            sender: the drive that sent it, which does not hear it; None for the host.
+
+        Returns:
+            What the drives send, in order.
+
+        Raises:
+            DriverError: the plant ran away.
+        """
+        self._now_ns = now_ns = max(now_ns, self._now_ns)
+        if self._injection.cut_off:
+            return []
+        self.body.catch_up(now_ns)
+        sent: list[Sent] = []
+        is_sync = False
+        for drive, face in self._on_bus.get(bus, ()):
+            if face.listens(frame.identifier) and drive != sender and not self._injection.dead(drive):
+                self._deadline = None
+                is_sync = is_sync or frame.identifier == face.sync_identifier
+                sent += self._injection.on_the_way(drive, face.receive(frame, now_ns), now_ns)
+        if not self.body.supported and all(face.released for face in self.faces):
+            self.body.support(now_ns)
+            self._deadline = None
+        if is_sync and not (frame.error or frame.remote or frame.extended):
+            self._sync(bus, now_ns)
+        return sent
+
+    def tick(self, now_ns: int) -> list[Sent]:
+        """Process everything that is due: faults begin and end, drives act on their timers, in order of time.
+
+        Raises:
+            DriverError: the plant ran away.
+        """
+        sent: list[Sent] = []
+        while (due := self.next_deadline_ns) is not None and due <= now_ns:
+            at = self._now_ns = max(due, self._now_ns)
+            if self.body.now_ns + _IDLE_NS <= at:
+                self.body.advance(at)
+            self.body.catch_up(at)
+            sent += self._faults_due(at)
+            for drive, face in enumerate(self.faces):
+                deadline = face.next_deadline_ns
+                if deadline is not None and deadline <= at and not self._injection.dead(drive):
+                    sent += self._injection.on_the_way(drive, face.tick(at), at)
+            self._deadline = None
+        self._now_ns = max(now_ns, self._now_ns)
+        return sent
+
+    def go_on(self, now_ns: int) -> None:
+        """Advance the arm when the next cycle is late, by `Body.overdue_ns`, instead of when the cycle comes.
+
+        Moving the arm takes longest; without this, a cycle that came late would have its answers late, too.
+        """
+        overdue = self.body.overdue_ns
+        if overdue is not None and overdue <= now_ns:
+            self.body.advance(now_ns)
+            self._watch(now_ns)
+            self._now_ns = max(now_ns, self._now_ns)
+            self._deadline = None
+
+    def inject(self, faults: Iterable[PuckFault], now_ns: int) -> None:
+        """Schedule faults, counted from now on; they take effect with `tick`."""
+        for fault in faults:
+            if fault.drive is not None and not 0 <= fault.drive < len(self.faces):
+                raise DriverError(f"{fault} is of no drive")
+            begin, end = fault.window(now_ns, self._period_ns)
+            self._to_begin.append((begin, end, fault))
+        self._deadline = None
+
+    def add_configured(self, faults: Iterable[PuckFault]) -> None:
+        """Schedule faults counted from the first SYNC, as those of the configuration."""
+        self._configured += tuple(faults)
+
+    def clear(self, now_ns: int) -> None:
+        """End all faults that act, and drop those that have not begun yet."""
+        self._to_begin.clear()
+        self._to_end = [(now_ns, fault) for fault in self._injection.active]
+        self._deadline = None
+
+    def _faults_due(self, now_ns: int) -> list[Sent]:
+        sent: list[Sent] = []
+        for ends in [item for item in self._to_end if item[0] <= now_ns]:
+            self._to_end.remove(ends)
+            sent += self._injection.end(ends[1], now_ns)
+        for begins in [item for item in self._to_begin if item[0] <= now_ns]:
+            self._to_begin.remove(begins)
+            _, end, fault = begins
+            sent += self._injection.begin(fault, now_ns)
+            if end is not None:
+                self._to_end.append((end, fault))
+        return sent
+
+    def _sync(self, bus: int, now_ns: int) -> None:
+        if self._configured:
+            self.inject(self._configured, now_ns)
+            self._configured = ()
+        if bus in self._synced:
+            self._synced.clear()
+        self._synced.add(bus)
+        if self.observer is not None and self._synced == set(self._buses):
+            self.observer(self.body.truth(now_ns))
+
+    def _watch(self, now_ns: int) -> None:
+        for drive, face in enumerate(self.faces):
+            if not self._injection.dead(drive):
+                face.watch(now_ns)

@@ -1,0 +1,260 @@
+"""Emulate drives in this process and in virtual time: a Link without a bus, for runs that repeat to the bit.
+
+All buses of an arm share one emulator, one arm and one clock. Nothing happens but by calls: `receive` moves the clock
+to the next frame, or to its deadline; whoever moves the clock otherwise finds at the next call that the drives have
+done what was due meanwhile.
+
+What the host sends acts when it is sent, so that a cycle is as long for the arm as it is for the host, and takes its
+time on the wire, so that the answers come no earlier than they would. What the drives send arrives in the order of
+arbitration, after its time on the wire.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from drivers.can.can_frame import Frame
+from drivers.clock import VirtualClock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+from sim_backend.emulator.build import build_emulator
+from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.injection import Sent
+from sim_backend.emulator.wire import Wire
+
+INTERFACE = "lock_step"
+
+
+class LockStepArm:
+    """Emulate the drives of one arm, their buses and their clock.
+
+    Attributes:
+        emulator: of the drives.
+        clock: all links'.
+    """
+
+    def __init__(self, config: ArmConfig, faults: Sequence[PuckFault] = (), clock: VirtualClock | None = None) -> None:
+        """Build the arm and power it up.
+
+        Args:
+            config: whose buses are all of this interface.
+            faults: to inject besides those of the configuration, counted from the first SYNC.
+            clock: the loop's; by default a new one.
+
+        Raises:
+            DriverError: as `build_emulator`, or a bus of another interface.
+        """
+        driver = config.driver
+        if isinstance(driver, CanopenDriver) and any(bus.interface != INTERFACE for bus in driver.buses):
+            raise DriverError(f"{config.name}: either all buses are {INTERFACE!r} or none: one arm, one time")
+        self.emulator = build_emulator(config, faults)
+        assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
+        self.clock = VirtualClock() if clock is None else clock
+        self._wires = [Wire(bus.bitrate, bus.data_bitrate) for bus in driver.buses]
+        self._heard: list[deque[Frame]] = [deque() for _ in driver.buses]
+        self._open: set[int] = set()
+        self._now_ns = self.clock.now_ns()
+        self.emulator.power_up(self._now_ns)
+
+    def link(self, bus: int) -> LockStepLink:
+        """Open one bus.
+
+        Raises:
+            DriverError: it is open already.
+        """
+        if bus in self._open:
+            raise DriverError(f"bus {bus} is open already; one driver at a time can have the arm")
+        self._open.add(bus)
+        self._heard[bus].clear()
+        return LockStepLink(self, bus)
+
+    def inject(self, *faults: PuckFault) -> None:
+        """Inject faults, counted from now on."""
+        self._run(self.clock.now_ns())
+        self.emulator.inject(faults, self._now_ns)
+        self._run(self._now_ns)
+
+    def settle(self, until_ns: int) -> None:
+        """Let time pass without a host."""
+        self.clock.sleep_until_ns(until_ns)
+        self._run(self.clock.now_ns())
+
+    def send(self, bus: int, frame: Frame) -> None:
+        """Send a frame of the host; see `LockStepLink.send`."""
+        self._run(self.clock.now_ns())
+        self._require_bus(bus)
+        frame = self._wires[bus].as_sent(frame)
+        self._wires[bus].occupy(self._now_ns, frame)
+        self._carry(self.emulator.receive(bus, frame, self._now_ns))
+
+    def receive(self, bus: int, deadline_ns: int) -> Frame | None:
+        """Return the next frame; see `LockStepLink.receive`."""
+        heard = self._heard[bus]
+        self._run(self.clock.now_ns())
+        while not heard:
+            self._require_bus(bus)
+            due, _ = self._due()
+            if due is None or due > deadline_ns:
+                self.clock.sleep_until_ns(deadline_ns)
+                self._run(self.clock.now_ns())
+                break
+            self.clock.sleep_until_ns(due)
+            self._run(due)
+        self._require_bus(bus)
+        return heard.popleft() if heard else None
+
+    def drain(self, bus: int) -> list[Frame]:
+        """Return all frames until now; see `LockStepLink.drain`."""
+        self._run(self.clock.now_ns())
+        self._require_bus(bus)
+        frames = list(self._heard[bus])
+        self._heard[bus].clear()
+        return frames
+
+    def leave(self, bus: int) -> None:
+        """Close the link of a bus; the drives go on."""
+        self._open.discard(bus)
+
+    def _require_bus(self, bus: int) -> None:
+        if bus not in self._open:
+            raise DriverError(f"bus {bus} is closed")
+        if self.emulator.gone:
+            raise DriverError(f"bus {bus} is gone")
+
+    def _due(self) -> tuple[int | None, int | None]:
+        """Return when the next event happens, and the bus on which a frame arrives then, if it is an arrival."""
+        due = arrived = None
+        for bus, wire in enumerate(self._wires):
+            time = wire.next_ns
+            if time is not None and (due is None or time < due):
+                due, arrived = time, bus
+        deadline = self.emulator.next_deadline_ns
+        if deadline is not None and (due is None or deadline < due):
+            return deadline, None
+        return due, arrived
+
+    def _run(self, now_ns: int) -> None:
+        """Process all events until this time, in their order."""
+        while True:
+            due, arrived = self._due()
+            if due is None or due > now_ns:
+                break
+            self._now_ns = max(due, self._now_ns)
+            if arrived is None:
+                self._carry(self.emulator.tick(due))
+            else:
+                self._deliver(arrived, self._wires[arrived].take(), self._now_ns)
+        self._now_ns = max(now_ns, self._now_ns)
+
+    def _deliver(self, bus: int, sent: Sent, now_ns: int) -> None:
+        if bus in self._open:
+            self._heard[bus].append(self._wires[bus].as_sent(sent.frame)._replace(stamp_ns=now_ns))
+        if sent.drive is not None:
+            self._carry(self.emulator.receive(bus, sent.frame, now_ns, sent.drive))
+
+    def _carry(self, sent: Sequence[Sent]) -> None:
+        for item in sent:
+            self._wires[item.bus].put(item)
+
+
+class LockStepLink:
+    """Implement a Link on one bus of emulated drives in virtual time.
+
+    Attributes:
+        arm: behind it; for tests and scoring.
+    """
+
+    def __init__(self, arm: LockStepArm, bus: int) -> None:
+        """Use an arm; opened by `LockStepArm.link`."""
+        self.arm = arm
+        self._bus = bus
+        self._closed = False
+
+    @property
+    def clock(self) -> VirtualClock:
+        """Return the virtual clock of all buses of the arm."""
+        return self.arm.clock
+
+    def send(self, frame: Frame) -> None:
+        """Send a frame: drives receive it now, and it occupies the wire for its duration; DriverError on a dead bus."""
+        self._require_open()
+        self.arm.send(self._bus, frame)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """Return the next frame and move the time to it, or to the deadline; raises DriverError on a dead bus."""
+        self._require_open()
+        return self.arm.receive(self._bus, deadline_ns)
+
+    def drain(self) -> list[Frame]:
+        """Return all frames that came until now; raises DriverError on a dead bus."""
+        self._require_open()
+        return self.arm.drain(self._bus)
+
+    def close(self) -> None:
+        """Close the link; any number of times."""
+        if not self._closed:
+            self._closed = True
+            self.arm.leave(self._bus)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise DriverError(f"bus {self._bus} is closed")
+
+
+_standing: dict[int, LockStepArm] = {}
+
+
+@contextmanager
+def standing(
+    config: ArmConfig, faults: Sequence[PuckFault] = (), clock: VirtualClock | None = None
+) -> Iterator[LockStepArm]:
+    """Keep an emulated arm alive before links to it are opened and after they are closed.
+
+    While this lasts, every link that is opened from this very configuration object leads to it. Otherwise each opening
+    of the first bus builds an arm anew.
+
+    Args:
+        config: of the arm.
+        faults: to inject besides those of the configuration, counted from the first SYNC.
+        clock: the loop's; by default a new one.
+
+    Raises:
+        DriverError: as `LockStepArm`, or such an arm is there already.
+    """
+    if id(config) in _standing:
+        raise DriverError(f"{config.name}: its emulated arm is there already")
+    _standing[id(config)] = LockStepArm(config, faults, clock)
+    try:
+        yield _standing[id(config)]
+    finally:
+        del _standing[id(config)]
+
+
+# The arm whose further buses are about to be opened, and the configuration that they belong to.
+_begun: tuple[ArmConfig, LockStepArm] | None = None
+
+
+def from_config(config: ArmConfig, number: int) -> LockStepLink:
+    """Open a bus of emulated drives: the entry point `lock_step` of the group `ident_service.can_links`.
+
+    Args:
+        config: of the arm.
+        number: of the bus; the first one builds the arm, the others, opened after it, lead to the same one.
+
+    Raises:
+        DriverError: as `LockStepArm`, or buses that are not opened in their order.
+    """
+    global _begun
+    arm = _standing.get(id(config))
+    if arm is None:
+        if number == 0:
+            _begun = (config, LockStepArm(config))
+        if _begun is None or _begun[0] is not config:
+            raise DriverError(f"{config.name}: bus {number} was opened before bus 0")
+        arm = _begun[1]
+        if isinstance(config.driver, CanopenDriver) and number == len(config.driver.buses) - 1:
+            _begun = None
+    return arm.link(number)

@@ -1,0 +1,244 @@
+"""Run emulated drives on real interfaces, in real time, for `ident emulate`.
+
+The arm behind them goes on falling or braking when the host is gone. While it runs, lines on `commands` inject faults:
+a fault as `parse_fault` has it, `clear` to end all of them, `state` to be told everything again, `quit`.
+
+"""
+
+from __future__ import annotations
+
+import gc
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.clock import RealClock
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.schema import ArmConfig
+from ident_service.errors import DriverError
+from sim_backend.emulator.build import build_emulator
+from sim_backend.emulator.emulator import Emulator
+from sim_backend.emulator.faults import PuckFault, parse_fault
+from sim_backend.emulator.injection import Sent
+from sim_backend.emulator.lock_step import INTERFACE
+from sim_backend.emulator.station import Station
+from sim_backend.emulator.wires import INTERFACE as OUR_WIRE
+from sim_backend.emulator.wires import Wires
+
+_POLL_NS = 20_000_000  # commands, stop and states are looked at this often
+_POSITIONS = range(0x181, 0x200)  # TPDO1
+_GIVEN_UP = 0.9  # of a period after SYNC, when a host hardly waits for positions any more
+_AT_ONCE = 256  # frames handled before time is looked at again
+# Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
+_RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
+_RESTING_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class Emulated:
+    """Summarise an emulation.
+
+    Attributes:
+        seconds: its duration.
+        heard: frames received.
+        sent: frames sent.
+        unsent: frames that an interface did not take.
+        states: of the drives at the end, in words.
+        at_rest: whether the arm stood still.
+    """
+
+    seconds: float
+    heard: int
+    sent: int
+    unsent: int
+    states: tuple[str, ...]
+    at_rest: bool
+
+
+def emulate(
+    config: ArmConfig,
+    *,
+    faults: Sequence[str] = (),
+    seconds: float | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+    stop_requested: Callable[[], bool] = lambda: False,
+    commands: Callable[[], str | None] = lambda: None,
+) -> Emulated:
+    """Run the drives of an arm on its configured interfaces until told to stop.
+
+    Args:
+        config: of the arm.
+        faults: to inject besides those of the configuration, as people write them; they count from the first SYNC.
+        seconds: how long; None until asked to stop.
+        tell: called with a line whenever a drive changes its state, a fault comes or goes, or the arm comes to rest.
+        stop_requested: asked all the time.
+        commands: gives the next line of commands, None while there is none; never waits.
+
+    Returns:
+        The summary.
+
+    Raises:
+        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a malformed fault.
+    """
+    driver = config.driver
+    if isinstance(driver, CanopenDriver) and any(bus.interface == INTERFACE for bus in driver.buses):
+        raise DriverError(
+            f"{config.name}: {INTERFACE} drives live in the process that moves them; "
+            "name an interface such as socketcan, udp_multicast or ident_wire"
+        )
+    emulator = build_emulator(config)
+    emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
+    assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
+    ours = {bus.interface == OUR_WIRE for bus in driver.buses}
+    if len(ours) > 1:
+        raise DriverError(f"{config.name}: either all buses are {OUR_WIRE} or none is, for one loop to serve them")
+    station = Wires(driver.buses) if ours == {True} else Station(driver.buses)
+    try:
+        return _Run(emulator, station, tell, commands).until(seconds, stop_requested)
+    finally:
+        station.close()
+
+
+class _Run:
+    def __init__(
+        self,
+        emulator: Emulator,
+        station: Station | Wires,
+        tell: Callable[[str], None],
+        commands: Callable[[], str | None],
+    ) -> None:
+        self._emulator, self._station = emulator, station
+        self._stamps = isinstance(station, Wires)  # whether frames say when they were on the wire
+        self._given_up_ns = round(_GIVEN_UP * 1e9 * emulator.body.plant.period)
+        self._tell, self._commands = tell, commands
+        self._clock = RealClock()
+        self._later: list[tuple[int, int, Sent]] = []
+        self._heard = self._sent = 0
+        self._told: tuple[str, ...] = ("",) * len(emulator.faces)
+        self._faults: tuple[PuckFault, ...] = ()
+        self._rested = True
+        self._stirred_ns = 0
+        self._quit = False
+        self._streaming = False  # whether a host sends cycles
+
+    def until(self, seconds: float | None, stop_requested: Callable[[], bool]) -> Emulated:
+        emulator, clock = self._emulator, self._clock
+        begun = looked = heard_ns = clock.now_ns()
+        end = None if seconds is None else begun + round(seconds * 1e9)
+        # What has been built stays; the garbage collector need not scan it again in the middle of a cycle.
+        collecting = gc.isenabled()
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        emulator.power_up(begun)
+        try:
+            while not self._quit:
+                now = clock.now_ns()
+                if now - looked >= _POLL_NS:
+                    looked = now
+                    self._look(now)
+                    if stop_requested() or (end is not None and now >= end):
+                        break
+                heard = self._station.receive(self._patience(now, looked))
+                # Time goes on to when nothing waited any more, however late this process is.
+                now = clock.now_ns()
+                heard, at_once = heard or self._station.receive(0.0), 0
+                while heard is not None:
+                    at_once += 1
+                    bus, frame = heard
+                    # Drives act when a frame is on the wire, not when this process comes to it.
+                    at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
+                    self._pass_on(emulator.receive(bus, frame, at_ns), at_ns)
+                    now = clock.now_ns()
+                    heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
+                if at_once:
+                    self._heard += at_once
+                    heard_ns = clock.now_ns()
+                # What was due while frames waited comes after them: a drive's firmware would have had them in time.
+                self._pass_on(emulator.tick(now))
+                self._streaming = now - heard_ns < _POLL_NS
+                if self._streaming:
+                    emulator.go_on(now)
+        finally:
+            gc.unfreeze()
+            if collecting:
+                gc.enable()
+        now = clock.now_ns()
+        self._look(now)
+        return Emulated(
+            (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._resting(now)
+        )
+
+    def _patience(self, now_ns: int, looked_ns: int) -> float:
+        due = [looked_ns + _POLL_NS, *(item[0] for item in self._later[:1])]
+        if (deadline := self._emulator.next_deadline_ns) is not None:
+            due.append(deadline)
+        if self._streaming and (overdue := self._emulator.body.overdue_ns) is not None:
+            due.append(overdue)
+        return max(0, min(due) - now_ns) * 1e-9
+
+    def _pass_on(self, sent: Sequence[Sent], asked_ns: int | None = None) -> None:
+        """Send what is ready, the lowest identifiers first, as a bus would, but no position too late."""
+        now = self._clock.now_ns()
+        too_late = asked_ns is not None and now - asked_ns > self._given_up_ns
+        ready = []
+        for item in sent:
+            if too_late and item.frame.identifier in _POSITIONS:
+                continue  # a drive would have sent it in its own cycle; in this one it would be taken for its own
+            if item.ready_ns <= now:
+                ready.append(item)
+            else:
+                heapq.heappush(self._later, (item.ready_ns, id(item), item))
+        while self._later and self._later[0][0] <= now:
+            ready.append(heapq.heappop(self._later)[2])
+        if ready:
+            ready.sort(key=lambda item: item.frame.identifier)
+            self._station.send([(item.bus, item.frame) for item in ready])
+            self._sent += len(ready)
+
+    def _look(self, now_ns: int) -> None:
+        while (line := self._commands()) is not None:
+            self._obey(line.strip(), now_ns)
+        emulator = self._emulator
+        states = emulator.states
+        for drive, (state, told) in enumerate(zip(states, self._told, strict=True)):
+            if state != told:
+                self._tell(f"{emulator.names[drive]}, node {emulator.faces[drive].number}: {state}")
+        self._told = states
+        if emulator.active != self._faults:
+            self._faults = emulator.active
+            self._tell("faults: " + (", ".join(self._named(fault) for fault in emulator.active) or "none"))
+        if (resting := self._resting(now_ns)) != self._rested:
+            self._rested = resting
+            self._tell("the arm is at rest" if resting else "the arm moves")
+
+    def _named(self, fault: PuckFault) -> str:
+        return fault.kind if fault.drive is None else f"{fault.kind} of {self._emulator.names[fault.drive]}"
+
+    def _resting(self, now_ns: int) -> bool:
+        fastest = float(np.abs(self._emulator.body.plant.velocity).max())
+        if fastest > _RESTS:
+            self._stirred_ns = now_ns
+        if self._rested:
+            return fastest < _MOVES
+        return now_ns - self._stirred_ns > _RESTING_NS
+
+    def _obey(self, line: str, now_ns: int) -> None:
+        match line:
+            case "":
+                pass
+            case "quit":
+                self._quit = True
+            case "clear":
+                self._emulator.clear(now_ns)
+            case "state":
+                self._told = ("",) * len(self._told)
+            case _:
+                try:
+                    self._emulator.inject([parse_fault(line, self._emulator.names)], now_ns)
+                except DriverError as error:
+                    self._tell(f"not understood: {error}")
+        # A line must have had its effect before the next one is read.
+        self._pass_on(self._emulator.tick(now_ns))
