@@ -12,22 +12,22 @@ from benchmarks import canopen, estimation, real_data
 from benchmarks.harness import Row, median_seconds, table, write
 from ident_service.config.load import load_arm
 from ident_service.estimation.equations import equations
-from ident_service.estimation.feasible.feasibility import (
+from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import (
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
+from ident_service.model.pinocchio_models import pinocchio_model
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import pinocchio_model
-from ident_service.motion.factory import make_arm
-from ident_service.operations.commission import record_motion
-from ident_service.recordings.kept import KeptRecording
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.commissioning import record_motion
+from ident_service.recordings.cached_recording import KeptRecording
 from ident_service.recordings.open import open_recording
 from ident_service.results.parameter_file import parameters_document, write_parameters
 

@@ -24,7 +24,7 @@ from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.can.frame_log import SessionLog
 from drivers.can.python_can_link import PythonCanLink, open_bus
-from drivers.canopen.frame_bits import exact
+from drivers.canopen.bus_load import exact
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanBus
 from sim_backend.can_bus.host import LocalPort

@@ -27,18 +27,18 @@ from drivers.can.can_frame import Frame
 from drivers.can.python_can_link import PythonCanLink, open_bus
 from drivers.canopen.driver import CanopenArm
 from drivers.clock import RealClock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.factory import make_arm
-from ident_service.motion.histogram import Histogram
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.cycle_timing import Histogram
 from ident_service.motion.realtime import asked
-from ident_service.motion.reference import rest
+from ident_service.motion.trajectory import rest
 from sim_backend.emulator.build import build_emulator
 
 SECONDS = float(os.environ.get("IDENT_BENCH_CANOPEN_SECONDS", "60"))

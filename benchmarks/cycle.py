@@ -13,19 +13,19 @@ import numpy as np
 
 from benchmarks.harness import Row, table, write
 from drivers.arm import Sample
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
-from ident_service.excitation.plan import excitation
+from ident_service.config.motion_limits import motion_limits
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.contact import Contact
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.deadlines import Deadlines
-from ident_service.motion.guard import Guard
-from ident_service.motion.owed import owed_ways
-from ident_service.motion.reference import PathReference
+from ident_service.model.collision import Contact
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.cycle_timing import Deadlines
+from ident_service.motion.encoder_observer import owed_ways
+from ident_service.motion.safety_monitor import Guard
+from ident_service.motion.trajectory import PathReference
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.ring import RingWriter, create_ring
+from ident_service.recordings.ring_buffer import RingWriter, create_ring
 
 CYCLES = 20_000  # one period of the motion, which is played twice
 WARM_UP = 1_000

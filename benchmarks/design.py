@@ -18,27 +18,26 @@ import numpy as np
 
 from benchmarks.harness import Row, median_seconds, table, write
 from benchmarks.plain_search import PlainSearch
-from ident_service.config.design import Criterion
-from ident_service.config.limits import motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_design import Criterion
+from ident_service.config.motion_limits import motion_limits
 from ident_service.estimation.identify import identify
+from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import Designed, design_motion, family, settled
-from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.expectation import described_noise, expected_deviations, information
-from ident_service.excitation.path import FourierPath, PosturePath
-from ident_service.excitation.plan import excitation
-from ident_service.excitation.problem import Problem
-from ident_service.excitation.proof import objections
+from ident_service.excitation.limit_proof import objections
+from ident_service.excitation.motion_file import Excitation
+from ident_service.excitation.optimal_design import Problem, usable_limits
+from ident_service.excitation.prediction import described_noise, expected_deviations, information
 from ident_service.excitation.search import Budget
-from ident_service.excitation.task import usable_limits
+from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import BaseParameters, base_parameters
-from ident_service.model.threads import one_blas_thread
-from ident_service.motion.factory import make_arm
-from ident_service.operations.commission import record_motion
+from ident_service.model.base_parameters import BaseParameters, base_parameters
+from ident_service.model.blas_threads import one_blas_thread
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.commissioning import record_motion
+from ident_service.recordings.adapters import RangeRecording
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.part import RangeRecording
 
 _SEEDS = int(os.environ.get("IDENT_BENCH_SEEDS", "10"))
 _SECONDS = float(os.environ.get("IDENT_BENCH_SECONDS", "60"))

@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, median_seconds
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.estimation.equations import equations
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.information import information_of, supports
 from ident_service.model.regressor import joint_regressor
 from ident_service.recordings.recording import Block

@@ -18,10 +18,10 @@ import pinocchio as pin
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.dynamic_model import DynamicModel
-from ident_service.results.export.arm import IdentifiedArm
 from ident_service.results.export.c_header import c_header, c_prefix
+from ident_service.results.export.identified_arm import IdentifiedArm
 
 ARMS = ("planar2", "threelink", "sixaxis", "wam7_sim")
 _STATES, _REPEATS = 1000, 41

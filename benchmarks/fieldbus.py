@@ -13,13 +13,13 @@ import numpy as np
 
 from benchmarks.harness import Row, table, write
 from drivers.can.can_frame import Frame
-from drivers.canopen.frame_bits import exact
+from drivers.canopen.bus_load import exact
 from drivers.canopen.motor_units import coordinates, unwrapped
 from drivers.canopen.pdo_codec import BusCodec
 from drivers.canopen.pdo_mapping import bus_profiles
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 
 CYCLES, WARM_UP = 20_000, 1_000
 

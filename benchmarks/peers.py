@@ -26,9 +26,9 @@ import pinocchio as pin
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.rigid_body import pinocchio_model
+from ident_service.model.pinocchio_models import pinocchio_model
 from ident_service.model.urdf import urdf_text
-from ident_service.operations.score import true_parameters
+from ident_service.operations.commissioning import true_parameters
 
 TURNS = int(os.environ.get("IDENT_BENCH_TURNS", "3"))
 ROWS, RATE = 62_500, 1000.0

@@ -15,14 +15,13 @@ import numpy as np
 import pinocchio as pin
 from scipy.optimize import minimize
 
-from ident_service.config.design import Design
-from ident_service.config.limits import MotionLimits
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import FourierPath
+from ident_service.config.motion_design import Design
+from ident_service.config.motion_limits import MotionLimits
+from ident_service.excitation.trajectory import FourierPath, FourierSeries
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import CollisionModel
+from ident_service.model.pinocchio_models import pinocchio_model
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import pinocchio_model
 
 _SAMPLES = 100
 _RANDOM = 100  # motions, of which the best is improved

@@ -12,13 +12,13 @@ from time import process_time
 import numpy as np
 
 from benchmarks.harness import Row
+from ident_service.config.arm import Method, PriorPull
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import Method, PriorPull
 from ident_service.errors import ParameterError
 from ident_service.estimation.identify import Candidate, Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.cached_recording import KeptRecording
 from ident_service.recordings.open import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -48,7 +48,7 @@ def case_model(case: Case) -> ArmModel:
     model = arm_model(load_arm(case.arm))
     if case.urdf is None:
         return model
-    from ident_service.model.rigid_body import read_urdf
+    from ident_service.model.pinocchio_models import read_urdf
 
     text = (DATA / case.folder / case.urdf).read_text(encoding="utf-8")
     chain, inertias = read_urdf(TextFile(name=case.urdf, text=text), model.config.gravity)

@@ -23,7 +23,7 @@ import yaml
 
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.operations.arm_state import fault_file
+from ident_service.registry.state_folder import fault_file
 
 TRIES = 10
 TARGET = "0.9"

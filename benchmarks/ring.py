@@ -14,9 +14,9 @@ import numpy as np
 
 from benchmarks.harness import Row, table, write
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_file import McapRecording
-from ident_service.recordings.recorder_process import RecorderProcess
-from ident_service.recordings.ring import RingReader, RingWriter, create_ring
+from ident_service.recordings.mcap_reader import McapRecording
+from ident_service.recordings.recorder import RecorderProcess
+from ident_service.recordings.ring_buffer import RingReader, RingWriter, create_ring
 
 _JOINTS = 7
 _SECONDS = float(os.environ.get("IDENT_BENCH_RING_SECONDS", "60"))

@@ -13,10 +13,10 @@ from typing import Any
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.factory import make_arm
-from ident_service.operations.run import run_motion
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.motion_run import run_motion
 from ident_service.preflight.preflight import preflight
 from ident_service.recordings.open import open_recording
 

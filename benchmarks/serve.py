@@ -23,7 +23,7 @@ from pathlib import Path
 
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import load_arm
-from ident_service.operations.commission import simulate
+from ident_service.operations.commissioning import simulate
 from ident_service.registry import jobs
 from ident_service.registry.arms import know_shipped
 from ident_service.registry.database import Database

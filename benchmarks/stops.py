@@ -35,9 +35,9 @@ from urllib.parse import urlsplit
 
 from benchmarks.harness import Row, table, write
 from ident_service.config.load import shipped_arms
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.database import FILE
+from ident_service.registry.state_folder import control_path
 
 ROUNDS = int(os.environ.get("IDENT_BENCH_ROUNDS", "20"))
 CLIENTS, VIEWERS, HALF_OPEN, DESCRIPTORS = 10, 40, 1000, 1024

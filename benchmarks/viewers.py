@@ -30,7 +30,7 @@ import numpy as np
 from benchmarks.harness import Row, table, write
 from ident_service.client import IdentClient
 from ident_service.errors import MotionRefused
-from ident_service.recordings.cycles import read_cycles
+from ident_service.recordings.mcap_reader import read_cycles
 
 PAIRS = int(os.environ.get("IDENT_BENCH_PAIRS", "5"))
 RATE = int(os.environ.get("IDENT_BENCH_RATE", "200"))

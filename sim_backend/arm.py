@@ -16,18 +16,15 @@ from collections.abc import Callable, Sequence
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.clock import Clock, RealClock, VirtualClock
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend.build import build_machine
-from sim_backend.door import checked_torque, description
 from sim_backend.faults import Fault
-from sim_backend.imperfections import Imperfections
-from sim_backend.machine import Machine, Stand
+from sim_backend.machine import Machine, Schedule, Stand, checked_torque, description
 from sim_backend.machine import Truth as Truth
-from sim_backend.plant import Plant
+from sim_backend.plant import Imperfections, Plant
 from sim_backend.remote_arm import RemoteArm
-from sim_backend.schedule import Schedule
 
 
 class SimulatedArm(Arm):

@@ -11,15 +11,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.arm import Vector
+from ident_service.config.arm import ArmConfig
 from ident_service.config.quantities import PerJoint
-from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model, with_payload
 from sim_backend.faults import Fault, configured_faults
-from sim_backend.imperfections import Imperfections
 from sim_backend.machine import Machine, Stand
-from sim_backend.plant import Plant
+from sim_backend.plant import Imperfections, Plant
 
 # Where limits do not state a drive's strength, its shorted windings stop the joint in about this time [s].
 _BRAKING_TIME = 0.1

@@ -1,7 +1,7 @@
 """Define faults to inject into the simulated arm, so that supervision of a motion can be tested.
 
 `FAULT_RULES` says in words what each kind does. What it does to readings is the table `_SHOWN` here, to drives
-`drives.py`, to the body `machine.py`, to time `schedule.py`.
+`machine.py`, to the body `machine.py`, to time `machine.py`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,9 @@
-"""Simulate the arm's body: rigid links, drive inertia, viscous and dry friction, stepped at a fixed period.
+"""Simulate the arm's body: rigid links, drive inertia, friction that sticks, encoder steps and noise.
+
+Find `v` with `A v + lambda = b` and `lambda_i` in `bound_i Sgn(v_i)`, where Sgn is set-valued: a sliding joint feels
+its whole friction against its motion, and a joint at rest whatever keeps it at rest, up to its bound (Moreau 1988,
+Stewart & Trinkle 1996). `A` is symmetric positive definite, so `v` is the one minimum of the strictly convex
+`v^T A v / 2 - b^T v + sum bound_i |v_i|`.
 
 `M(q) ddq + c(q, dq) + g(q) + fo + fv dq + lambda = tau` with `lambda_i` in `fc_i Sgn(dq_i)` (eqs. 1, 27). One step
 takes a constant torque (zero-order hold) and everything smooth at the predicted midpoint, viscous friction
@@ -18,16 +23,168 @@ mass that moves with the last link, on which it appears without an impact.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
+from drivers.arm import Flags
 from ident_service.errors import DriverError, ModelError
 from ident_service.model.chain import Array, Chain
-from ident_service.model.layout import Layout
-from ident_service.model.rigid_body import InverseDynamics, pinocchio_model
-from sim_backend.friction import stick_slip_velocity
+from ident_service.model.parameter_layout import Layout
+from ident_service.model.pinocchio_models import InverseDynamics, pinocchio_model
+
+Vector = NDArray[np.float64]
+
+# Rounding must not tell a joint at the very edge of its friction cone to creep.
+_EDGE = 1e-14
+_PIVOTS = 20
+_SWEEPS = 20
+_ROUNDS = 500
+
+
+def stick_slip_velocity(A: Vector, b: Vector, bound: Vector, guess: Vector) -> Vector:
+    """Solve for the velocities; joints that stick come back with exactly 0.
+
+    Args:
+        A: symmetric positive definite, shape (joints, joints).
+        b: shape (joints,).
+        bound: largest friction in the units of b, not negative, shape (joints,).
+        guess: a velocity whose signs are probably right, 0 for joints that probably stick, shape (joints,).
+
+    Returns:
+        The velocities, shape (joints,).
+    """
+    slack = _EDGE * float((np.abs(b) + bound).max())
+    v, consistent = _pivot(A, b, bound, np.sign(guess), slack)
+    if consistent:
+        return v
+    # Pivoting several joints at once can go in circles; sweeping over them one by one only ever descends.
+    for _ in range(_ROUNDS):
+        v = _sweep(A, b, bound, v)
+        exact, consistent = _pivot(A, b, bound, np.sign(v), slack, pivots=1)
+        if consistent:
+            return exact
+    return v
+
+
+def _pivot(
+    A: Vector, b: Vector, bound: Vector, mode: Vector, slack: float, pivots: int = _PIVOTS
+) -> tuple[Vector, bool]:
+    """Solve with each joint's mode (-1, 0, 1) assumed, correct the modes, and repeat.
+
+    Returns:
+        The last solution, and whether its modes are the right ones.
+    """
+    dry, edge = bound > 0.0, bound + slack
+    v = np.zeros_like(b)
+    for _ in range(pivots):
+        sliding = (mode != 0.0) | ~dry
+        v = _with_modes(A, b - bound * mode, sliding)
+        wrong_way = sliding & dry & (v * mode <= 0.0)
+        holding = b - A @ v
+        torn_loose = ~sliding & (np.abs(holding) > edge)
+        if not (wrong_way | torn_loose).any():
+            return v, True
+        mode = np.where(torn_loose, np.sign(holding), mode * ~wrong_way)
+    return v, False
+
+
+def _with_modes(A: Vector, b: Vector, sliding: NDArray[np.bool_]) -> Vector:
+    if not sliding.any():
+        return np.zeros_like(b)
+    # Unit rows in place of the sticking joints' are cheaper than cutting the others out.
+    held = A * (sliding[:, None] & sliding)
+    held.flat[:: len(b) + 1] += ~sliding
+    v = np.asarray(np.linalg.solve(held, b * sliding))
+    v[~sliding] = 0.0
+    return v
+
+
+def _sweep(A: Vector, b: Vector, bound: Vector, start: Vector) -> Vector:
+    """Minimise by projected Gauss-Seidel: each joint in turn to its own minimum, the others held."""
+    rows, v = A.tolist(), start.tolist()
+    for _ in range(_SWEEPS):
+        for i, (row, force, limit) in enumerate(zip(rows, b.tolist(), bound.tolist(), strict=True)):
+            pull = force - sum(a * w for a, w in zip(row, v, strict=True)) + row[i] * v[i]
+            v[i] = 0.0 if abs(pull) <= limit else (pull - (limit if pull > 0.0 else -limit)) / row[i]
+    return np.array(v)
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Hold the imperfections per joint, all of shape (joints,).
+
+    Attributes:
+        encoder_resolution: step of the position [rad or m]; 0 where continuous.
+        torque_resolution: step of the torque [N m or N]; 0 where continuous.
+        torque_noise: standard deviation per cycle of what acts besides the torque [N m or N].
+        torque_limit: clip of the driver [N m or N]; infinite where there is none.
+    """
+
+    encoder_resolution: Vector
+    torque_resolution: Vector
+    torque_noise: Vector
+    torque_limit: Vector
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = np.array(getattr(self, field.name), dtype=float)
+            if value.shape != self.torque_limit.shape or not (value >= 0.0).all():
+                raise DriverError(
+                    f"{field.name} must be {self.torque_limit.shape[0]} numbers, none negative, is {value}"
+                )
+            value.setflags(write=False)
+            object.__setattr__(self, field.name, value)
+
+    @classmethod
+    def none(cls, joints: int) -> Imperfections:
+        """Return the imperfections of a perfect arm: continuous, without noise, unlimited."""
+        return cls(np.zeros(joints), np.zeros(joints), np.zeros(joints), np.full(joints, np.inf))
+
+    def encode(self, position: Vector) -> Vector:
+        """Return the position that encoders show, a new array of shape (joints,)."""
+        return _in_steps(position, self._encoder_steps)
+
+    def drive(self, torque: Vector) -> Vector:
+        """Return the torque that drives give for a request, a new array of shape (joints,)."""
+        least, most = self._range
+        return np.asarray(np.minimum(np.maximum(_in_steps(torque, self._torque_steps), least), most))
+
+    @cached_property
+    def _encoder_steps(self) -> _Steps:
+        return _steps(self.encoder_resolution)
+
+    @cached_property
+    def _torque_steps(self) -> _Steps:
+        return _steps(self.torque_resolution)
+
+    @cached_property
+    def _range(self) -> tuple[Vector, Vector]:
+        """Return the largest whole steps inside the limits, because rounding could lead out of them again."""
+        step, limit = self.torque_resolution, self.torque_limit
+        whole = np.where(step > 0.0, step, 1.0)
+        # A limit that is a whole number of steps must stay one when their quotient is rounded down.
+        reach = np.where(step > 0.0, np.floor(limit / whole * (1.0 + 1e-12)) * whole, limit)
+        return -reach, reach
+
+
+# Which values have steps, None where all have; and the steps, 1 where a value is continuous.
+_Steps = tuple[Flags | None, Vector]
+
+
+def _steps(step: Vector) -> _Steps:
+    stepped = step > 0.0
+    return None if stepped.all() else stepped, np.where(stepped, step, 1.0)
+
+
+def _in_steps(value: Vector, steps: _Steps) -> Vector:
+    stepped, step = steps
+    whole: Vector = np.rint(value / step) * step
+    return whole if stepped is None else np.where(stepped, whole, value)
+
 
 Load = tuple[float, tuple[float, float, float]]
 

@@ -19,9 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from drivers.can.can_frame import Frame
+from drivers.can.can_frame import Frame, pack_frames
 from drivers.can.can_link import Link
-from drivers.can.kernel_frame import pack_frames
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 

@@ -19,8 +19,7 @@ from typing import IO, Any, Final, Protocol, cast
 import can
 from can.io.canutils import CanutilsLogWriter
 
-from drivers.can.can_frame import Frame
-from drivers.can.kernel_frame import ERROR, MAX_PACKET_BYTES, unpack_frames
+from drivers.can.can_frame import ERROR, MAX_PACKET_BYTES, Frame, unpack_frames
 from ident_service.errors import DriverError
 
 _WINDOW_NS: Final = 500_000_000

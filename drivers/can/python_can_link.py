@@ -19,14 +19,12 @@ from typing import Any
 
 import can
 
-from drivers.can.bus_errors import BusError, BusOffWatch, Kind, kind_of
-from drivers.can.can_frame import Frame
-from drivers.can.kernel_interface import check_interface
-from drivers.can.receive_filter import HEARD, MOST_AT_ONCE
-from drivers.can.sendable import check_sendable
+from drivers.can.bus_state import BusError, BusOffWatch, Kind, kind_of
+from drivers.can.can_frame import HEARD, MOST_AT_ONCE, Frame, check_sendable
+from drivers.can.socketcan_link import check_interface
 from drivers.clock import RealClock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus, CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 
 _OURS = ("interface", "channel", "bitrate", "data_bitrate", "fd", "receive_own_messages", "can_filters")

@@ -1,4 +1,4 @@
-"""Implement a Link on a CAN socket of the kernel (interface `raw`, Documentation/networking/can.rst).
+"""Use a CAN socket of the kernel without python-can (interface `raw`), and ask the kernel about its interfaces.
 
 One system call a frame. Stamps are the kernel's, taken when the frame arrived, turned from wall-clock to monotonic time
 by their age. Frames that the kernel dropped are reported as an error frame of receive overflow.
@@ -6,6 +6,8 @@ by their age. Frames that the kernel dropped are reported as an error frame of r
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import select
 import socket
@@ -15,16 +17,47 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 
-from drivers.can.bus_errors import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
-from drivers.can.can_frame import Frame
-from drivers.can.kernel_frame import EXTENDED, FD_BYTES, from_kernel, to_kernel
-from drivers.can.kernel_interface import AF_CAN, CAN_RAW, check_interface
-from drivers.can.receive_filter import HEARD, MOST_AT_ONCE
-from drivers.can.sendable import check_sendable
+from drivers.can.bus_state import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
+from drivers.can.can_frame import EXTENDED, FD_BYTES, HEARD, MOST_AT_ONCE, Frame, check_sendable, from_kernel, to_kernel
 from drivers.clock import RealClock
-from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
+from ident_service.config.canopen import CanBus, CanopenDriver
 from ident_service.errors import DriverError
+
+# Values of the kernel's headers; Python defines the CAN ones only where it was built with them.
+AF_CAN, CAN_RAW = 29, 1
+_SIOCGIFMTU = 0x8921
+_REQUEST, _LONGEST_NAME = struct.Struct("16si20x"), 15  # struct ifreq, IFNAMSIZ less its zero
+
+
+def check_interface(bus: CanBus) -> None:
+    """Refuse an interface whose defect would show late: python-can would leave a socket open, CAN FD fail in a cycle.
+
+    Where the kernel has no CAN sockets nothing is refused; opening says so.
+
+    Raises:
+        BusError: no such interface, or a data bit rate is configured for one that is set up for classic frames.
+    """
+    try:
+        largest = _largest_packet(bus.channel)
+    except OSError as error:
+        if error.errno == errno.ENODEV:
+            raise BusError("absent", bus.channel, bus.bitrate, f"{bus.interface}: {error.strerror}") from None
+        return
+    if bus.data_bitrate is not None and largest < FD_BYTES:
+        remedy = (
+            f"carries no CAN FD: `ip link set {bus.channel} up type can bitrate {bus.bitrate}"
+            f" dbitrate {bus.data_bitrate} fd on`, or leave data_bitrate out"
+        )
+        raise BusError("refused", bus.channel, remedy=remedy)
+
+
+def _largest_packet(channel: str) -> int:
+    """Return the largest packet of an interface [bytes]; raises OSError where the kernel does not say."""
+    with socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW) as sock:
+        request = _REQUEST.pack(channel.encode()[:_LONGEST_NAME], 0)
+        return int(_REQUEST.unpack(fcntl.ioctl(sock, _SIOCGIFMTU, request))[1])
+
 
 # Values of the kernel's headers; Python defines the CAN ones only where it was built with them.
 _SOL_CAN_RAW = 101

@@ -1,4 +1,4 @@
-"""Observe an arm of CANopen drives without commanding it: SDO uploads and received frames, nothing else.
+"""Look at CANopen drives without commanding them, and hear what others say on their buses.
 
 No NMT command, no SYNC, no PDO, no write, no heartbeat leaves the host, so that drives stay in whatever state they are,
 pre-operational or operational, with their watchdogs as they were. Each cycle asks all drives for position (6064h),
@@ -9,7 +9,7 @@ shown as such.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -17,22 +17,89 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.axis_status import AxisStatus
-from drivers.can.bus_lock import BusLock
 from drivers.can.can_frame import Frame
-from drivers.can.can_link import Link
+from drivers.can.can_link import BusLock, Link
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_listener import Overheard
-from drivers.canopen.cia402 import axis_status, drive_words, joint_status
+from drivers.canopen.bus_load import worst
+from drivers.canopen.cia402 import NmtState, axis_status, drive_words, joint_status, nmt_words
 from drivers.canopen.drive_setup import identify
-from drivers.canopen.frame_bits import worst
 from drivers.canopen.motor_units import coordinates, unwrapped
-from drivers.canopen.polling import Answers, Place, poll
-from drivers.canopen.sdo import TIMEOUT, Objects
+from drivers.canopen.pdo_mapping import HEARTBEAT, SDO_REPLY, SYNC
+from drivers.canopen.sdo import TIMEOUT, Answers, Objects, Place, poll
 from drivers.canopen.stored_zero import zeros_of
 from drivers.clock import Clock, RealClock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
+
+LONGER = 1.2  # times a heartbeat's period, in which one must come
+
+
+class Overheard:
+    """Listen on every bus of an arm.
+
+    Attributes:
+        nmt: state of each node's last heartbeat, and when it came [ns of the links' clock].
+        booted: nodes whose last heartbeat was a boot-up message, which makes them pre-operational.
+        restarted: nodes that sent a boot-up message since this was last cleared.
+        answered: nodes that sent an SDO reply for which no request waited.
+        streaming: buses on which another host sends SYNC.
+    """
+
+    def __init__(self) -> None:
+        self.nmt: dict[Place, tuple[int, int]] = {}
+        self.booted: set[Place] = set()
+        self.restarted: set[Place] = set()
+        self.answered: set[Place] = set()
+        self.streaming: set[int] = set()
+
+    def take(self, bus: int, frame: Frame) -> None:
+        """Process one received frame of any kind."""
+        if frame.error or frame.remote or frame.extended:
+            return
+        node = frame.identifier - HEARTBEAT
+        if frame.identifier == SYNC:
+            self.streaming.add(bus)
+        elif 1 <= node <= 127 and len(frame.data) == 1:
+            state = frame.data[0] & 0x7F  # bit 7 belongs to node guarding
+            self.booted.discard((bus, node))
+            if state == NmtState.BOOT_UP:
+                self.booted.add((bus, node))
+                self.restarted.add((bus, node))
+                state = NmtState.PRE_OPERATIONAL
+            self.nmt[bus, node] = state, frame.stamp_ns
+        elif 1 <= frame.identifier - SDO_REPLY <= 127:
+            self.answered.add((bus, frame.identifier - SDO_REPLY))
+
+    def listen(self, links: Sequence[Link], period: float) -> None:
+        """Listen long enough for every heartbeat of this period [s]; raises DriverError when a bus is gone."""
+        until_ns = links[0].clock.now_ns() + round(LONGER * period * 1e9)
+        for bus, link in enumerate(links):
+            while (frame := link.receive(until_ns)) is not None:
+                self.take(bus, frame)
+
+    def drain(self, links: Sequence[Link]) -> None:
+        """Process the frames that wait; raises DriverError when a bus is gone."""
+        for bus, link in enumerate(links):
+            for frame in link.drain():
+                self.take(bus, frame)
+
+    def nmt_words(self, place: Place, now_ns: int, patience_ns: int) -> str:
+        """Describe a node's NMT state for people, as of now.
+
+        Args:
+            place: bus and node.
+            now_ns: of the links' clock.
+            patience_ns: after which a heartbeat that was there is missed [ns].
+        """
+        if place not in self.nmt:
+            return "sends no heartbeat"
+        state, stamp_ns = self.nmt[place]
+        if place in self.booted:
+            return f"{nmt_words(state)} since it booted"
+        words = nmt_words(state)
+        return f"{words}, heartbeat missing" if now_ns - stamp_ns > patience_ns else words
+
 
 RATE = 20.0  # Hz
 SHARE = 0.25  # of the bus in the worst case; below, the rate is lower

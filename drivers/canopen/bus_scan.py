@@ -11,19 +11,17 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from drivers.can.bus_errors import BusError
-from drivers.can.bus_lock import BusLock
+from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
-from drivers.can.can_link import Link, open_links
+from drivers.can.can_link import BusLock, Link, open_links
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_listener import Overheard
+from drivers.canopen.bus_load import worst
+from drivers.canopen.bus_monitor import Overheard
 from drivers.canopen.capabilities import DRIVE_PROFILE
 from drivers.canopen.drive_setup import IDENTITY
-from drivers.canopen.frame_bits import worst
-from drivers.canopen.polling import BURST, Place, poll
-from drivers.canopen.sdo import DOES_NOT_EXIST, TIMEOUT, Objects, SdoRefused
+from drivers.canopen.sdo import BURST, DOES_NOT_EXIST, TIMEOUT, Objects, Place, SdoRefused, poll
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 
 T = TypeVar("T")

@@ -1,25 +1,59 @@
-"""Compare what a drive can do with what this driver needs, by SDO uploads or by its data sheet.
+"""Judge what a drive can against what this driver needs, by its family and by SDO uploads.
 
 A drive's answer counts before its family (`profiles/`), the family before the file. What is indispensable and missing
 is a problem, with the object and the reason; what is optional and missing is noted with what happens instead. Of
-alternatives the first of the family's list is taken. Whether an entry can be written shows when `drive_setup.py` writes it.
+alternatives the first of the family's list is taken. Whether an entry can be written shows when `drive_setup.py` writes
+it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 
-from drivers.can.bus_errors import BusError
+from drivers.can.bus_state import BusError
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.families import entry_of, family_of
-from drivers.canopen.object_dictionary import Entry, pdo_entry
+from drivers.canopen.object_dictionary import Entry, Kind, pdo_entry
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
-from ident_service.config.canopen import CanopenDrive, CanopenDriver
+from ident_service.config.canopen import CanopenDrive, CanopenDriver, WatchdogKind
+from ident_service.config.drive_family import Family, TorqueLimit, TorquePath, family_from
 from ident_service.config.eds import DataSheet
-from ident_service.config.family import Family, TorqueLimit, TorquePath
-from ident_service.config.watchdogs import WatchdogKind
 from ident_service.errors import DriverError
+
+_FOLDER = Path(__file__).parent / "profiles"
+GENERIC = "generic402"
+
+
+@lru_cache(maxsize=1)
+def shipped_families() -> tuple[Family, ...]:
+    """Return the families that come with the driver, the generic one last."""
+    files = sorted(_FOLDER.glob("*.yaml"), key=lambda path: (path.stem == GENERIC, path.stem))
+    return tuple(family_from(path.name, path.read_text(encoding="utf-8")) for path in files)
+
+
+def family_of(identity: Mapping[str, int], own: Sequence[Family] = ()) -> Family:
+    """Return the family of a drive, with what it leaves open as in `generic402`.
+
+    Args:
+        identity: values of 1018h, by the keys `vendor` and `product`.
+        own: families of the arm's description, which count before the shipped ones.
+    """
+    vendor, product = identity.get("vendor"), identity.get("product")
+    *shipped, generic = shipped_families()
+    makers = [one for one in (*own, *shipped) if one.match.vendor is not None and one.match.vendor == vendor]
+    exact = [one for one in makers if product in one.match.product]
+    found = [*exact, *(one for one in makers if not one.match.product)]
+    return found[0].over(generic) if found else generic
+
+
+def entry_of(text: str, name: str, unit: str = "") -> Entry:
+    """Return an entry that a family names, such as `6071:0/i16`."""
+    where, kind = text.split("/")
+    index, sub = where.split(":")
+    return Entry(int(index, 16), int(sub, 16), Kind[kind.upper()], name, unit)
+
 
 DRIVE_PROFILE = 402  # low word of 1000h
 TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}

@@ -1,4 +1,7 @@
-"""Configure drives before anything moves: check their identity, their own protection, the frames they exchange.
+"""Configure drives before anything moves: who each must be, what it must have, its PDOs; only differences are written.
+
+All that differ are switched off before one of them is written, so that no two share a COB-ID even for a moment. Some
+drives have fixed COB-IDs, which must then be the wanted ones. Two dummies of 8 bits take the room of one of 16.
 
 Everything is compared first, written where it differs, and read back (FIELDBUS.md 2.5; DRIVES.md 2 and 4). What a drive
 lacks of it was judged before (`capabilities.py`): what is indispensable has been refused, what may be missing is left
@@ -15,15 +18,14 @@ import numpy as np
 
 from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, where
+from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, entry_of, where
 from drivers.canopen.cia402 import POWER_OFF, state_of
-from drivers.canopen.families import entry_of
 from drivers.canopen.motor_units import Coordinates, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
-from drivers.canopen.pdo_setup import configure_pdos
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, NotHeld, Objects, SdoRefused, optional
 from drivers.canopen.stored_zero import Zeros
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import (
     CanopenDrive,
     CanopenDriver,
@@ -32,9 +34,110 @@ from ident_service.config.canopen import (
     motor_speeds,
     quick_stop_decelerations,
 )
-from ident_service.config.family import TorquePath
-from ident_service.config.schema import ArmConfig
+from ident_service.config.drive_family import TorquePath
 from ident_service.errors import AnotherDrive, DriverError
+
+_SMALL = {0x0002: Kind.I8, 0x0005: Kind.U8}
+_DUMMIES = {0x0003: Kind.I16, 0x0006: Kind.U16} | _SMALL
+_NOT_VALID = 1 << 31
+
+
+def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo], dummies: Sequence[int]) -> None:
+    """Configure a pre-operational drive's PDOs.
+
+    Args:
+        objects: of the drive.
+        pdos: that it shall have; slots of other drives are `od.DUMMY_INT16`.
+        unused: that it shall not have; they may be missing.
+        dummies: indices of dummies that may take the room of others' slots, in the order in which they are tried.
+
+    Raises:
+        SdoRefused: it does not take one of them.
+        DriverError: it does not answer, or forgets something.
+    """
+    for pdo in unused:
+        optional(lambda one: _off(objects, one), pdo)
+    variants = {pdo: _variants(pdo, dummies) for pdo in pdos}
+    waiting = [pdo for pdo in pdos if not any(_is_there(objects, one) for one in variants[pdo])]
+    for pdo in waiting:
+        _off(objects, pdo)
+    for pdo in waiting:
+        _map(objects, variants[pdo])
+        for write in pdo.parameters:
+            if write.entry.sub == od.TPDO_INHIBIT.sub:
+                objects.ensure_if_there(write)
+            else:
+                objects.ensure(write)
+        try:
+            objects.ensure(pdo.on)
+        except SdoRefused as refused:
+            if refused.code not in READ_ONLY:
+                raise
+            words = "where COB-IDs are fixed, driver.torque_frames must be single"
+            raise SdoRefused(f"{refused}; {words}", refused.code) from None
+    for pdo in pdos:
+        if not pdo.sent and not pdo.timer:
+            objects.ensure_if_there(
+                pdo.timing
+            )  # a deadline left by another host could report a silence where there is none
+
+
+def _variants(pdo: Pdo, dummies: Sequence[int]) -> list[Pdo]:
+    """Return a PDO with each kind of dummy in the slots of other drives."""
+    if od.DUMMY_INT16 not in pdo.slots:
+        return [pdo]
+    return [
+        replace(pdo, slots=tuple(one for slot in pdo.slots for one in _room(slot, index)))
+        for index in dummies or (od.DUMMY_INT16.index,)
+    ]
+
+
+def _room(slot: Entry, index: int) -> tuple[Entry, ...]:
+    if slot != od.DUMMY_INT16:
+        return (slot,)
+    return (Entry(index, 0, _DUMMIES[index], "dummy"),) * (2 if index in _SMALL else 1)
+
+
+def _is_there(objects: Objects, pdo: Pdo) -> bool:
+    return _is_mapped(objects, pdo) and all(
+        optional(objects.holds, write) is not False for write in (*pdo.parameters, pdo.on)
+    )
+
+
+def _is_mapped(objects: Objects, pdo: Pdo) -> bool:
+    _, *slots, count = pdo.mapping
+    return objects.holds(count) and all(objects.holds(slot) for slot in slots)
+
+
+def _off(objects: Objects, pdo: Pdo) -> None:
+    if objects.read(pdo.off.entry) & _NOT_VALID:
+        return
+    try:
+        objects.set(pdo.off)
+    except SdoRefused as refused:
+        if refused.code not in READ_ONLY:
+            raise
+        objects.ensure(pdo.mapping[0])  # what cannot be switched off exists by what it maps
+
+
+def _map(objects: Objects, variants: Sequence[Pdo]) -> None:
+    """Map the first variant of a PDO that the drive takes."""
+    refusals = []
+    for pdo in variants:
+        if _is_mapped(objects, pdo):
+            return
+        try:
+            for write in pdo.mapping:
+                objects.set(write)
+        except SdoRefused as refused:
+            refusals.append(refused)
+        else:
+            return
+    why = refusals[0]
+    if len(variants[0].slots) == 1:
+        raise why
+    raise SdoRefused(f"{why}; where it takes no dummy, driver.torque_frames must be single", why.code)
+
 
 LIMIT_SLACK = 0.05  # rad or m by which the drives' position limits exceed the joints'
 _FIRMWARE = 0x100A
@@ -292,7 +395,7 @@ def _mode_entry(text: str) -> Entry:
 def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
     """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
 
-    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed (`stored_zero.py`) it
+    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed it
     confirms afterwards too, and nothing else: one that restarted in the session has lost its zero.
 
     Args:

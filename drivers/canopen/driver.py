@@ -1,5 +1,12 @@
 """Drive an arm of CANopen drives in cyclic synchronous torque mode.
 
+A transmit queue that is full for a moment, or one bus of two that has failed, must not lose the stop of any drive. The
+drives' own deadline for torque frames comes before the last try, so that nobody waits for this.
+
+A drive's torque follows its command within a millisecond or two, and many drives average what they report over some
+more. So a measured torque is compared with all that the drive was told within the last `WINDOW`. Only what lies outside
+of that, in two reports in a row, is a difference.
+
 A sample is stamped when SYNC was sent, at which the torque that was handed over began to act and all positions were
 taken.
 
@@ -9,7 +16,7 @@ drive that missed them would rightly report it. `close` takes the drives back to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,15 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
-from drivers.axis_status import AxisStatus
-from drivers.can.bus_lock import BusLock
-from drivers.can.can_link import Link, open_links
+from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
+from drivers.can.bus_state import HOST, Event, EventCode
+from drivers.can.can_link import BusLock, Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links, require_format
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.axis_events import Reports
 from drivers.canopen.bus_monitor import LookingArm
 from drivers.canopen.capabilities import required
-from drivers.canopen.cia402 import NmtCommand, joint_status
+from drivers.canopen.cia402 import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, joint_status
 from drivers.canopen.drive_setup import (
     Setup,
     configure,
@@ -36,20 +42,231 @@ from drivers.canopen.drive_setup import (
     released,
     watchdogs_of,
 )
-from drivers.canopen.enabling import Enabling, Resetting, hold
 from drivers.canopen.homing import ZeroingArm
-from drivers.canopen.measured import MeasuredTorque
 from drivers.canopen.motor_units import Coordinates, coordinates, unwrapped
-from drivers.canopen.pdo_codec import Drive, Emergency
+from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
-from drivers.canopen.stopping import StopCommand
 from drivers.canopen.stored_zero import zeros_of
-from drivers.canopen.sync_cycle import Buses
+from drivers.canopen.sync_cycle import Buses, Enabling, Resetting, hold
 from drivers.clock import Clock, RealClock, VirtualClock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
+
+_TRIES, _AGAIN = 75, 0.001  # s between them
+_BRAKING = 1.0  # s that drives may take for a quick stop before the arm is left to them
+_FAREWELL = 5  # cycles after the last control words, in which drives report that they are off
+_ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
+
+
+class StopCommand:
+    """Hold the last stop command, and the drives that it could not be sent to yet; no method raises.
+
+    Attributes:
+        braking: whether it is a quick stop.
+    """
+
+    def __init__(self) -> None:
+        self.braking = False
+        self._untold: list[int] = []
+
+    def give(self, buses: Buses, kind: StopKind) -> None:
+        """Send the stop to every drive; for 75 ms again to those whose link has not taken it."""
+        self.braking = kind is StopKind.QUICK_STOP
+        self._untold = list(range(len(buses.drives)))
+        for _ in range(_TRIES):
+            self.repeat(buses)
+            if not self._untold:
+                break
+            with suppress(Exception):
+                buses.clock.sleep_until_ns(buses.clock.now_ns() + round(_AGAIN * 1e9))
+
+    def repeat(self, buses: Buses) -> None:
+        """Send the stop once more to the drives whose link has not taken it."""
+        word, drives, self._untold = QUICK_STOP if self.braking else DISABLE_VOLTAGE, self._untold, []
+        for number in drives:
+            try:
+                buses.control(number, word)
+            except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
+                self._untold.append(number)
+
+    def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
+        """Return the torques to send: zero, or None for no torque frames before all drives were told to brake.
+
+        By zero torque alone an arm without brakes would fall.
+
+        Args:
+            zero: torque of every drive [per mille of rated torque].
+        """
+        return None if self.braking and self._untold else zero
+
+    def see_through(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
+        """Cycle until the drives report that they are off, or have had their time; a lost command is sent again.
+
+        Args:
+            buses: open.
+            zero: as for `counts`; None where no torque frames are sent.
+            period_ns: of a cycle [ns].
+        """
+        for cycle in range(1, max(_FAREWELL, round(_BRAKING * 1e9 / period_ns)) + 1):
+            self.repeat(buses)
+            with suppress(Exception):  # of one cycle: the next one may be possible
+                buses.cycle(None if zero is None else self.counts(zero))
+            brakes = self.braking and any(drive.state in _ENDING for drive in buses.drives)
+            if brakes and cycle % _FAREWELL == 0:
+                self._untold = list(range(len(buses.drives)))  # what was sent may have been lost
+            if cycle >= _FAREWELL and not brakes:
+                break
+        self._untold = []
+
+
+WINDOW = 0.01  # s
+
+
+class MeasuredTorque:
+    """Collect the torques that the drives of an arm measure.
+
+    Attributes:
+        torque: by the newest reports, where one came since the cycle before, else NaN [N m or N], shape (joints,);
+            None where no drive has reported.
+        difference: how much more than they were told drives measured in their last two reports, the smaller of both
+            [N m or N], shape (joints,); None likewise.
+    """
+
+    def __init__(self, coordinates: Coordinates, rate: float) -> None:
+        """Start with drives without a commanded torque; `rate` is in cycles per second."""
+        self._coordinates = coordinates
+        self._told = np.zeros((max(2, round(WINDOW * rate)), len(coordinates.limit)))
+        self._cycle = 0
+        self._outside, self._before = [0.0] * len(coordinates.limit), [0.0] * len(coordinates.limit)
+        self._reports = [0] * len(coordinates.limit)
+        self.torque: Vector | None = None
+        self.difference: Vector | None = None
+
+    def cycle(self, counts: Sequence[int], drives: Sequence[Drive]) -> None:
+        """Process the torques sent and the reports received in a cycle.
+
+        Args:
+            counts: sent with its SYNC [per mille of rated torque], by drive.
+            drives: as they are at its end.
+        """
+        self._told[self._cycle % len(self._told)] = counts
+        self._cycle += 1
+        new = [drive.torques > known for drive, known in zip(drives, self._reports, strict=True)]
+        if not any(new):
+            if self.torque is not None:
+                self.torque = np.full(len(new), np.nan)
+            return
+        least, most = self._told.min(axis=0).tolist(), self._told.max(axis=0).tolist()
+        for k, drive in enumerate(drives):
+            if new[k]:
+                now, before = drive.torque - min(max(drive.torque, least[k]), most[k]), self._before[k]
+                self._outside[k] = min(now, before, key=abs) if now * before > 0.0 else 0.0
+                self._before[k] = now
+        self._reports = [drive.torques for drive in drives]
+        torque = self._coordinates.joint_torque([drive.torque for drive in drives])
+        for motors, joints in self._coordinates.groups:
+            if not (all(self._reports[k] for k in motors) and any(new[k] for k in motors)):
+                torque[list(joints)] = np.nan
+        self.torque, self.difference = torque, self._coordinates.joint_torque(self._outside)
+
+
+_CODES: dict[EventCode, AxisEventCode] = {
+    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
+    EventCode.NOTICE: AxisEventCode.DRIVE_NOTICE,
+    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
+    EventCode.LEFT: AxisEventCode.DRIVE_LEFT,
+    EventCode.DEAF: AxisEventCode.TORQUE_IGNORED,
+    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
+    EventCode.TORQUE_LIMITED: AxisEventCode.TORQUE_LIMITED,
+    EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,
+    EventCode.LATE: AxisEventCode.STRANGE_FRAME,
+    EventCode.WRONG_LENGTH: AxisEventCode.STRANGE_FRAME,
+    EventCode.STRANGER: AxisEventCode.STRANGE_FRAME,
+    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
+    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
+    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
+    EventCode.OVERFLOW: AxisEventCode.STRANGE_FRAME,
+    EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
+}
+# Emergencies of a drive that is in trouble with the bus itself (CiA 301, table 26).
+_ERROR_PASSIVE = "8120h"
+
+
+def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
+    """Translate the events of one bus.
+
+    events: as the codec reports them. States of drives, errors that were reset and a return to normal are not among
+        events: as the codec tells them. States of drives, errors that were reset and a return to normal are not among
+            the results.
+        codec: of the bus.
+        joint_of: first joint that each node moves.
+    """
+    bus = codec.profile.bus.channel
+    found = []
+    for event in events:
+        code = _CODES.get(event.code)
+        if event.code is EventCode.EMERGENCY and event.words.startswith(_ERROR_PASSIVE):
+            code = AxisEventCode.BUS_DEGRADED
+        if code is not None:
+            words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
+            found.append(AxisEvent(code, joint_of.get(event.node), words))
+    return found
+
+
+class Reports:
+    """Collect the events of all buses of an arm, cycle by cycle."""
+
+    def __init__(self, driver: CanopenDriver, joints: Mapping[int, int], look_every: int) -> None:
+        """Start with nothing reported missing.
+
+        Args:
+            driver: the section `driver`.
+            joints: first joint that each drive moves, by number.
+            look_every: cycles between two checks for missing reports.
+        """
+        self._joints = [{d.node: joints[k] for k, d in enumerate(driver.drives) if d.bus == bus} for bus in range(4)]
+        self._look_every = look_every
+        self._missed = MissedReports()
+
+    def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
+        """Return the events since the last call; `cycle` is the cycle's number, `now_ns` of the links' clock [ns]."""
+        found: list[AxisEvent] = []
+        look = cycle % self._look_every == 0
+        for codec in codecs:
+            if (events := codec.take_events()) or look:
+                joints = self._joints[codec.profile.number]
+                found += axis_events(events, codec, joints)
+                found += self._missed.new(codec, now_ns, joints) if look else []
+        return found
+
+
+class MissedReports:
+    """Report drives whose heartbeat or status report is missing, each once until it is received again."""
+
+    def __init__(self) -> None:
+        self._told: set[tuple[int, int, AxisEventCode]] = set()
+
+    def new(self, codec: BusCodec, now_ns: int, joint_of: Mapping[int, int]) -> list[AxisEvent]:
+        """Return the reports that have gone missing on one bus since the last call.
+
+        Args:
+            codec: of the bus.
+            now_ns: of the links' clock [ns].
+            joint_of: first joint that each node moves.
+        """
+        bus, profile = codec.profile.number, codec.profile
+        missing = {(bus, node, AxisEventCode.DRIVE_SILENT) for node in codec.silent(now_ns)}
+        missing |= {(bus, node, AxisEventCode.STATUS_STALE) for node in codec.stale()}
+        new = sorted(missing - self._told)
+        self._told = {place for place in self._told if place[0] != bus} | missing
+        words = {
+            AxisEventCode.DRIVE_SILENT: f"no heartbeat for {profile.heartbeat_timeout:g} s",
+            AxisEventCode.STATUS_STALE: f"no status report for {profile.status_timeout:g} s",
+        }
+        return [AxisEvent(code, joint_of[node], f"node {node}: {words[code]}") for _, node, code in new]
+
 
 # Between two checks of everybody's heartbeats and status reports: share of a status period, and cycles at most.
 _LOOK_SHARE, _MOST_UNLOOKED = 0.1, 10

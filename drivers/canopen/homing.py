@@ -16,8 +16,7 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_monitor import LookingArm
 from drivers.canopen.cia402 import DriveState, drive_words, state_of
 from drivers.canopen.motor_units import unwrapped
-from drivers.canopen.polling import Place
-from drivers.canopen.sdo import TIMEOUT
+from drivers.canopen.sdo import TIMEOUT, Place
 from drivers.canopen.stored_zero import Zeros
 from ident_service.errors import DriverError
 

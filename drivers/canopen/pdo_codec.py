@@ -16,9 +16,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axis_status import AxisStatus
-from drivers.can.bus_event import HOST, MILD, Event, EventCode
+from drivers.can.bus_state import (
+    HOST,
+    MILD,
+    ControllerState,
+    Event,
+    EventCode,
+    controller_state,
+    error_words,
+    overflowed,
+)
 from drivers.can.can_frame import Frame
-from drivers.can.controller_state import ControllerState, controller_state, error_words, overflowed
 from drivers.canopen.cia402 import (
     FOLLOWS,
     INTERNAL_LIMIT,

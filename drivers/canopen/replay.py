@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.can.can_frame import Frame
-from drivers.can.kernel_frame import ERROR
-from drivers.can.sendable import check_sendable
+from drivers.can.can_frame import ERROR, Frame, check_sendable
 from drivers.clock import Clock, VirtualClock
 from ident_service.errors import RecordingError
 

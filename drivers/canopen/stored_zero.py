@@ -21,8 +21,8 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.motor_units import Vector, signed
 from drivers.canopen.pdo_mapping import Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
 
 _WHOSE = "ident: counts at home, 1"

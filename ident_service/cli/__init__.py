@@ -15,25 +15,17 @@ from pathlib import Path
 
 from ident_service import __version__
 from ident_service.cli import (
-    arm,
-    bus,
-    commission,
-    comparing,
-    configs,
-    daemon,
-    doctor,
-    emulate,
-    exports,
-    keeping,
-    motions,
-    parameters,
-    recovery,
-    reidentify,
+    archive_commands,
+    daemon_commands,
+    identification_commands,
+    maintenance_commands,
+    motion_commands,
+    planning_commands,
+    recovery_commands,
     remote,
-    results,
-    schedule,
 )
-from ident_service.cli.answer import (
+from ident_service.cli.arguments import Parser, Verbs, WrongWords, asks_for_json
+from ident_service.cli.output import (
     DONE,
     FAILED,
     FAULTED,
@@ -48,7 +40,6 @@ from ident_service.cli.answer import (
     print_to_person,
     state_folder,
 )
-from ident_service.cli.words import Parser, Verbs, WrongWords, asks_for_json
 from ident_service.errors import (
     ArmFault,
     ConfigError,
@@ -63,8 +54,8 @@ from ident_service.errors import (
 __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", "main"]
 
 GROUPS = (
-    *(commission, motions, arm, recovery, parameters, results, comparing, exports, keeping),
-    *(configs, bus, doctor, emulate, schedule, reidentify, daemon, remote),
+    *(identification_commands, planning_commands, motion_commands, recovery_commands, archive_commands),
+    *(maintenance_commands, daemon_commands, remote),
 )
 _EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
     (ConfigError, USAGE),
@@ -173,7 +164,7 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFull(f"{place}: cannot be written: {error.strerror}; make room, then ask again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        from ident_service.operations.state_folder import shut_out
+        from ident_service.registry.state_folder import shut_out
 
         hint = shut_out(state_folder(arguments))
         return UsageError(f"{place}: {error.strerror}" + (f"; {hint}" if hint else ""))

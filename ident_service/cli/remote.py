@@ -14,11 +14,21 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, FAILED, FAULTED, USAGE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell
+from ident_service.cli.arguments import Verbs, columns_files, count
+from ident_service.cli.output import (
+    DONE,
+    FAILED,
+    FAULTED,
+    USAGE,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    in_words,
+    state_folder,
+    tell,
+)
 from ident_service.cli.remote_recordings import file_of, recording, require_known
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
-from ident_service.cli.remote_words import in_words
-from ident_service.cli.words import Verbs, columns_files, count
 from ident_service.errors import IdentError, UnknownId, UsageError
 
 if TYPE_CHECKING:
@@ -378,7 +388,7 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
 
 def _client(arguments: argparse.Namespace) -> IdentClient:
     from ident_service.client import IdentClient
-    from ident_service.operations.state_folder import shut_out
+    from ident_service.registry.state_folder import shut_out
     from ident_service.registry.tokens import TOKEN_FILE, read_token
 
     state, url = state_folder(arguments), arguments.server

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from ident_service.cli.answer import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
-from ident_service.cli.reidentify import EXIT_CODES
+from ident_service.cli.maintenance_commands import alarm_lines, due_line, schedule_line
+from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
+from ident_service.cli.recovery_commands import EXIT_CODES
 from ident_service.cli.remote import confirmation, motion_id, word_of_address
-from ident_service.cli.schedule import alarm_lines, due_line, schedule_line
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient

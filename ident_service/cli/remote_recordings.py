@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import tell
+from ident_service.cli.output import tell
 from ident_service.errors import UnknownId, UsageError
 
 if TYPE_CHECKING:

@@ -10,12 +10,11 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer
-from ident_service.cli.daemon import token_line
-from ident_service.cli.keeping import deleted_text, pruned_text
+from ident_service.cli.archive_commands import deleted_text, pruned_text
+from ident_service.cli.daemon_commands import token_line
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, in_words
 from ident_service.cli.remote import Verb, asked, word_of_address
 from ident_service.cli.remote_recordings import recording
-from ident_service.cli.remote_words import in_words
 from ident_service.errors import ArmError, UsageError
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """Download the files of an export, where `--out` was given."""
-    from ident_service.results.files import appearing_folder
+    from ident_service.results.manifest import appearing_folder
 
     code, text, document = in_words(client, arguments, answer)
     if code not in (DONE, VERDICT_NO):
@@ -98,7 +97,7 @@ def _reported(client: IdentClient, arguments: argparse.Namespace, answer: Answer
 
 
 def _write(path: Path, content: bytes) -> None:
-    from ident_service.results.files import write_atomically
+    from ident_service.results.manifest import write_atomically
 
     try:
         write_atomically(path, content.decode("utf-8"))

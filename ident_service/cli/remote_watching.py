@@ -14,8 +14,8 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.answer import DONE, VERDICT_NO, Answer, StopOnSignal, tell
-from ident_service.cli.moving import RELEASED, HeldKey, require_terminal
+from ident_service.cli.motion_commands import RELEASED, HeldKey, require_terminal
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, in_words, tell
 from ident_service.cli.remote import (
     LIVE,
     Verb,
@@ -27,7 +27,6 @@ from ident_service.cli.remote import (
     typed,
     word_of_address,
 )
-from ident_service.cli.remote_words import in_words
 from ident_service.errors import MotionRefused, UsageError
 
 if TYPE_CHECKING:
@@ -86,7 +85,7 @@ def named_files(path: Path) -> dict[str, str]:
     Returns:
         Name to content; what cannot be read as text is left out, and the daemon says that it is not there.
     """
-    from ident_service.config.source import read_alone
+    from ident_service.config.yaml_source import read_alone
 
     found: dict[str, str] = {}
     waiting = [path]

@@ -17,9 +17,9 @@ Errors are those of `ident_service.errors`: the daemon's own, and `ArmError` whe
 is checked as the system does (`SSL_CERT_FILE` names another authority); proxies of the environment are not asked.
 """
 
+from ident_service.client.client import Event as Event
 from ident_service.client.client import IdentClient as IdentClient
+from ident_service.client.client import Job as Job
+from ident_service.client.client import LiveSample as LiveSample
 from ident_service.client.client import RemoteArm as RemoteArm
 from ident_service.client.client import RemoteMotion as RemoteMotion
-from ident_service.client.values import Event as Event
-from ident_service.client.values import Job as Job
-from ident_service.client.values import LiveSample as LiveSample

@@ -1,20 +1,156 @@
-"""Talk to a daemon about its arms, jobs, runs and motions."""
+"""Drive a daemon: its arms, jobs, motions and runs, and recordings uploaded in pieces."""
 
 from __future__ import annotations
 
+import hashlib
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, Final, Self
+from typing import Any, BinaryIO, Final, Self
 from urllib.parse import quote, urlencode
 
 from ident_service.client.connection import NOTHING, Connection, error_of
-from ident_service.client.upload import upload
-from ident_service.client.values import Event, Job, LiveSample
-from ident_service.errors import ArmError, ArmFault, IdentError, MotionRefused, Stopped, Unavailable, UsageError
+from ident_service.errors import (
+    AlreadyThere,
+    ArmError,
+    ArmFault,
+    IdentError,
+    MotionRefused,
+    Stopped,
+    Unavailable,
+    UsageError,
+)
+
+_LIVE: Final = ("queued", "running")
+
+
+@dataclass(frozen=True)
+class Job:
+    """A job as it stood when it was asked for.
+
+    Attributes:
+        id: which names it.
+        kind: `run`, `identify` and so on.
+        arm: its arm's name, if it is about one.
+        state: `queued`, `running`, and after its end `done`, `refused`, `failed`, `faulted`, `cancelled` or
+            `interrupted`.
+        run: id of the run, motion or export that it makes or is about.
+        detail: why it ended so, in words; empty where there is nothing to say.
+        phase: of one that runs.
+        held: whether the motion has stopped and its arm, which has no brakes, is held until a person confirms that it
+            is supported; until then the job runs.
+        document: everything that the daemon tells of it (`JobAnswer` in the OpenAPI description).
+    """
+
+    id: str
+    kind: str
+    arm: str | None
+    state: str
+    run: str | None
+    detail: str
+    phase: str | None
+    held: bool
+    document: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def live(self) -> bool:
+        """Tell if the job has not ended."""
+        return self.state in _LIVE
+
+
+@dataclass(frozen=True)
+class LiveSample:
+    """A moment of a run while it is recorded; the daemon sends one every 20 ms.
+
+    Attributes:
+        time: since the first sample [s].
+        joints: names, in the order of the values.
+        position: measured [rad or m]; None for a value that was not valid.
+        torque: commanded [N m or N].
+        following_error: the largest of those 20 ms [rad or m].
+    """
+
+    time: float
+    joints: tuple[str, ...]
+    position: tuple[float | None, ...]
+    torque: tuple[float | None, ...]
+    following_error: tuple[float | None, ...]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that a daemon tells of its arms and jobs.
+
+    Attributes:
+        kind: `happened` (a line of the audit trail), `job` or `arm` (how one stands), `samples` or `doubt` of a run.
+        number: of what has happened, to go on after it; None for all else.
+        value: `AuditLine`, `JobAnswer`, or as the OpenAPI description says of the stream.
+    """
+
+    kind: str
+    number: int | None
+    value: Mapping[str, Any]
+
+
+_UPLOADS: Final = "/api/v1/uploads"
+_PIECE: Final = 4 * 2**20  # bytes
+_UPLOAD_TRIES: Final = 5  # in a row without a byte that arrived
+_UPLOAD_AGAIN = 1.0  # s between them
+_CHECKING = 600.0  # s for the hash of the longest recording
+
+
+def upload(connection: Connection, arm: str, file: Path, columns: str, tell: Callable[[float], None]) -> dict[str, str]:
+    """Upload a file; arguments, result and errors as `IdentClient.upload`."""
+    if not file.is_file():
+        raise UsageError(f"{file}: no such file")
+    try:
+        with file.open("rb") as stream:
+            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+            size = stream.seek(0, 2)
+            name = re.sub(r"[^A-Za-z0-9_.-]", "_", file.name)[-120:].lstrip("_.-")
+            announced = {"arm": arm, "name": name, "bytes": size, "sha256": sha256, "columns": columns}
+            seen = connection.post(_UPLOADS, announced)
+            if seen["run"] is None:
+                _send(connection, stream, seen, tell)
+                path = f"{_UPLOADS}/{seen['id']}/complete"
+                seen = connection.ask("POST", path, {}, patience=_CHECKING)
+    except OSError as error:
+        if isinstance(error, IdentError):
+            raise
+        raise UsageError(f"{file}: cannot be read: {error.strerror or error}") from None
+    tell(1.0)
+    return {"run": str(seen["run"]), "name": str(seen["name"])}
+
+
+def _send(connection: Connection, stream: BinaryIO, seen: dict[str, Any], tell: Callable[[float], None]) -> None:
+    path, failed = f"{_UPLOADS}/{seen['id']}", 0
+    while seen["received"] < seen["bytes"]:
+        tell(seen["received"] / seen["bytes"])
+        stream.seek(seen["received"])
+        try:
+            if failed:  # the bytes of an interrupted piece that arrived are kept
+                time.sleep(_UPLOAD_AGAIN)
+                before, seen = seen["received"], connection.get(path)
+                failed = 1 if seen["received"] > before else failed
+                stream.seek(seen["received"])
+            piece = stream.read(_PIECE)
+            seen = connection.ask("PATCH", path, piece, {"Upload-Offset": str(seen["received"])})
+        except (
+            ArmError,
+            AlreadyThere,
+            Unavailable,
+        ):  # the line broke, or the daemon is busy, with the last piece perhaps
+            failed += 1
+            if failed == _UPLOAD_TRIES:
+                raise
+        else:
+            failed = 0
+
 
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long

@@ -4,8 +4,6 @@ A body of mass m with its centre of mass at c in the frame of the link that carr
 centre along the axes of that frame, adds to the link's parameters (eqs. 5, 8)
 
     L = J + m (c.c 1 - c c^T),    l = m c,    m.
-
-Boundary: data only.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from pydantic import Field, field_validator
 from ident_service.config.quantities import Interval, Number, Positive, Section, Vector3
 
 if TYPE_CHECKING:
-    from ident_service.config.schema import ArmConfig
+    from ident_service.config.arm import ArmConfig
 
 _FARTHEST = 3.0  # m from the link's frame; a number in millimetres is beyond
 _HEAVIEST = 1000.0  # kg; a number in grams is beyond

@@ -48,8 +48,7 @@ from ident_service.daemon.web.routes import PAGES
 from ident_service.operations.acceptance import settle
 from ident_service.operations.deletion import remove_deleted
 from ident_service.registry.arms import know_shipped
-from ident_service.registry.audit import enter_waiting
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, enter_waiting
 from ident_service.registry.runs import rebuild_runs
 from ident_service.registry.tokens import first_token
 

@@ -1,8 +1,8 @@
 """Authenticate requests and provide the routes' dependencies: the service, and the caller's name and role.
 
 A token comes as `Authorization: Bearer`, or a session of the page as a cookie. Browsers send cookies by themselves, so
-a request with a cookie that changes anything must also have an Origin header (`request_guard.py` has checked that it is this
-service's).
+a request with a cookie that changes anything must also have an Origin header (`request_guard.py` has checked that it is
+this service's).
 """
 
 from __future__ import annotations

@@ -23,11 +23,11 @@ import numpy as np
 
 from ident_service.config.load import arm_from_json
 from ident_service.errors import IdentError, RecordingError
+from ident_service.recordings.mcap_follower import RecordingTail, Samples
 from ident_service.recordings.recording import Block
-from ident_service.recordings.tail import RecordingTail, Samples
 
 if TYPE_CHECKING:  # the thread that needs estimation imports it, so that the service starts without
-    from ident_service.estimation.growing import Doubt, GrowingInformation
+    from ident_service.estimation.online import Doubt, GrowingInformation
 
 ARM, RECORDING = "arm.json", "run.mcap"
 BIN_NS: Final = 20_000_000  # one point of the display
@@ -142,7 +142,7 @@ class LiveRun:
     # --- the thread that computes the deviations
 
     def _work(self) -> None:
-        from ident_service.estimation.growing import GrowingInformation
+        from ident_service.estimation.online import GrowingInformation
         from ident_service.model.arm_model import arm_model
 
         try:
@@ -197,7 +197,7 @@ class LiveRuns:
 
 
 def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) -> dict[str, Any]:
-    from ident_service.estimation.doubt import shares
+    from ident_service.estimation.uncertainty import shares
 
     return {
         "seconds": round(doubt.seconds, 2),

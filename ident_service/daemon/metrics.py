@@ -135,7 +135,7 @@ class _Now(Collector):
 
 
 class _Lateness(Collector):
-    """Collector of the wake-up lateness of cycles: sums of the runs' own histograms (`motion/histogram.py`)."""
+    """Collector of the wake-up lateness of cycles: sums of the runs' own histograms (`motion/cycle_timing.py`)."""
 
     def __init__(self) -> None:
         self._lock, self._edges, self._counts = threading.Lock(), list[float](), list[int]()

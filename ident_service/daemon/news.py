@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.daemon.jobs.reach import moving_arms
 from ident_service.errors import IdentError
-from ident_service.operations.arm_state import fault_file
+from ident_service.operations.moving_arms import moving_arms
 from ident_service.registry import jobs as rows
-from ident_service.registry.audit import last_line, trail_after
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, last_line, trail_after
+from ident_service.registry.state_folder import fault_file
 
 LOOK: Final = 0.25  # s between polls, however many viewers there are
 _PAGE = 500  # lines that are read at a time

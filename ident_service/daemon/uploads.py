@@ -1,4 +1,4 @@
-"""Receive recordings in pieces: resumed where they broke off, and kept only if their hash is right.
+"""Take recordings in pieces: resumed where they broke off, columns judged first, and kept only whole.
 
 ```
 STATE/.uploads/ID/upload.json    what was announced
@@ -8,37 +8,83 @@ STATE/runs/RUN/                  a whole one: NAME, upload.json, arm.json, colum
 
 The id is a hash of what was announced: whoever announces the same again goes on, after a restart, too. A whole one is a
 run of the kind `recording`, so whatever takes a recording of a run takes it. A columns file is held against the arm
-before anything is sent, and a CSV's header against both as soon as it has arrived. Boundary: nothing here looks further
-into a recording; that is done by the process of a job.
+before anything is sent, and a CSV's header against both as soon as it has arrived.
 """
 
 from __future__ import annotations
 
 import errno
 import fcntl
+import gzip
 import hashlib
 import json
 import os
 import re
 import shutil
+import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
-from ident_service.daemon.upload_columns import LONGEST_HEADER, first_line, format_of
-from ident_service.errors import AlreadyThere, RecordingError, UnknownId, UsageError
+from ident_service.errors import AlreadyThere, ConfigError, Problem, RecordingError, UnknownId, UsageError
 from ident_service.operations.deletion import forget_run
 from ident_service.registry.arms import known_arm
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, note
 from ident_service.registry.motions import new_id
 from ident_service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
-from ident_service.results.files import appearing_folder, write_atomically
-from ident_service.results.manifest import named_files, write_manifest
+from ident_service.results.manifest import appearing_folder, named_files, write_atomically, write_manifest
+
+if TYPE_CHECKING:
+    from ident_service.config.arm import ArmConfig
+    from ident_service.config.recording import RecordingFormat
+
+
+LONGEST_HEADER: Final = 2**20  # bytes
+
+
+def format_of(columns: str, name: str, config: ArmConfig) -> RecordingFormat:
+    """Read the columns file of a recording as an identification will.
+
+    Args:
+        columns: content of the file.
+        name: of the recording.
+        config: of its arm.
+
+    Raises:
+        ConfigError, UsageError: as `recordings.own_formats`, without the place where it was read.
+    """
+    from ident_service.model.arm_model import arm_model
+    from ident_service.operations.recordings import own_formats
+
+    with tempfile.TemporaryDirectory(prefix="ident-columns.") as place:
+        file, recording = Path(place) / COLUMNS, Path(name)
+        file.write_text(columns, encoding="utf-8", errors="replace")
+        try:
+            return own_formats({recording: file}, [recording], arm_model(config))[recording]
+        except ConfigError as error:
+            raise ConfigError(
+                [Problem(Path(COLUMNS), one.line, one.column, one.message) for one in error.problems]
+            ) from None
+        except UsageError as error:
+            raise UsageError(str(error).replace(f"{place}/", "")) from None
+
+
+def first_line(path: Path, *, packed: bool) -> bytes:
+    """Return the first line as far as it is there, and as a reader takes it."""
+    with path.open("rb") as stream:
+        if not packed:
+            return stream.readline(LONGEST_HEADER)
+        try:
+            with gzip.open(stream) as unpacked:
+                return unpacked.readline(LONGEST_HEADER)
+        except (EOFError, OSError, zlib.error):
+            return b""
+
 
 UPLOADS: Final = ".uploads"  # hidden, so that backups leave out incomplete uploads
 MOST_BYTES: Final = 4 * 2**30  # of a recording
@@ -153,7 +199,7 @@ def require_header(db: Database, state: Path, upload: str) -> None:
         UnknownId: no such upload, or its arm is gone.
         RecordingError: all that is wrong with the header; the upload is deleted, for its columns cannot be changed.
     """
-    from ident_service.recordings.csv_header import parse_header
+    from ident_service.recordings.csv_reader import parse_header
 
     seen, folder = known_upload(state, upload), state / UPLOADS / upload
     announced = seen.announced

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError, SolverError
 from ident_service.estimation.equations import Equations
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import Prior
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle
-from ident_service.model.threads import one_blas_thread
 
 _MANY = 40
 

@@ -1,4 +1,15 @@
-"""Certify that an estimate is feasible or infeasible, by a proof in exact decimals (BPFT, eq. 51).
+"""Prove in exact arithmetic that parameters are feasible, or that no body has them.
+
+A point is one vector: per block the upper triangle of a matrix, column by column, with sqrt(2) beside the diagonal, so
+that inner products of vectors are those of matrices. Pure computation, no I/O.
+
+The alternative to BPFT (eq. 51) with `D > 0`: Z >= 0, not zero, with `<F_k d, Z_k>` summing to zero for every d with
+`K d = 0` and `sum_k <F_k(delta) + f_k, Z_k> <= 0` at any delta with `K delta = beta`. Of all such Z an interior-point
+path gives one far from the boundary of the cone, which survives rounding to decimals.
+
+An unbounded direction of the set (a mass that no expression names) forces Z to vanish on some rows; these are dropped
+before (facial reduction, where the direction is diagonal). Nothing here needs to be trusted, as
+`certificate_verifier.py` checks what comes out. Pure computation, no I/O.
 
 Floating-point solvers only suggest; what they suggest is rounded, repaired so that all equations hold exactly, and
 checked with `fractions` before it is called a proof:
@@ -15,24 +26,446 @@ checked with `fractions` before it is called a proof:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 
-from ident_service.certificate_verifier import Arm, ExactBlock, VerificationError, rational_text, set_blocks, verify
+from ident_service.certificate_verifier import (
+    Affine,
+    Arm,
+    ExactBlock,
+    VerificationError,
+    is_positive_semidefinite,
+    rational_text,
+    set_blocks,
+    symmetric,
+    triangle,
+    verify,
+)
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.certificate_dual import dual_candidates
-from ident_service.estimation.certificate_rounding import Statement, counts, exact_block, printed, prove, repair, trace
-from ident_service.estimation.feasible.consistency import interior_point
-from ident_service.estimation.feasible.feasibility import feasibility_test
+from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet
-from ident_service.model.base import BaseParameters
+from ident_service.estimation.feasible.formulation import interior_point
+from ident_service.estimation.feasible.problems import feasibility_test
+from ident_service.model.base_parameters import BaseParameters, parse_exactly
 from ident_service.model.chain import Array
-from ident_service.model.expressions import parse_exactly
+
+_SPARE_DIGITS = 5
+_MOST_DIGITS = 28
+
+Unknown = TypeVar("Unknown", bound=Hashable)
+Key = tuple[int, int]  # block and entry of a multiplier; block -1 for the multipliers of base parameters
+
+
+@dataclass(frozen=True)
+class Statement:
+    """Statement to be proven, in exact numbers as they are printed.
+
+    Attributes:
+        names: link parameters.
+        K: per base parameter the coefficients of its expression.
+        beta: base parameters.
+        blocks: what must be positive.
+        equalities: lists of numbers that must be zero.
+    """
+
+    names: tuple[str, ...]
+    K: tuple[dict[str, Fraction], ...]
+    beta: tuple[Fraction, ...]
+    blocks: tuple[ExactBlock, ...]
+    equalities: tuple[ExactBlock, ...] = ()
+
+    @property
+    def rows(self) -> list[Mapping[str, Fraction]]:
+        """Return the left-hand sides of all linear equations on delta: K, then the equalities."""
+        return [*self.K, *(entry.coefficients for block in self.equalities for entry in block.entries)]
+
+    @property
+    def right(self) -> list[Fraction]:
+        """Return the right-hand sides of the equations whose left-hand sides are `rows`."""
+        return [*self.beta, *(-entry.constant for block in self.equalities for entry in block.entries)]
+
+
+def exact_block(block: Block, names: Sequence[str]) -> ExactBlock:
+    """Return the block with its coefficients as decimals."""
+    entries = tuple(
+        Affine({names[int(column)]: printed(row[column]) for column in np.flatnonzero(row)}, printed(constant))
+        for row, constant in zip(block.F, block.f, strict=True)
+    )
+    return ExactBlock(block.name, block.size, entries)
+
+
+def printed(value: float) -> Fraction:
+    """Return the number that a file shows: the shortest decimal that reads back as this float."""
+    return Fraction(repr(float(value)))
+
+
+def trace(block: ExactBlock, z: Sequence[Fraction]) -> Fraction:
+    """Return the trace of a multiplier, or the sum of its numbers."""
+    return sum((v for v, n in zip(z, counts(block), strict=True) if n == 1), Fraction(0))
+
+
+def counts(block: ExactBlock) -> list[int]:
+    """Return how often each entry counts in an inner product of symmetric matrices."""
+    return [1 if i == j else 2 for i, j in triangle(block.size)] if block.size else [1] * len(block.entries)
+
+
+def prove(
+    statement: Statement, multipliers: Sequence[Array], y: Array
+) -> tuple[list[list[Fraction]], list[Fraction]] | None:
+    """Round the multipliers, make the equations hold exactly, and check the rest exactly.
+
+    Args:
+        statement: what they are multipliers of.
+        multipliers: per block, strictly inside the cone on the rows that are not zero, shape (entries,) each.
+        y: multipliers of the statement's rows, shape (rows,).
+
+    Returns:
+        Both in fractions, or None where rounding broke the proof.
+    """
+    smallest = [_smallest(block, z) for block, z in zip(statement.blocks, multipliers, strict=True)]
+    floor = min((value for value in smallest if value > 0.0), default=1e-12)
+    digits = min(int(np.ceil(-np.log10(floor))) + _SPARE_DIGITS, _MOST_DIGITS)
+    values: dict[Key, Fraction] = {(-1, i): _rounded(value, digits) for i, value in enumerate(y)}
+    for k, z in enumerate(multipliers):
+        values |= {(k, e): _rounded(value, digits) for e, value in enumerate(z) if value != 0.0}
+    equations: dict[str, dict[Key, Fraction]] = {name: {} for name in statement.names}
+    for i, row in enumerate(statement.rows):
+        for name, coefficient in row.items():
+            equations[name][-1, i] = -coefficient
+    for k, block in enumerate(statement.blocks):
+        for e, (entry, n) in enumerate(zip(block.entries, counts(block), strict=True)):
+            if (k, e) in values:
+                for name, coefficient in entry.coefficients.items():
+                    equations[name][k, e] = n * coefficient
+    exact = repair(
+        list(equations.values()),
+        [Fraction(0)] * len(equations),
+        values,
+        lambda key: smallest[key[0]] if key[0] >= 0 else 0.0,
+    )
+    if exact is None:
+        return None
+    factors = [exact[-1, i] for i in range(len(y))]
+    Z = [[exact.get((k, e), Fraction(0)) for e in range(len(b.entries))] for k, b in enumerate(statement.blocks)]
+    value = sum((factor * beta for factor, beta in zip(factors, statement.right, strict=True)), Fraction(0))
+    for block, z_k in zip(statement.blocks, Z, strict=True):
+        terms = (n * z * e.constant for n, z, e in zip(counts(block), z_k, block.entries, strict=True))
+        value += sum(terms, Fraction(0))
+        if not (is_positive_semidefinite(symmetric(z_k, block.size)) if block.size else all(z >= 0 for z in z_k)):
+            return None
+    return (Z, factors) if value < 0 or (value == 0 and any(any(row) for row in Z)) else None
+
+
+def _smallest(block: ExactBlock, z: Array) -> float:
+    """Return the smallest eigenvalue on the rows that facial reduction left, zero where it left none."""
+    if block.size == 0:
+        return float(min(z[z != 0.0], default=0.0))
+    matrix = np.zeros((block.size, block.size))
+    for value, (i, j) in zip(z, triangle(block.size), strict=True):
+        matrix[i, j] = matrix[j, i] = value
+    left = np.diag(matrix) != 0.0
+    return float(np.linalg.eigvalsh(matrix[left][:, left])[0]) if left.any() else 0.0
+
+
+def _rounded(value: float, digits: int) -> Fraction:
+    return Fraction(round(Fraction(float(value)) * 10**digits), 10**digits)
+
+
+def repair(
+    equations: Sequence[Mapping[Unknown, Fraction]],
+    right: Sequence[Fraction],
+    values: Mapping[Unknown, Fraction],
+    weight: Callable[[Unknown], float],
+) -> dict[Unknown, Fraction] | None:
+    """Change a few values so that linear equations hold exactly.
+
+    Elimination on the residuals; each equation changes the unknown that stands in the fewest equations, so that
+    decimals stay short, and of these the one with the largest weight times coefficient.
+
+    Args:
+        equations: coefficients by unknown.
+        right: right-hand sides.
+        values: what is nearly a solution.
+        weight: the larger, the sooner an unknown is changed.
+
+    Returns:
+        The values that solve the equations, or None where these contradict each other.
+    """
+    count: dict[Unknown, int] = {}
+    for equation in equations:
+        for unknown in equation:
+            count[unknown] = count.get(unknown, 0) + 1
+    solved: list[tuple[Unknown, dict[Unknown, Fraction], Fraction]] = []
+    for equation, target in zip(equations, right, strict=True):
+        row = {unknown: coefficient for unknown, coefficient in equation.items() if coefficient}
+        rest = target - sum((c * values[unknown] for unknown, c in row.items()), Fraction(0))
+        for pivot, pivot_row, pivot_rest in solved:
+            if factor := row.pop(pivot, Fraction(0)):
+                rest -= factor * pivot_rest
+                for unknown, coefficient in pivot_row.items():
+                    row[unknown] = row.get(unknown, Fraction(0)) - factor * coefficient
+                    if not row[unknown]:
+                        del row[unknown]
+        if not row:
+            if rest:
+                return None
+            continue
+        chosen = min(row, key=lambda unknown: (count[unknown], -weight(unknown) * abs(float(row[unknown]))))
+        scale = row.pop(chosen)
+        solved.append((chosen, {unknown: c / scale for unknown, c in row.items()}, rest / scale))
+    change: dict[Unknown, Fraction] = {}
+    for chosen, row, rest in reversed(solved):
+        change[chosen] = rest - sum((c * change.get(unknown, Fraction(0)) for unknown, c in row.items()), Fraction(0))
+    return {unknown: value + change.get(unknown, 0) for unknown, value in values.items()}
+
+
+_CLOSE_TO_OPTIMUM = 9.0  # value at most this many times the gap below zero: shares of the blocks are then meaningful
+_PATH_STEP = 10.0
+_PATH_STEPS = 40
+_NEWTON_STEPS = 60
+_CENTRED = 0.1  # Newton decrement
+
+
+@dataclass(frozen=True)
+class Part:
+    """Block of the dual cone: a matrix over `rows` of its block, or the numbers `rows` of a list.
+
+    Attributes:
+        block: index in the list of blocks.
+        matrix: whether it is a matrix.
+        rows: rows that are left.
+        entries: the block's entries these leave.
+        scale: 1 on the diagonal, sqrt(2) beside it, so that inner products of entries are those of matrices.
+        duplication: entries to the matrix column by column, shape (rows^2, entries).
+    """
+
+    block: int
+    matrix: bool
+    rows: tuple[int, ...]
+    entries: tuple[int, ...]
+    scale: Array
+    duplication: Array
+
+
+def identity(part: Part) -> Array:
+    """Return the entries of the identity matrix, or of ones, shape (entries,)."""
+    return part.duplication.T @ np.eye(len(part.rows)).ravel() if part.matrix else np.ones(len(part.rows))
+
+
+def split(parts: Sequence[Part], z: Array) -> list[Array]:
+    """Return the rows of `z` that belong to each part, shape (entries, ...) each."""
+    return np.split(z, np.cumsum([len(part.entries) for part in parts])[:-1])
+
+
+def central_path(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Iterator[Array]:
+    """Yield points of the central path of `minimise c.z` with a negative value.
+
+    Args:
+        parts: the cone.
+        c: the objective, shape (entries,).
+        z: an interior point, shape (entries,).
+        normals: orthonormal directions that must not be followed from there, such that what is left of the cone is
+            bounded, shape (entries, normals).
+    """
+    degree = float(sum(len(part.rows) for part in parts))
+    weight = degree / max(abs(float(c @ z)), float(np.linalg.norm(c)) * 1e-3, np.finfo(float).tiny)
+    for _ in range(_PATH_STEPS):
+        centred = _centre(parts, weight * c, z, normals)
+        if centred is None:
+            return
+        z = centred
+        value = float(c @ z)
+        if value < 0.0:
+            yield z
+        if value < -_CLOSE_TO_OPTIMUM * degree / weight:
+            return
+        weight *= _PATH_STEP
+
+
+def _centre(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Array | None:
+    """Minimise `c.z - log det Z` across the normals by Newton's method; None where it stalls.
+
+    With Z = L L^T, the map X -> L X L^T takes the identity to Z and the barrier's Hessian to the identity: each step is
+    a projection, small and accurate however close to the boundary Z is.
+    """
+    identities = np.concatenate([identity(part) for part in parts])
+    for _ in range(_NEWTON_STEPS):
+        maps = colouring(parts, z)
+        if maps is None:
+            return None
+        slope = np.concatenate([P.T @ piece for P, piece in zip(maps, split(parts, c), strict=True)])
+        across = np.vstack([P.T @ piece for P, piece in zip(maps, split(parts, normals), strict=True)])
+        Q = np.linalg.qr(across)[0]
+        step = identities - slope
+        for _ in range(2):
+            step = step - Q @ (Q.T @ step)
+        spectrum = np.concatenate(
+            [_spectrum(part, piece) for part, piece in zip(parts, split(parts, step), strict=True)]
+        )
+        length = _step_length(float(slope @ step), spectrum)
+        z = z + length * np.concatenate([P @ piece for P, piece in zip(maps, split(parts, step), strict=True)])
+        if np.linalg.norm(step) < _CENTRED:
+            return z
+    return None
+
+
+def _step_length(slope: float, spectrum: Array) -> float:
+    """Return the minimiser a of `slope a - sum log(1 + a spectrum)`, by bisection on its derivative, 1 at most."""
+    lowest = float(spectrum.min())
+    low, high = 0.0, min(1.0, -0.99 / lowest) if lowest < 0.0 else 1.0
+    if slope - float(np.sum(spectrum / (1.0 + high * spectrum))) <= 0.0:
+        return high
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        if slope - float(np.sum(spectrum / (1.0 + middle * spectrum))) > 0.0:
+            high = middle
+        else:
+            low = middle
+    return low
+
+
+def _spectrum(part: Part, entries: Array) -> Array:
+    """Return the eigenvalues of a matrix block, or its numbers."""
+    if not part.matrix:
+        return entries
+    return np.asarray(np.linalg.eigvalsh((part.duplication @ entries).reshape(len(part.rows), -1)), dtype=float)
+
+
+def colouring(parts: Sequence[Part], z: Array) -> list[Array] | None:
+    """Return per part the map of entries X -> L X L^T with Z = L L^T; None outside the interior of the cone."""
+    maps = []
+    for part, piece in zip(parts, split(parts, z), strict=True):
+        if not part.matrix:
+            if piece.min() <= 0.0:
+                return None
+            maps.append(np.diag(piece))
+            continue
+        try:
+            factor = np.linalg.cholesky((part.duplication @ piece).reshape(len(part.rows), -1))
+        except np.linalg.LinAlgError:
+            return None
+        maps.append(part.duplication.T @ np.kron(factor, factor) @ part.duplication)
+    return maps
+
+
+_RANK = 1e-11
+_LONGEST_DIRECTION = 1e4
+_INTERIOR = 1e-9
+
+
+def dual_candidates(blocks: Sequence[Block], null: Array, delta: Array) -> Iterator[list[Array]]:
+    """Yield multipliers with a negative value, best first; none where no strictly feasible dual is found.
+
+    Args:
+        blocks: the conditions.
+        null: directions d with `K d = 0`, shape (parameters, directions).
+        delta: any link parameters with `K delta = beta`, shape (parameters,).
+
+    Yields:
+        Per block its multiplier, shape (entries,): upper triangles column by column. They satisfy the equations up to
+        rounding and lie strictly inside the cone of what facial reduction left.
+    """
+    parts = _reduce(blocks, null)
+    if not parts:
+        return
+    A = np.vstack([blocks[p.block].F[list(p.entries)] @ null * p.scale[:, None] for p in parts])
+    c = np.concatenate([(blocks[p.block].F @ delta + blocks[p.block].f)[list(p.entries)] * p.scale for p in parts])
+    trace = np.concatenate([identity(p) for p in parts])
+    lengths = np.linalg.norm(A, axis=0)
+    A = A[:, lengths > _RANK] / lengths[lengths > _RANK]
+    start = _most_interior(parts, A, trace)
+    if start is None:
+        return
+    normals = scipy.linalg.orth(np.column_stack([A, trace]), rcond=_RANK)
+    found = list(central_path(parts, c, start, normals))
+    for z in reversed(found):
+        multipliers = [np.zeros(len(block.f)) for block in blocks]
+        for part, piece in zip(parts, split(parts, z), strict=True):
+            multipliers[part.block][list(part.entries)] = piece / part.scale
+        yield multipliers
+
+
+def _part(blocks: Sequence[Block], block: int, rows: tuple[int, ...]) -> Part:
+    size = blocks[block].size
+    if size == 0:
+        return Part(block, False, rows, rows, np.ones(len(rows)), np.zeros((0, 0)))
+    place = {row: number for number, row in enumerate(rows)}
+    kept = [(e, place[i], place[j]) for e, (i, j) in enumerate(triangle_entries(size)) if i in place and j in place]
+    duplication = np.zeros((len(rows), len(rows), len(kept)))
+    for number, (_, i, j) in enumerate(kept):
+        duplication[i, j, number] = duplication[j, i, number] = 1.0 if i == j else np.sqrt(0.5)
+    scale = np.array([1.0 if i == j else np.sqrt(2.0) for _, i, j in kept])
+    return Part(block, True, rows, tuple(e for e, _, _ in kept), scale, duplication.reshape(-1, len(kept)))
+
+
+def _reduce(blocks: Sequence[Block], null: Array) -> list[Part]:
+    """Drop rows on which a direction of the null space is diagonal and not negative, until there are none."""
+    from scipy.optimize import linprog  # loads for 0.1 s, and most parameters are feasible
+
+    rows = [tuple(range(block.size or len(block.f))) for block in blocks]
+    while True:
+        parts = [_part(blocks, k, kept) for k, kept in enumerate(rows) if kept]
+        if not parts or null.shape[1] == 0:
+            return parts
+        diagonal: list[Array] = []
+        owners: list[tuple[int, int]] = []
+        beside: list[Array] = []
+        for part in parts:
+            F = blocks[part.block].F[list(part.entries)] @ null
+            on = identity(part) > 0.5
+            diagonal.append(F[on])
+            beside.append(F[~on])
+            owners += [(part.block, row) for row in part.rows]
+        D, B = np.vstack(diagonal), np.vstack(beside)
+        count = len(owners)
+        answer = linprog(
+            np.append(np.zeros(null.shape[1]), -np.ones(count)),
+            A_ub=scipy.sparse.csr_array(np.hstack([-D, np.eye(count)])),
+            b_ub=np.zeros(count),
+            A_eq=scipy.sparse.csr_array(np.hstack([B, np.zeros((len(B), count))])) if len(B) else None,
+            b_eq=np.zeros(len(B)) if len(B) else None,
+            bounds=[(-_LONGEST_DIRECTION, _LONGEST_DIRECTION)] * null.shape[1] + [(0.0, 1.0)] * count,
+        )
+        if answer.x is None:
+            return parts
+        gone = {owner for owner, grown in zip(owners, answer.x[-count:], strict=True) if grown > 0.5}
+        if not gone:
+            return parts
+        rows = [tuple(row for row in kept if (k, row) not in gone) for k, kept in enumerate(rows)]
+
+
+def _most_interior(parts: Sequence[Part], A: Array, trace: Array) -> Array | None:
+    """Return the Z of trace 1 on the subspace whose smallest eigenvalue is largest, where that is positive."""
+    count = len(trace)
+    problem = ConicProblem(count + 1)
+    unit = split(parts, np.eye(count))
+    for part, piece, one in zip(parts, unit, split(parts, trace), strict=True):
+        F = np.column_stack([piece / part.scale[:, None], -one])
+        if part.matrix:
+            problem.semidefinite(F, np.zeros(len(F)), len(part.rows))
+        else:
+            problem.nonnegative(F, np.zeros(len(F)))
+    problem.nonnegative(np.append(-trace, 0.0)[None], np.ones(1))
+    if A.shape[1]:
+        problem.zero(np.column_stack([A.T, np.zeros(A.shape[1])]), np.zeros(A.shape[1]))
+    try:
+        solution = problem.minimise(np.append(np.zeros(count), -1.0), "search for a dual")
+    except SolverError:
+        return None
+    z = solution.x[:-1]
+    if A.shape[1]:
+        # The solver meets the equations to its tolerance; the path needs them to the last digit.
+        z = z - A @ np.linalg.lstsq(A, z, rcond=None)[0]
+    if solution.x[-1] <= _INTERIOR or colouring(parts, z) is None:
+        return None
+    return np.asarray(z / (trace @ z), dtype=float)
+
 
 # Bounds of masses [kg] and moments of inertia [kg m^2], times the size of the base parameters, where only
 # bounded bodies can be excluded; the smaller one proves more verdicts close to the boundary.

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ident_service.errors import SolverError
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 

@@ -1,6 +1,6 @@
 """Turn recordings into information on the base parameters, in blocks of about a second, in one pass.
 
-Residuals of neighbouring samples are correlated, so uncertainty is computed from blocks (`doubt.py`). The number of
+Residuals of neighbouring samples are correlated, so uncertainty is computed from blocks. The number of
 blocks is bounded: when there are too many, neighbours merge in pairs and blocks become longer, so memory stays
 constant.
 """
@@ -14,21 +14,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.schema import Identification
+from ident_service.config.arm import Identification
 from ident_service.errors import RecordingError
-from ident_service.estimation.periodic import averaged
 from ident_service.estimation.repeats import Label, Stretches, stretches
-from ident_service.estimation.smoothing import Motion, smoothed, windows
+from ident_service.estimation.signal_processing import Motion, averaged, smoothed, windows
 from ident_service.estimation.spectra import settled
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.threads import one_blas_thread
 from ident_service.model.zero_phase import low_pass
-from ident_service.recordings.grid import grid
 from ident_service.recordings.recording import Recording
+from ident_service.recordings.resampling import grid
 
 MAX_BLOCKS = 256
 LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known

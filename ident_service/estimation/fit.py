@@ -12,30 +12,30 @@ from typing import Literal
 
 import numpy as np
 
-from ident_service.config.schema import Method
-from ident_service.estimation import instruments, robust
+from ident_service.config.arm import Method
+from ident_service.estimation import instrumental_variables as instruments
+from ident_service.estimation import robust_regression
 from ident_service.estimation.choices import Choice, chosen, held_out_error
-from ident_service.estimation.delay import Delay, choose_delay, estimate_delay, with_delay
-from ident_service.estimation.doubt import uncertainty, widening
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.central import Near
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import residual_deviation
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.estimation.friction_fit import fit_friction, friction_trials, to_be_fitted
-from ident_service.estimation.instruments import instrumental_variables
+from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
-from ident_service.estimation.robust import held_out_errors, huber
-from ident_service.estimation.shape_doubt import shape_covariance
+from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_shares
+from ident_service.estimation.shape_uncertainty import shape_covariance
 from ident_service.estimation.spectra import settled
-from ident_service.estimation.standstill import standstill_shares
+from ident_service.estimation.torque_delay import Delay, choose_delay, estimate_delay, with_delay
+from ident_service.estimation.uncertainty import uncertainty, widening
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.layout import INERTIAL
-from ident_service.recordings.grid import grid
+from ident_service.model.parameter_layout import INERTIAL
 from ident_service.recordings.recording import Recording
+from ident_service.recordings.resampling import grid
 
 SAME = 0.01  # share of its deviation; a parameter that changes by less counts as unchanged
 
@@ -69,7 +69,7 @@ class Fit:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
         covariance: from blocks of scores, with the doubt about fitted shapes of friction, shape (base, base).
-        deviations: standard deviations on the careful side, shape (base,), see `doubt.py`.
+        deviations: standard deviations on the careful side, shape (base,), see `uncertainty.py`.
         degrees: degrees of freedom of the deviations, shape (base,).
         noise: variances by what differs between repetitions of the motion, shape (base,); None where most is not
             repeated.
@@ -239,7 +239,7 @@ def _with_known_shape(
     if method != "iv":
         fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares)
         found = _doubted("huber", fit, reweighted, shares)
-        return replace(found, choices=choices, remarks=_unsettled("Huber's weights", change, robust.SETTLED))
+        return replace(found, choices=choices, remarks=_unsettled("Huber's weights", change, robust_regression.SETTLED))
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)

@@ -8,23 +8,22 @@ from typing import get_args
 
 import numpy as np
 
-from ident_service.config.schema import FeasibleSetName, Method
+from ident_service.config.arm import FeasibleSetName, Method
 from ident_service.errors import UsageError
 from ident_service.estimation.bootstrap import constrained_intervals
 from ident_service.estimation.choices import Choice
 from ident_service.estimation.custom import CustomFunction
-from ident_service.estimation.doubt import Verdict, negligible, verdicts
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.convex import SOLVER, convex_least_squares, require_solver
-from ident_service.estimation.feasible.feasibility import (
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
+from ident_service.estimation.feasible.priors import Prior, choose_weight, roomier
+from ident_service.estimation.feasible.problems import (
     FeasibilityTest,
     FeasibleEstimate,
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
-from ident_service.estimation.feasible.priors import Prior, choose_weight, roomier
 from ident_service.estimation.fit import Fit, Prepared, as_good_as_the_same, prepare, unconstrained
 from ident_service.estimation.friction_fit import at_the_edge
 from ident_service.estimation.least_squares import (
@@ -35,13 +34,14 @@ from ident_service.estimation.least_squares import (
 )
 from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
 from ident_service.estimation.spectra import remarks_on_noise
+from ident_service.estimation.uncertainty import Verdict, negligible, verdicts
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters, remarks_on_angles
+from ident_service.model.base_parameters import BaseParameters, base_parameters, remarks_on_angles
+from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.likely_bodies import Source, likely_bodies
-from ident_service.model.threads import one_blas_thread
-from ident_service.recordings.part import overlap
+from ident_service.recordings.adapters import overlap
 from ident_service.recordings.recording import Recording
 
 _HELD_OUT = 1.0 / 3.0
@@ -113,7 +113,8 @@ class Estimate:
         margin: of delta inside the set, or of the feasibility test when infeasible.
         tight: blocks of the set that the estimate presses against or violates.
         covariance: of the unconstrained estimate, see `Fit`, shape (base, base).
-        standard_deviations: on the careful side, shape (base,): at least its diagonal's square root, see `doubt.py`.
+        standard_deviations: on the careful side, shape (base,): at least its diagonal's square root, see
+            `uncertainty.py`.
         white_standard_deviations: the paper's (eq. 81), shape (base,).
         degrees: degrees of freedom of the standard deviations, shape (base,).
         negligible: sizes below which parameters are as good as zero on this motion, shape (base,).

@@ -7,8 +7,8 @@ A body x in the frame of the last link adds K_x x to the base parameters beta of
 
 is least squares for x; joints are weighted by their residuals. What W K_x cannot tell apart is grouped as base
 parameters are; what the motion does not show (inertia where it is slow) has infinite variance and is left out. The
-covariance of x has two parts: noise, from blocks of scores as in `doubt.py`, and the arm's own uncertainty, which on
-this motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
+covariance of x has two parts: noise, from blocks of scores as in `uncertainty.py`, and the arm's own uncertainty, which
+on this motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x)^-1 K_x^T W^T W, so G cov(beta) G^T.
 
 A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
 nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
@@ -28,8 +28,7 @@ from typing import Literal
 import numpy as np
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.doubt import Verdict, uncertainty, verdicts
-from ident_service.estimation.drift import (
+from ident_service.estimation.change_detection import (
     ALPHA,
     RELEVANT_TORQUE,
     Identified,
@@ -43,15 +42,16 @@ from ident_service.estimation.drift import (
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.formulation import EPSILON, Lift, constrain
 from ident_service.estimation.feasible.nearest import nearest
-from ident_service.estimation.feasible.posing import EPSILON, Lift, constrain
 from ident_service.estimation.least_squares import LeastSquares, TorqueError, torque_error, weighted_least_squares
+from ident_service.estimation.uncertainty import Verdict, uncertainty, verdicts
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, grouping
+from ident_service.model.base_parameters import BaseParameters, grouping
+from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle
-from ident_service.model.layout import INERTIAL
-from ident_service.model.threads import one_blas_thread
+from ident_service.model.parameter_layout import INERTIAL
 
 Word = Literal["none", "added", "removed", "infeasible"]
 

@@ -12,11 +12,11 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.schema import JointTerm
-from ident_service.estimation.doubt import jackknife, widening
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.config.arm import JointTerm
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
+from ident_service.estimation.uncertainty import jackknife, widening
 from ident_service.model.arm_model import ArmModel
 from ident_service.recordings.quality import JointQuality
 

@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
-from ident_service.recordings.grid import grid
 from ident_service.recordings.recording import Recording
-from ident_service.recordings.segments import uniform
+from ident_service.recordings.resampling import grid, uniform
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

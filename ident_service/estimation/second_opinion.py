@@ -15,7 +15,7 @@ from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.nearest import FeasibleEstimate
 from ident_service.estimation.feasible.priors import Prior
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 
 AGREED_BELOW = 0.1  # percent of the torques that the fit is about

@@ -13,12 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.arm import Identification
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import Identification
 from ident_service.model.arm_model import ArmModel
-from ident_service.recordings.grid import grid
 from ident_service.recordings.recording import Recording
-from ident_service.recordings.segments import uniform
+from ident_service.recordings.resampling import grid, uniform
 
 Array = NDArray[np.float64]
 USUAL = 8.0  # Hz; lower, and filtered friction would not turn round where the velocity does

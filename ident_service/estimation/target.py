@@ -1,7 +1,7 @@
 """Decide when a run has learned enough: the target of `ident run --until`.
 
 A parameter is reached when its deviation is at most the target's share of the larger of its size and what is as good
-as zero, as in its verdict (`doubt.py`): a parameter that is as good as zero need not be known to a share of itself.
+as zero, as in its verdict: a parameter that is as good as zero need not be known to a share of itself.
 The deviation is the larger of eq. 81 and of what blocks say, as few blocks can err to either side, and nothing counts
 before there are some, nor before the motion has lasted for its first period: before, its design has not been made.
 Every base parameter counts where none is chosen. Not only the essential ones: early on, what is not known yet cannot
@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import UsageError
-from ident_service.estimation.doubt import shares
+from ident_service.estimation.uncertainty import shares
 
 if TYPE_CHECKING:  # a run whose target another process watches loads no estimator
-    from ident_service.estimation.growing import Doubt
-    from ident_service.model.base import BaseParameters
+    from ident_service.estimation.online import Doubt
+    from ident_service.model.base_parameters import BaseParameters
 
 LEAST_BLOCKS = 10
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident_service.config.design import Criterion, Design
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.motion_design import Criterion, Design
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
-from ident_service.excitation.binding import (
+from ident_service.excitation.active_limits import (
     Binding,
     binding,
     binding_words,
@@ -24,20 +23,22 @@ from ident_service.excitation.binding import (
     needed_stiffness,
     stiffer_gains,
 )
-from ident_service.excitation.climb import Candidate
-from ident_service.excitation.criteria import condition_number, criterion
-from ident_service.excitation.demands import demands
-from ident_service.excitation.excitation import LONGEST, Excitation
-from ident_service.excitation.expectation import described_noise, information, seconds_of_information
-from ident_service.excitation.following import USABLE, dry_friction
+from ident_service.excitation.limit_proof import Proof, demands
 from ident_service.excitation.mending import Attempt, Prover
-from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.motion_file import LONGEST, Excitation
+from ident_service.excitation.optimal_design import Task, condition_number, criterion, usable_limits
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.proof import Proof
-from ident_service.excitation.search import Budget, Found, Progress, search
-from ident_service.excitation.task import Task, usable_limits
+from ident_service.excitation.prediction import (
+    USABLE,
+    described_noise,
+    dry_friction,
+    information,
+    seconds_of_information,
+)
+from ident_service.excitation.search import Budget, Candidate, Found, Progress, search
+from ident_service.excitation.trajectory import Basis, FourierBasis, FourierPath, PostureBasis, PosturePath
 from ident_service.model.arm_model import ArmModel, control_model
-from ident_service.model.base import BaseParameters, base_parameters, static_base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters, static_base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 from ident_service.model.expected_friction import expected_friction

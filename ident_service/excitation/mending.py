@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident_service.config.limits import motion_limits
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.climb import Candidate
-from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.limit_proof import Proof, largest_proven, objections, proof_of, tightened
+from ident_service.excitation.optimal_design import Task
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.proof import Proof, largest_proven, objections, proof_of, tightened
-from ident_service.excitation.search import polished
-from ident_service.excitation.task import Task
+from ident_service.excitation.search import Candidate, polished
+from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.following import dry_friction
+from ident_service.excitation.prediction import dry_friction
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.capsules import CapsuleModel
+from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
 

@@ -1,7 +1,7 @@
 """Simulate the control loop over a motion, to bound where the arm goes, not only its reference.
 
 The plant has the control law's own model with other friction and heavier links; between two cycles it is integrated
-with its friction taken implicitly (`model/rigid_body.py`). The law is that of `motion/control.py`, with its velocity
+with its friction taken implicitly. The law is that of `motion/controller.py`, with its velocity
 filter, its torque limits and its delay: the torque of a sample acts `delay` cycles later.
 
     tau_k+d = M(q_k) (ddq_r + K_d (dq_r - v_k) + K_p (q_r - q_k)) + c(q_k, v_k) + g(q_k) + f(dq_r)
@@ -18,14 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import ModelError
-from ident_service.excitation.following import DOUBT
-from ident_service.excitation.path import FourierPath, Path
+from ident_service.excitation.prediction import DOUBT
+from ident_service.excitation.trajectory import FourierPath, Path
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.expected_friction import expected_friction, friction_feedforward
-from ident_service.model.rigid_body import ForwardDynamics, InverseDynamics
+from ident_service.model.pinocchio_models import ForwardDynamics, InverseDynamics
 
 # Shares of the safety monitor's limits that a simulated arm may use: it stops at 1.0 times the following error allowed
 # and at 1.2 times the velocity limit, and an arm has noise that no case has.

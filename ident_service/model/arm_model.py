@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.quantities import TextFile
 from ident_service.config.recording import units_of_other_joints
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain, chain_from_dh
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 
 _LONGEST_LINK = 20.0  # m, as in DH tables
 
@@ -53,7 +53,7 @@ def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:
         chain = chain_from_dh(kinematics.dh, config.gravity)
     else:
         # Pinocchio is not needed, and not loaded, for an arm that a DH table describes.
-        from ident_service.model.rigid_body import read_mjcf, read_urdf
+        from ident_service.model.pinocchio_models import read_mjcf, read_urdf
 
         if kinematics.urdf is not None:
             chain, inertias = read_urdf(kinematics.urdf, config.gravity, kinematics)

@@ -4,7 +4,7 @@ Frames. Joint k's frame sits on its parent's frame by a constant placement (at z
 slides along, its own axis. Link parameters are expressed in the link frame, which is the joint frame for URDF, MJCF
 and modified-DH arms and the distal frame for standard-DH arms (conventions), a constant offset further.
 
-Dynamics are in `regressor.py` and `rigid_body.py`.
+Dynamics are in `regressor.py` and `pinocchio_models.py`.
 """
 
 from __future__ import annotations

@@ -11,16 +11,16 @@ from typing import Literal
 import numpy as np
 import pinocchio as pin
 
+from ident_service.config.arm import Joint
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import Joint
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.drives import WrittenArm, joint_drives
+from ident_service.model.friction_state import presliding_ways, turned
 from ident_service.model.mechanism import read_mechanism
-from ident_service.model.presliding import presliding_ways, turned
-from ident_service.model.rigid_body import chain_of, pinocchio_model
+from ident_service.model.parameter_layout import WrittenArm, joint_drives
+from ident_service.model.pinocchio_models import chain_of, pinocchio_model
 
 
 class DynamicModel:

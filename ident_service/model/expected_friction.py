@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array, Chain
 

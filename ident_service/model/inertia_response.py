@@ -11,12 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from ident_service.errors import ModelError
-from ident_service.model.adjoint import Differentiable
 from ident_service.model.chain import Array, Chain
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
+from ident_service.model.pinocchio_models import ForwardDynamics
 from ident_service.model.regressor import traced_rigid_torque
-from ident_service.model.rigid_body import ForwardDynamics
-from ident_service.model.tape import Tape
+from ident_service.model.symbolic import Differentiable, Tape
 
 
 class InertiaResponse:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array, Chain
-from ident_service.model.layout import INERTIAL, Layout
+from ident_service.model.parameter_layout import INERTIAL, Layout
 
 
 @dataclass(frozen=True)

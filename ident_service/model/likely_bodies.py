@@ -13,12 +13,12 @@ from typing import Literal
 
 import numpy as np
 
+from ident_service.config.motion_design import Capsule
 from ident_service.config.payload import knowledge_with_payload
-from ident_service.config.workspace import Capsule
 from ident_service.model.arm_model import ArmModel, control_model, with_payload
 from ident_service.model.chain import Array
-from ident_service.model.layout import INERTIAL
 from ident_service.model.mechanism import read_mechanism
+from ident_service.model.parameter_layout import INERTIAL
 
 # Of industrial and research arms: castings, motors and gears fill about half of a link's outline with metal.
 _DENSITY = 1500.0  # kg/m^3

@@ -1,4 +1,9 @@
-"""Read a mechanism with pinocchio, as JSON values; as a program, read the MJCF at a given path within limits.
+"""Read a mechanism with pinocchio in a process of its own, and take the part of it that is the arm.
+
+A joint that is held still is a fixed joint at its value, and its link's inertia merges into the link before it
+(pinocchio's `buildReducedModel`). Joints outside base and tip are held at zero, or at the limit nearest to zero, unless
+`lock` names a value; a joint that mimics one that is held still follows it. What moves with a joint of the arm cannot
+be represented, and is refused; so is a lock of such a joint elsewhere than where the one that it mimics puts it.
 
 `python -m ident_service.model.mechanism_process FILE` prints one JSON object. `error` in it says why there is no other.
 """
@@ -6,8 +11,11 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
-from collections.abc import Callable
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -16,10 +24,183 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
 from ident_service.model.limited_process import answer_within
-from ident_service.model.mechanism_part import Mimic, Part, arm_part, mimics
 
-if TYPE_CHECKING:  # this process loads no configuration
+if TYPE_CHECKING:
     from ident_service.config.quantities import TextFile
+
+
+_OUTSIDE = 1e-6  # rad or m; what a value may be beyond a limit by rounding
+
+
+@dataclass(frozen=True)
+class Part:
+    """Part of a mechanism that is the arm: `base`, `tip` and `lock` of `config.kinematics.Kinematics`."""
+
+    base: str | None = None
+    tip: str | None = None
+    lock: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """`<mimic>` of a URDF joint: its position is `multiplier` times that of `joint`, plus `offset` [rad or m]."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
+def mimics(file: TextFile) -> dict[str, Mimic]:
+    """Read the `<mimic>` elements of a URDF that pinocchio has accepted, by the name of their joint.
+
+    Raises:
+        ModelError: XML that pinocchio's lenient reader accepts and a strict one does not.
+    """
+    found: dict[str, Mimic] = {}
+    if "mimic" not in file.text:
+        return found
+    try:
+        robot = ET.fromstring(file.text)  # noqa: S314 - entities were refused before
+    except ET.ParseError as error:
+        raise ModelError(f"not well-formed XML: {error}") from None
+    # Numbers were checked by pinocchio's reader.
+    for joint in robot.findall("joint"):
+        if (mimic := joint.find("mimic")) is not None:
+            scale, offset = float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0"))
+            found[joint.get("name", "")] = Mimic(mimic.get("joint", ""), scale, offset)
+    return found
+
+
+def arm_part(
+    model: pin.Model, part: Part, followers: Mapping[str, Mimic], file: str
+) -> tuple[pin.Model, dict[str, float]]:
+    """Reduce a mechanism to the arm.
+
+    Args:
+        model: of the whole mechanism, mimicking joints as joints of their own.
+        part: `base` and `tip`, names of links, and `lock`, positions of joints [rad or m].
+        followers: joints that mimic others.
+        file: its name, for errors.
+
+    Returns:
+        The model of the arm, its world at the frame of `base` where that is named, and the positions at which all
+        other joints are held [rad or m].
+
+    Raises:
+        ModelError: a link or joint that does not exist, a value outside a joint's limits, a tip that does not hang on
+            the base, a joint that follows one of the arm, or locks that contradict each other.
+    """
+    inside = _between(model, part, file)
+    held = {name: _checked(model, name, value, file) for name, value in part.lock.items()}
+    outside = {str(name) for name in model.names[1:]} - inside - set(held)
+    held |= {name: _rest(model, name) for name in outside if name not in followers}
+    # A joint without a link, or on another tree, stands in the file and not in the mechanism.
+    waiting = {name: one for name, one in followers.items() if name not in held and model.existJointName(name)}
+    while ready := [name for name, one in waiting.items() if one.joint in held]:
+        for name in ready:
+            follower = waiting.pop(name)
+            held[name] = follower.multiplier * held[follower.joint] + follower.offset
+    for name, follower in waiting.items():
+        raise ModelError(
+            f"{file}: joint {name!r} mimics {follower.joint!r}, which moves with the arm; lock {follower.joint!r} at a"
+            f" value, as kinematics.lock: {{{follower.joint}: 0}}, or name base and tip so that it is not between them"
+        )
+    for name, follower in followers.items():
+        if name in part.lock and model.existJointName(name):
+            _require_agreement(name, follower, held, file)
+    positions = pin.neutral(model)
+    for name, value in held.items():
+        joint = model.joints[model.getJointId(name)]
+        if joint.nv == 1:
+            positions[joint.idx_q : joint.idx_q + joint.nq] = (
+                [value] if joint.nq == 1 else [math.cos(value), math.sin(value)]
+            )
+    if held:
+        model = pin.buildReducedModel(model, sorted(model.getJointId(name) for name in held), positions)
+    if part.base is not None:
+        _rebase(model, part.base)
+    return model, held
+
+
+def _require_agreement(name: str, follower: Mimic, held: Mapping[str, float], file: str) -> None:
+    """Refuse a lock of a joint that is elsewhere than the joint that it mimics puts it."""
+    leader, value = follower.joint, held[name]
+    scale, offset = follower.multiplier, follower.offset
+    there = f"; lock {leader!r} alone" + (
+        f", as kinematics.lock: {{{leader}: {(value - offset) / scale:g}}}" if scale else ""
+    )
+    if leader not in held:
+        raise ModelError(
+            f"{file}: kinematics.lock: {name!r} mimics {leader!r}, which is not locked and would move with it{there},"
+            f" or name base and tip so that {leader!r} is not between them"
+        )
+    puts = scale * held[leader] + offset
+    if abs(puts - value) > _OUTSIDE:
+        raise ModelError(
+            f"{file}: kinematics.lock: {name} at {value:g} contradicts {leader} at {held[leader]:g}, which puts it at"
+            f" {puts:g}{there}"
+        )
+
+
+def _between(model: pin.Model, part: Part, file: str) -> set[str]:
+    """Return the joints between base and tip, without those on the way to the base or off the way to the tip."""
+    ids = set(range(1, model.njoints))
+    if part.base is not None:
+        base = _joint_of(model, part.base, "base", file)
+        ids = {k for k in ids if k != base and base in model.supports[k]}
+    if part.tip is not None:
+        tip = _joint_of(model, part.tip, "tip", file)
+        ids &= set(model.supports[tip])
+    if not ids and (part.base is not None or part.tip is not None):
+        raise ModelError(f"{file}: no movable joint from {part.base or 'the root'!r} to {part.tip or 'any tip'!r}")
+    return {str(model.names[k]) for k in ids}
+
+
+def _joint_of(model: pin.Model, link: str, role: str, file: str) -> int:
+    """Return the joint that moves a link; 0 is the world."""
+    if not model.existFrame(link, pin.FrameType.BODY):
+        known = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+        raise ModelError(f"{file}: kinematics.{role}: no link {link!r}; it has {', '.join(known[:40])}")
+    return int(model.frames[model.getFrameId(link, pin.FrameType.BODY)].parentJoint)
+
+
+def _checked(model: pin.Model, name: str, value: float, file: str) -> float:
+    if not model.existJointName(name):
+        raise ModelError(
+            f"{file}: kinematics.lock: no movable joint {name!r}; it has {', '.join(list(model.names[1:])[:40])}"
+        )
+    joint = model.joints[model.getJointId(name)]
+    if joint.nv != 1:
+        raise ModelError(f"{file}: kinematics.lock: {name!r} is a {joint.shortname()}, which no one number holds")
+    if joint.nq == 1:
+        lower, upper = (float(limits[joint.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+        if not lower - _OUTSIDE <= value <= upper + _OUTSIDE:
+            raise ModelError(
+                f"{file}: kinematics.lock: {name} at {value:g} is outside its limits, {lower:g} to {upper:g}; positions"
+                " are rad or m, degrees are written '90 deg'"
+            )
+    return value
+
+
+def _rest(model: pin.Model, name: str) -> float:
+    """Return the position at which a joint is held [rad or m]: zero, or the limit nearest to it."""
+    joint = model.joints[model.getJointId(name)]
+    if joint.nq != 1:
+        return 0.0
+    lower, upper = (float(limits[joint.idx_q]) for limits in (model.lowerPositionLimit, model.upperPositionLimit))
+    return min(max(0.0, lower), upper) if lower <= upper else 0.0
+
+
+def _rebase(model: pin.Model, base: str) -> None:
+    """Move the model's world frame to the frame of a link that does not move."""
+    to_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement.inverse()
+    for k in range(1, model.njoints):
+        if model.parents[k] == 0:
+            model.jointPlacements[k] = to_base * model.jointPlacements[k]
+    for frame in model.frames:
+        if frame.parentJoint == 0:
+            frame.placement = to_base * frame.placement
+
 
 MOST_MEMORY: Final = 512 * 2**20  # bytes of addresses, of which the libraries take 230 MB
 MOST_SECONDS: Final = 5  # of computing

@@ -1,4 +1,4 @@
-"""Derive inverse dynamics, gravity and mass matrix as formulas of joint states and parameters, by recursion.
+"""Formulate inverse dynamics, gravity and mass matrix (Newton-Euler recursion) on symbolic values.
 
 Newton-Euler outwards and inwards with the ten parameters of eq. 13 per link: with w, e and a the angular velocity,
 angular acceleration and linear acceleration of the link frame's origin (gravity as an upward acceleration of the base),
@@ -9,7 +9,7 @@ angular acceleration and linear acceleration of the link frame's origin (gravity
 values of the base parameters and every other column at zero, `K delta = beta` holds, and so do all torques (eq. 37).
 The mass matrix is that of composite bodies, whose ten parameters simply add up.
 
-The formulas are recorded on a tape (`tape.py`), which other modules run or print.
+The formulas are recorded on a tape (`symbolic.py`), which other modules run or print.
 """
 
 from __future__ import annotations
@@ -17,11 +17,57 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ident_service.config.schema import JointTerm
+import numpy as np
+
+from ident_service.config.arm import JointTerm
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.layout import INERTIAL, Layout
-from ident_service.model.tape import Symbol, Tape, Value
-from ident_service.model.vectors import ZERO, Rotation, Vector, add, constant, cross, dot, rotate, scaled, turned
+from ident_service.model.parameter_layout import INERTIAL, Layout
+from ident_service.model.symbolic import Symbol, Tape, Value
+
+Vector = list[Value]
+Rotation = list[list[Value]]
+ZERO: Vector = [0.0, 0.0, 0.0]
+
+
+def constant(values: Array) -> Vector:
+    """Return numbers as a vector, shape (3,)."""
+    return [float(value) for value in values]
+
+
+def turned(placement: Array, axis: Array, c: Symbol, s: Symbol) -> Rotation:
+    """Return the rows of the rotation from the parent's frame into the turned joint frame (Rodrigues, transposed)."""
+    x, y, z = (float(component) for component in axis)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    still, sine, cosine = placement @ (np.eye(3) + K @ K), placement @ K, -(placement @ (K @ K))
+    return [
+        [float(still[j, i]) + (float(sine[j, i]) * s + float(cosine[j, i]) * c) for j in range(3)] for i in range(3)
+    ]
+
+
+def dot(a: Vector, b: Vector) -> Value:
+    """Return the dot product."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def rotate(rotation: Rotation, vector: Vector) -> Vector:
+    """Return the product of a rotation, by rows, and a vector."""
+    return [dot(row, vector) for row in rotation]
+
+
+def scaled(vector: Vector, factor: Value) -> Vector:
+    """Return the vector with every component multiplied by a factor."""
+    return [component * factor for component in vector]
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the cross product, a x b."""
+    return [a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+
+
+def add(a: Vector, b: Vector) -> Vector:
+    """Return the sum of two vectors."""
+    return [a[i] + b[i] for i in range(3)]
+
 
 Parameters = Mapping[int, Value]
 """Values of columns of delta; columns that are not there are zero."""
@@ -122,7 +168,7 @@ def friction_torque(
     dq: Sequence[Symbol],
     direction: Sequence[Symbol] | None = None,
 ) -> list[Value]:
-    """Return the friction torque (`layout.py`); `direction` per drive is the sign of its velocity when None."""
+    """Return the friction torque; `direction` per drive is the sign of its velocity when None."""
     torque: list[Value] = [0.0] * chain.joints
     columns = {term: layout.term_columns(term) for term in layout.terms}
     for drive in range(chain.joints):

@@ -15,12 +15,12 @@ import numpy as np
 import pinocchio as pin
 
 from ident_service.config.kinematics import Kinematics
-from ident_service.config.workspace import BASE, Capsule
+from ident_service.config.motion_design import BASE, Capsule
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.solids import Box, Cylinder, Solid
 from ident_service.model.solids import Capsule as Pill
-from ident_service.model.urdf_solids import origin_of, solid_of
+from ident_service.model.urdf import origin_of, solid_of
 
 MOST_MESH_BYTES: Final = 64 * 2**20
 _LEAST_RADIUS = 0.005  # m

@@ -1,6 +1,6 @@
 """Define convex solids, and bodies made of them: capsules, boxes, cylinders and half spaces, in some joint's frame.
 
-`scene.py` assigns them to links and surroundings, and says which pairs must stay apart.
+`collision.py` assigns them to links and surroundings, and says which pairs must stay apart.
 """
 
 from __future__ import annotations

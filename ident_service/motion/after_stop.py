@@ -11,10 +11,10 @@ from typing import Final
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.pinocchio_models import InverseDynamics
 
 WEIGHS: Final = 1e-3  # of a torque limit; every drive that reaches this torque has more friction than that
 _POSTURES, _SEED = 64, 1

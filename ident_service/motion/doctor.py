@@ -2,7 +2,7 @@
 
 What is looked at needs no privileges; what cannot be looked at is said. Lateness is measured as cyclictest does, in a
 process that sets itself up as the motion process does (`realtime.py`), and judged by the numbers that judge a motion
-(`deadlines.py`): a rate is held where no motion would have ended.
+(`cycle_timing.py`): a rate is held where no motion would have ended.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm import Vector, Watchdog
-from drivers.can.bus_errors import BusError
-from drivers.can.kernel_interface import check_interface
+from drivers.can.bus_state import BusError
+from drivers.can.socketcan_link import check_interface
 from drivers.clock import Clock, RealClock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus, CanopenDriver
 from ident_service.config.control import Realtime
-from ident_service.config.schema import ArmConfig
-from ident_service.motion.deadlines import LATE, SUCCESS, longest_stall
+from ident_service.motion.cycle_timing import LATE, SUCCESS, longest_stall
 from ident_service.motion.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, asked, capable, core_numbers
 
 LEAST_RATE = 1000.0  # Hz, at which lateness is measured at least

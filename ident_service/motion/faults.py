@@ -1,10 +1,10 @@
-"""Define every fault of a moving arm and the reaction to it, in one table after FIELDBUS.md 5.2.
+"""List every fault with its reaction in one table, and keep active faults until a person acknowledges each by its name.
 
 Reactions, from mild to severe; a motion only ever goes from a milder one to a more severe one.
 
 * **warn**: the cycle goes on; a single axis without usable feedback is taken to go on as it went. The same warning in
   too many of the last 100 cycles becomes a controlled stop.
-* **controlled stop**: the loop stays closed on a stop within limits (`stop.py`). The arm must then be measured at rest
+* **controlled stop**: the loop stays closed on a stop within limits. The arm must then be measured at rest
   within `SETTLE` of the end of the stop, and is held: gravity compensated, motion damped, what else it needed to stand
   kept on, no position asked for, so that it yields when it is pushed. After `HOLD` seconds the drives of an arm
   with brakes are told to quick-stop. Without brakes (`after_stop.py`) it is held until a person confirms that it is
@@ -21,6 +21,8 @@ A run that ends in DONE stands where it stood, supported, before it began; its t
 Where this table differs from FIELDBUS.md 5.2: a frozen encoder takes the torque (decision 0008); beyond a position
 limit the stop is controlled as long as the arm is no further out than a following error, because these limits are
 ours and lie inside the hardware's; faults of the program and of single axes quick-stop instead of dropping the arm.
+
+The state machine refuses to arm the arm while there are any (`state_machine.py`).
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from drivers.arm import StopKind
+from ident_service.errors import UsageError
 
 SETTLE = 0.5  # s after the end of a stop or pause within which the arm must be at rest
 HOLD = 2.0  # s that a stopped arm is held
@@ -99,7 +102,7 @@ FAULTS: dict[str, Rule] = {
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
     "strange_frame": Rule(_WARN, "a bus that is too full, a wrong node number, or another device on it"),
-    # `deadlines.py` decides when a cycle is too late, or too many are; fewer in a second are tolerated.
+    # `cycle_timing.py` decides when a cycle is too late, or too many are; fewer in a second are tolerated.
     "late_cycle": Rule(_WARN, "the machine was busy with something else", often=WINDOW - 1),
     # The loop can still be trusted to stop the arm.
     "repeated_warnings": Rule(_STOP, "what is bridged once must not go on"),
@@ -197,3 +200,45 @@ class Findings:
                 what = f"{code} in more than {rule.often} of the last {WINDOW} cycles ({what})"
                 code, rule = rule.becomes, FAULTS[rule.becomes]
         return Fault(code, rule.reaction, f"{what}: {rule.means}")
+
+
+@dataclass(frozen=True)
+class Latched:
+    """Represent an unacknowledged fault in memory.
+
+    Attributes:
+        code: its name.
+        cause: one plain sentence.
+        since_ns: when it was found, on the loop's clock [ns].
+    """
+
+    code: str
+    cause: str
+    since_ns: int
+
+
+class Latch:
+    """Hold the unacknowledged faults of one arm, the earliest first, beyond the single run."""
+
+    def __init__(self) -> None:
+        self._faults: dict[str, Latched] = {}
+
+    @property
+    def faults(self) -> tuple[Latched, ...]:
+        """Return the active faults, the earliest first."""
+        return tuple(self._faults.values())
+
+    def set(self, code: str, cause: str, since_ns: int) -> None:
+        """Latch a fault; one that is latched already keeps its first cause and time."""
+        self._faults.setdefault(code, Latched(code, cause, since_ns))
+
+    def acknowledge(self, code: str) -> Latched:
+        """Acknowledge one fault: remove and return it.
+
+        Raises:
+            UsageError: no fault of this code is latched; a person must acknowledge a known fault.
+        """
+        if code not in self._faults:
+            known = ", ".join(self._faults) or "none"
+            raise UsageError(f"no fault {code!r} is latched (latched: {known})")
+        return self._faults.pop(code)

@@ -19,9 +19,9 @@ from typing import Final
 import numpy as np
 
 from drivers.arm import Arm, Vector
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import IdentError, MotionRefused, UsageError
-from ident_service.motion.watch import watch
+from ident_service.motion.read_only_monitor import watch
 from ident_service.recordings.files import write_atomically
 
 FILE: Final = "position.json"  # in the arm's folder

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from drivers.arm import Vector
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.kinematics import link_poses
 from ident_service.motion.faults import LOWER

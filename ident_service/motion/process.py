@@ -3,7 +3,7 @@
 It gets one JSON object on its standard input and says in lines of JSON on its standard output which state it enters and
 how the run ended; samples and story go through the ring to the recorder's process. It takes the arm's control file and
 holds its lock, so that `ident stop` reaches it whatever became of its parent. A parent that is gone has closed the
-standard input, and one that hangs lets the lease lapse: either stops the arm (`lifeline.py`). What is to be known
+standard input, and one that hangs lets the lease lapse: either stops the arm. What is to be known
 afterwards does not need a parent: faults are latched, and the ending is written into the run folder, from here.
 
 A pipe that the parent does not read must not make the loop wait: lines that do not fit are dropped.
@@ -23,24 +23,22 @@ from typing import Any
 
 import numpy as np
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import ArmFault, IdentError, MotionRefused, UsageError
-from ident_service.excitation.excitation import excitation_from_json
+from ident_service.excitation.motion_file import excitation_from_json
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.control_file import ControlFile
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.command_channel import ControlFile, Lifeline
+from ident_service.motion.control_loop import LOWERS, WAITS
+from ident_service.motion.cycle_timing import Histogram
 from ident_service.motion.ending import write_ending
-from ident_service.motion.factory import make_arm
-from ident_service.motion.fault_file import CONTROLS, FaultFile
-from ident_service.motion.faults import Severity
-from ident_service.motion.histogram import Histogram
+from ident_service.motion.fault_store import CONTROLS, FaultFile
+from ident_service.motion.faults import Latch, Severity
 from ident_service.motion.last_position import PositionFile
-from ident_service.motion.latch import Latch
-from ident_service.motion.lifeline import Lifeline
-from ident_service.motion.loop import LOWERS, WAITS
-from ident_service.motion.plans import Destination, Excite, GoTo, Plan
 from ident_service.motion.realtime import ask
 from ident_service.motion.run import RunReport, follow
-from ident_service.motion.states import State
+from ident_service.motion.run_plan import Destination, Excite, GoTo, Plan
+from ident_service.motion.state_machine import State
 from ident_service.motion.ticket import subject_of, ticket_from_json
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.ring_sink import RingSink, SinkEnds

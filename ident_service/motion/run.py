@@ -1,4 +1,8 @@
-"""Run a motion: check and arm, then follow the references of a plan (`plans.py`), every cycle guarded and recorded.
+"""Run one motion: check, enable, follow the plan, end; keep an open arm served while its host is busy.
+
+Drives treat a host that falls silent as dead and disable themselves or stop. So code that plans, checks or asks a
+person while an arm is open lets cycles without torque go on meanwhile. In virtual time no drive waits, and the block
+just runs. With torque on nothing else is done at all: the loop's thread would have to share the interpreter.
 
 The loop owns no file: it hands samples to a sink that keeps the disk away, and a sink that fails stops the arm under
 control like one that is slow. The stop path is `_halt`: torque away, no condition, nothing that can raise.
@@ -6,38 +10,124 @@ control like one that is slow. The stop path is `_halt`: torque away, no conditi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, MotionRefused
-from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, control_model
-from ident_service.model.contact import Contact
+from ident_service.model.collision import Contact
 from ident_service.model.expected_friction import friction_feedforward
-from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop
-from ident_service.motion.attended import attended
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.controls import Controls, StopWhen
-from ident_service.motion.course import Course
-from ident_service.motion.deadlines import Deadlines, longest_stall
-from ident_service.motion.faults import FAULTS, HOLD
-from ident_service.motion.guard import Guard
-from ident_service.motion.latch import Latch
-from ident_service.motion.loop import REST_CYCLES, REST_SPEED, Loop, Peaks
+from ident_service.motion.clearance import Surroundings
+from ident_service.motion.command_channel import Controls, StopWhen
+from ident_service.motion.control_loop import REST_CYCLES, REST_SPEED, Loop, Peaks
+from ident_service.motion.control_loop import Sink as Sink
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.cycle_timing import Deadlines, longest_stall
+from ident_service.motion.encoder_observer import owed_ways
+from ident_service.motion.faults import FAULTS, HOLD, Latch
 from ident_service.motion.lowering import lowest_point
-from ident_service.motion.owed import owed_ways
-from ident_service.motion.plans import Excite, Plan
-from ident_service.motion.reference import rest
-from ident_service.motion.sink import Sink as Sink
-from ident_service.motion.speed import require_factor, slowed_limits
-from ident_service.motion.states import LAWFUL, State, States
-from ident_service.motion.surroundings import Surroundings
+from ident_service.motion.run_plan import Excite, Plan
+from ident_service.motion.safety_monitor import Guard
+from ident_service.motion.sequencer import Course
+from ident_service.motion.speed_scaling import require_factor, slowed_limits
+from ident_service.motion.state_machine import LAWFUL, State, States
+from ident_service.motion.trajectory import rest
+
+_SWITCH = 2e-4  # s after which the cycles get the interpreter from the other thread, instead of 5 ms
+_FIRST_COME = (os.SCHED_FIFO, os.SCHED_RR)  # threads of one priority let each other run only when they wait
+_FIRST = -20  # of the nice values
+
+
+@contextmanager
+def attended(arm: Arm) -> Iterator[None]:
+    """Exchange cycles without torque in a background thread for as long as the block lasts, which must not use the arm.
+
+    Args:
+        arm: open, not enabled.
+
+    Raises:
+        ArmError: a cycle failed, told when the block has ended; likewise whatever else a driver may raise.
+    """
+    if arm.clock.lock_step:
+        yield
+        return
+    ended, over = threading.Event(), threading.Event()
+    failures: list[Exception] = []
+
+    def cycles() -> None:
+        try:
+            while not ended.is_set():
+                arm.exchange(None)
+        except Exception as error:  # noqa: BLE001 - whatever it is, no cycles are exchanged from here on
+            failures.append(error)
+        finally:
+            over.set()
+
+    thread = threading.Thread(target=cycles, name="attended")
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(min(before, _SWITCH))
+    try:
+        thread.start()
+        with unhurried():
+            yield
+    finally:
+        ended.set()
+        sys.setswitchinterval(before)
+        if thread.ident is not None:
+            _wait_for(over)
+    if failures:
+        raise failures[0]
+
+
+def _wait_for(over: threading.Event) -> None:
+    """Wait until the background thread has ended, however often the wait is interrupted: the caller needs the arm."""
+    interrupted: KeyboardInterrupt | None = None
+    while not over.is_set():
+        try:
+            over.wait()
+        except KeyboardInterrupt as error:
+            interrupted = error
+    if interrupted is not None:
+        raise interrupted
+
+
+@contextmanager
+def unhurried() -> Iterator[None]:
+    """Work at no real-time priority, but before all that has none, where real time was granted (`realtime.py`).
+
+    Cycles in a thread that was started before go first. What works for seconds at a real-time priority starves all else
+    on its core, for which the kernel stops every real-time process there for up to 50 ms of a second
+    (sched_rt_runtime_us, or the fair server of Linux 6.12): in the middle of the motion that follows.
+    """
+    policy, granted = os.sched_getscheduler(0), os.sched_getparam(0)
+    if policy not in _FIRST_COME:
+        yield
+        return
+    thread = threading.get_native_id()
+    nice = os.getpriority(os.PRIO_PROCESS, thread)
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, thread, _FIRST)
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            os.sched_setscheduler(0, policy, granted)
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, thread, nice)
+
 
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 

@@ -23,12 +23,11 @@ from pathlib import Path
 from typing import Final
 
 from ident_service.errors import ParameterError, UsageError
-from ident_service.operations.arm_state import arm_folder
 from ident_service.operations.drift_alarms import end_alarms
-from ident_service.registry.audit import note as audit
 from ident_service.registry.database import Database
-from ident_service.results.files import appearing_folder, write_atomically
-from ident_service.results.manifest import file_sha256
+from ident_service.registry.database import note as audit
+from ident_service.registry.state_folder import arm_folder
+from ident_service.results.manifest import appearing_folder, file_sha256, write_atomically
 
 PARAMETERS, URDF, ARM = "parameters.json", "identified.urdf", "arm.json"
 ACCEPTED, CURRENT, ACT = "accepted", "current", "acceptance.json"

@@ -34,12 +34,11 @@ from typing import Any, BinaryIO, Final
 from urllib.parse import quote
 
 from ident_service import __version__
-from ident_service.daemon.jobs.reach import moving_arms
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.motion.fault_file import CONTROLS
-from ident_service.operations.state_folder import LOCK, RESTORING, URL_FILE, require_whole, single_instance
-from ident_service.registry.audit import note
-from ident_service.registry.database import FILE, Database
+from ident_service.motion.fault_store import CONTROLS
+from ident_service.operations.moving_arms import moving_arms
+from ident_service.registry.database import FILE, Database, note
+from ident_service.registry.state_folder import LOCK, RESTORING, URL_FILE, require_whole, single_instance
 from ident_service.registry.tokens import TOKEN_FILE, revoke_first_tokens
 
 FORMAT: Final = "ident-backup"

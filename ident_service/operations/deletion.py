@@ -16,15 +16,14 @@ from pathlib import Path
 from typing import Final, Literal
 
 from ident_service.errors import Dependent, DriverError, InUse, UnknownId, UsageError
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import arm_folder, control_path, fault_file
+from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.maintenance_schedule import remove_schedule
 from ident_service.registry.arms import DESCRIPTIONS, know_shipped
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 from ident_service.registry.jobs import LIVE
 from ident_service.registry.motions import MOTIONS, known_motion
 from ident_service.registry.runs import REPORTS, RUNS, known_run
+from ident_service.registry.state_folder import arm_folder, control_path, fault_file
 
 _GONE: Final = ".deleted"
 _PLACES: Final = (RUNS, MOTIONS, DESCRIPTIONS, "arms")

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from drivers.canopen.bus_load import Budget
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm, mistake
+from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ModelError, MotionRefused, ParameterError
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters, remarks_on_angles
+from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import AfterStop, after_stop
-from ident_service.operations.bus import bus_lines, require_budget
+from ident_service.operations.fieldbus import bus_lines, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
 _NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a mechanism begins with

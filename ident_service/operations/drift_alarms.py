@@ -1,12 +1,51 @@
-"""Keep drift alarms: a re-identification that found a change raises one, a person acknowledges it."""
+"""Judge a comparison with the accepted set, and raise, keep and close drift alarms."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
+
+_MOST = 4000  # characters
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Verdict of a re-identification.
+
+    Attributes:
+        state: `unchanged`, `changed` or `impossible`.
+        words: what changed, by how many sigma, what it may mean, and torque errors.
+    """
+
+    state: str
+    words: str
+
+
+def verdict_of(document: Mapping[str, Any]) -> Verdict:
+    """Return the verdict of a comparison of two parameter sets.
+
+    Args:
+        document: `comparison.json`.
+    """
+    state, pair = str(document["verdict"]), document["compared"][0]
+    parts = [_finding(one) for one in pair["findings"]] or ([pair["reason"]] if pair["reason"] else [])
+    errors = pair["torque_error_percent"]
+    if errors is not None:
+        parts.append(
+            f"torque error on the new recording: accepted parameters {errors['reference']['whole']:.3g} %, "
+            f"its own {errors['own']['whole']:.3g} %"
+        )
+    return Verdict(state, f"{state}: {'; '.join(parts)}"[:_MOST] if parts else state)
+
+
+def _finding(one: Mapping[str, Any]) -> str:
+    size = f", {one['size']}" if one["size"] else ""
+    return f"{one['what']} ({one['sigma']:.1f} sigma{size}): {one['meaning']}"
+
 
 LONGEST_NOTE: Final = 2000
 

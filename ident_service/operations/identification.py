@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from ident_service.config.arm import ArmConfig, Method
 from ident_service.config.load import folder_of, load_arm, load_recording_format, mistake
-from ident_service.config.schema import ArmConfig, Method
 from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
-from ident_service.estimation.essential import essential_parameters
 from ident_service.estimation.feasible.convex import convex_least_squares
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.feasible.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.model_reduction import essential_parameters
 from ident_service.estimation.plausibility import (
     reasons_against,
     reasons_in_length,
@@ -37,8 +37,7 @@ from ident_service.operations.recordings import (
 )
 from ident_service.recordings.quality import Quality
 from ident_service.recordings.recording import Recording
-from ident_service.results.files import write_atomically
-from ident_service.results.replacing import replacing_folder, require_replaceable
+from ident_service.results.manifest import replacing_folder, require_replaceable, write_atomically
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
 

@@ -1,4 +1,7 @@
-"""Keep the schedules of an arm (cron, operating hours, maintenance) and what is due by them.
+"""Schedule re-identification by cron (cronsim, UTC), operating hours or maintenance, and tell what is due.
+
+Times are UTC: no hour comes twice or never. Beside numbers, ranges, steps, lists and English names in three letters,
+cronsim knows `L` (last day of the month, `5L`: last Friday) and `1#2` (second Monday).
 
 A time that was missed, because nothing ran or the clock was wrong, is due once. It stays due until a re-identification
 of the arm came to a verdict, or a person dismisses it; meanwhile its schedule adds nothing. Operating hours count only
@@ -9,14 +12,59 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Final
 
+from cronsim import CronSim, CronSimError
+
 from ident_service.errors import UnknownId, UsageError
-from ident_service.operations.cron import parse_cron
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 from ident_service.registry.motions import known_motion
 from ident_service.registry.runs import operating_seconds
+
+_FIELDS: Final = 5
+_LONGEST: Final = 200  # characters
+
+
+@dataclass(frozen=True)
+class Cron:
+    """Times given by cron's five fields.
+
+    Attributes:
+        text: the five fields as they were given, with single spaces.
+    """
+
+    text: str
+
+    def after(self, at: float) -> float:
+        """Return the first instant after `at`; both [s since 1970 in UTC].
+
+        Raises:
+            UsageError: no such day comes within fifty years.
+        """
+        found = next(CronSim(self.text, datetime.fromtimestamp(at, UTC)), None)
+        if found is None:
+            raise UsageError(f"{self.text!r}: no such day ever comes")
+        return found.timestamp()
+
+
+def parse_cron(text: str) -> Cron:
+    """Parse cron's five fields: minute, hour, day of month, month, day of week.
+
+    Raises:
+        UsageError: they are not; the message names the field.
+    """
+    words = text.split() if len(text) <= _LONGEST else []
+    if len(words) != _FIELDS:
+        raise UsageError(f"{text[:_LONGEST]!r}: cron has five fields: minute, hour, day of month, month, day of week")
+    cron = Cron(" ".join(words))
+    try:
+        cron.after(0.0)
+    except CronSimError as error:
+        # cronsim names the field: "Bad day-of-month", also for a day that its months never have.
+        raise UsageError(f"{cron.text!r}: {str(error).lower()} in cron's five fields") from None
+    return cron
+
 
 MAINTENANCE: Final = "maintenance"
 LONGEST_WHAT: Final = 200
@@ -33,7 +81,7 @@ class When:
     """Rule for when a re-identification is due; exactly one of these.
 
     Attributes:
-        cron: five fields in UTC (`cron.py`); None otherwise.
+        cron: five fields in UTC; None otherwise.
         hours: of operation, since it was last due [h]; None otherwise.
         maintenance: after each maintenance event.
     """

@@ -1,4 +1,4 @@
-"""Draft an arm's description from its URDF, with all that a simulated run needs, guessed where unknown.
+"""Write a first description of an arm from its URDF, complete enough to simulate.
 
 Values of the URDF are taken over; missing ones are guessed cautiously, and marked as guesses in a comment. The
 simulated arm differs from the prior: its links, drives and friction are drawn at random about it, so that identifying
@@ -10,33 +10,255 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
+from ident_service.config.motion_design import BASE
+from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import TextFile
-from ident_service.config.workspace import BASE
 from ident_service.errors import ModelError, MotionRefused, UsageError
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
-from ident_service.model.base import base_parameters, remarks_on_angles
+from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
 from ident_service.model.likely_bodies import drawn_about, likely_bodies, lines_of, with_urdf_bodies
 from ident_service.model.mechanism import count_mechanism, read_mechanism
 from ident_service.model.outline import mesh_capsules
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
-from ident_service.motion.preflight_check import Verdict
-from ident_service.operations.commission import require_clear_from_home
-from ident_service.operations.draft import CLEARANCE, ENCODER, LARGEST_USE, RATE, Draft, in_yaml, short
-from ident_service.operations.urdf_says import Said, arm_part, said_of
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
+from ident_service.motion.ticket import Verdict
+from ident_service.operations.commissioning import require_clear_from_home
 from ident_service.preflight.static_checks import stability_check
 from ident_service.recordings.files import write_atomically
+
+_ARM = 3  # joints that make a branch an arm and not a gripper
+
+
+@dataclass(frozen=True)
+class Said:
+    """Limits of a joint in a URDF; None where it has none that is plausible."""
+
+    position: tuple[float, float] | None
+    velocity: float | None
+    effort: float | None
+
+
+def arm_part(text: str, file: str, base: str | None, tip: str | None) -> dict[str, Any]:
+    """Return which part of a URDF is the arm: from the root along the branch with most joints to its gripper.
+
+    Args:
+        text: of the file, whose elements were counted.
+        file: its name.
+        base: link that the arm stands on; the root when None.
+        tip: link that it ends at; found when None.
+
+    Returns:
+        The keys of `kinematics`.
+
+    Raises:
+        ModelError: not well-formed, or several roots.
+    """
+    try:
+        robot = ET.fromstring(text)  # noqa: S314 - counted before
+    except ET.ParseError as error:
+        raise ModelError(f"{file}: not well-formed XML: {error}") from None
+    part: dict[str, Any] = {"urdf": file}
+    if base is not None:
+        part["base"] = base
+    if tip is not None:
+        return part | {"tip": tip}
+    children: dict[str, list[tuple[str, str, bool]]] = {}
+    carried, leaders = set(), set()
+    for joint in robot.findall("joint"):
+        parent, child = (joint.find(role) for role in ("parent", "child"))
+        if parent is None or child is None:
+            continue
+        mimic = joint.find("mimic")
+        moves = joint.get("type") in ("revolute", "continuous", "prismatic") and mimic is None
+        if mimic is not None:
+            leaders.add(mimic.get("joint", ""))
+        children.setdefault(parent.get("link", ""), []).append((child.get("link", ""), joint.get("name", ""), moves))
+        carried.add(child.get("link", ""))
+    roots = [link.get("name", "") for link in robot.findall("link") if link.get("name", "") not in carried]
+    if base is None and len(roots) != 1:
+        raise ModelError(f"{file}: {len(roots)} links hang on no joint; name the arm's --base")
+
+    def depth(link: str) -> int:
+        return max((moves + depth(child) for child, _, moves in children.get(link, [])), default=0)
+
+    link, branched = roots[0] if base is None else base, False
+    while True:
+        ways = [(moves + depth(child), child, name, moves) for child, name, moves in children.get(link, [])]
+        ways = [way for way in ways if way[0] > 0]
+        if not ways:
+            break
+        longest = max(ways, key=lambda way: way[0])
+        count, onward, joint_name, moves = longest
+        # The gripper begins where branches too short for an arm part, or at a joint that others mimic.
+        if count < _ARM and (len(ways) > 1 or (moves and joint_name in leaders)):
+            branched = True
+            break
+        branched = branched or len(ways) > 1 or len(children.get(link, [])) > 1
+        link = onward
+    return part | {"tip": link} if branched else part
+
+
+def said_of(text: str) -> dict[str, Said]:
+    """Return the limits of every joint of a URDF whose elements were counted, by its name."""
+    found = {}
+    for joint in ET.fromstring(text).findall("joint"):  # noqa: S314 - counted before
+        limit = joint.find("limit")
+
+        def number(key: str, limit: ET.Element | None = limit) -> float | None:
+            try:
+                value = float(limit.get(key, "nan")) if limit is not None else float("nan")
+            except ValueError:
+                return None
+            return value if np.isfinite(value) else None
+
+        lower, upper = number("lower"), number("upper")
+        ranged = lower is not None and upper is not None and lower < upper and joint.get("type") != "continuous"
+        position = (float(lower or 0.0), float(upper or 0.0)) if ranged else None
+        velocity, effort = number("velocity"), number("effort")
+        found[joint.get("name", "")] = Said(
+            position,
+            velocity if velocity is not None and 0.0 < velocity < 100.0 else None,
+            effort if effort is not None and 0.0 < effort < 1e5 else None,
+        )
+    return found
+
+
+RATE = 500.0  # Hz, at which most arms' gains are stable and a simulation is quick
+CLEARANCE = 0.02  # m
+FRICTION_GUESS = 0.04  # of the torque limits, what the description expects
+ENCODER = 2e-5  # rad or m, of the simulated arm
+_DRAFT_SECONDS = 20.0  # of a motion
+LARGEST_USE = 0.6  # share of the limits of the first motion that is tried
+
+
+@dataclass
+class Draft:
+    """Decided content of a description, to be written as YAML.
+
+    Attributes:
+        name: of the arm.
+        urdf: name of the file beside the description.
+        part: the keys of its kinematics.
+        joints: keys of each joint.
+        geometry: capsules of links whose meshes are replaced.
+        may_touch: pairs that always touch.
+        prior: names and values where the URDF's bodies are not those of real links; empty where they are.
+        use: share of the limits that the motions take.
+        seeds: of the two motions.
+        frequency: of the two motions [Hz].
+        cutoff: of the velocity's low-pass [Hz].
+        standstill: speed below which a joint counts as standing [rad/s or m/s]; 0 for what is usual.
+        total_mass: largest of the arm [kg].
+        truth: of the simulated arm.
+        remarks: what was guessed, for people.
+    """
+
+    name: str
+    urdf: str
+    part: dict[str, Any]
+    joints: dict[str, dict[str, Any]] = field(default_factory=dict)
+    geometry: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    may_touch: list[tuple[str, str]] = field(default_factory=list)
+    prior: dict[str, float] = field(default_factory=dict)
+    use: float = LARGEST_USE
+    seeds: tuple[int, int] = (1, 2)
+    frequency: float = 0.1
+    cutoff: float = 30.0
+    standstill: float = 0.0
+    total_mass: float = 0.0
+    truth: dict[str, float] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+
+def short(value: float, digits: int = 4) -> float:
+    """Round a number to some significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
+def in_yaml(draft: Draft) -> str:
+    """Return the description as YAML with comments."""
+    guessed = "\n".join(f"#   {line}" for line in draft.remarks)
+    head = f"""\
+# {draft.name}, begun by `ident new` from {draft.urdf}. Look through it before a real arm moves by it.
+# Guessed or chosen:
+{guessed}
+format: ident-arm
+version: 1
+name: {_flow(draft.name)}
+
+kinematics: {_flow(draft.part)}
+
+gravity: [0, 0, -9.81] # m/s^2 in the base frame: the arm stands upright
+terms: [drive_inertia, viscous, coulomb, offset]
+"""
+    units = (
+        "# rad, rad/s, rad/s^2, rad/s^3, N m; for slides m, m/s, m/s^2, m/s^3, N\n"
+        "# Accelerations, jerks, following errors, gains, home and the drives' inertias are guesses."
+    )
+    parts = [head]
+    if draft.joints:
+        rows = "".join(f"  {_flow(name)}:\n    {_flow(keys)}\n" for name, keys in draft.joints.items())
+        parts.append(f"{units}\njoints:\n{rows}")
+    if draft.prior:
+        parts.append(
+            f"prior: # SI units, in the link frames; whose are guessed is said above\n  {_flow(draft.prior)}\n"
+        )
+    if draft.total_mass:
+        parts.append(f"constraints: {{total_mass: {{upper: {draft.total_mass:g}}}}} # kg, twice what its links have\n")
+    cutoff = "" if draft.cutoff == 30.0 else f", velocity_cutoff: {draft.cutoff:g}"
+    parts.append(f"control: {{rate: {RATE:g}{cutoff}}} # Hz\n")
+    if draft.geometry:
+        rows = "".join(f"  {_flow(name)}: {_flow(each)}\n" for name, each in draft.geometry.items())
+        parts.append(f"geometry: # m, in the link frames; around the URDF's meshes\n{rows}")
+    space: dict[str, Any] = {"clearance": CLEARANCE}
+    if draft.may_touch:
+        space["may_touch"] = [list(pair) for pair in draft.may_touch]
+    parts.append(
+        f"workspace: {_flow(space)} # m\n"
+        "# What else must not be touched, in the braces above, with motions that are clear of it (`ident design`):\n"
+        "#   obstacles: {table: {half_space: {normal: [0, 0, 1], offset: -0.1}}}\n"
+    )
+    parts.append(
+        f"design: {{friction_guess: [{FRICTION_GUESS:g}, {FRICTION_GUESS:g}]}} # shares of the torque limits\n"
+    )
+    if draft.standstill:
+        parts.append(f"identification: {{reversal: {{speed: {draft.standstill:g}}}}} # rad/s or m/s\n")
+    periods = round(_DRAFT_SECONDS * draft.frequency)
+    motion = {
+        "kind": "seeded", "about": "home", "base_frequency": draft.frequency, "harmonics": 5, "periods": periods,
+        "use": draft.use,
+    }  # fmt: skip
+    first, second = ({**motion, "seed": seed} for seed in draft.seeds)
+    parts.append(f"motions:\n  identification: {_flow(first)}\n  validation: {_flow(second)}\n")
+    torque = [keys["torque"] for keys in draft.joints.values()]
+    noise, step = ([short(share * value, 2) for value in torque] for share in (2e-3, 2e-4))
+    driver: dict[str, Any] = {
+        "kind": "simulated", "time": "virtual", "seed": 1, "truth": draft.truth, "encoder_resolution": ENCODER,
+        "torque_resolution": step, "torque_noise": noise, "delay_cycles": 1,
+    }  # fmt: skip
+    rows = "".join(f"  {key}: {_flow(value)}\n" for key, value in driver.items() if value or key == "seed")
+    parts.append(f"driver: # a simulated arm whose links, drives and friction are drawn about the prior's\n{rows}")
+    return "\n".join(parts)
+
+
+def _flow(value: Any) -> str:
+    """Return a value in YAML's flow style on one line."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10**6).strip()
+    return text.removesuffix("\n...").removesuffix("...").strip()
+
 
 _MOST_TURNS = 8.0 * np.pi  # rad; a larger range is taken for degrees
 _TURN, _SLIDE = 3.14, 0.5  # rad and m either way, of joints without limits

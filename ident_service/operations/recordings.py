@@ -15,14 +15,13 @@ from ident_service.config.recording import RecordingFormat, disagreements, units
 from ident_service.errors import RecordingError, UsageError
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
+from ident_service.recordings.adapters import MeasuredRecording, RangeRecording, first_stamp, without_standstill
+from ident_service.recordings.cached_recording import KeptRecording
 from ident_service.recordings.files import split_range
-from ident_service.recordings.kept import KeptRecording
-from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.mcap_records import MAGIC
-from ident_service.recordings.measured import MeasuredRecording
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.part import RangeRecording, first_stamp, without_standstill
 from ident_service.recordings.quality import Quality, quality
 from ident_service.recordings.recording import Recording
 

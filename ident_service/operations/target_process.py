@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.load import arm_from_json
-from ident_service.estimation.doubt import shares
-from ident_service.estimation.growing import GrowingInformation
+from ident_service.estimation.online import GrowingInformation
 from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
+from ident_service.estimation.uncertainty import shares
 from ident_service.model.arm_model import arm_model
+from ident_service.recordings.mcap_follower import RecordingTail
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Block
-from ident_service.recordings.tail import RecordingTail
 
 _LOOK = 0.3  # s between polls
 _IN_A_ROW = 2  # consecutive steps below the target: deviations are estimates, and may dip below it once by chance

@@ -11,7 +11,7 @@ from ident_service.certificate_verifier import Arm, Verification, VerificationEr
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
-    from ident_service.config.schema import ArmConfig
+    from ident_service.config.arm import ArmConfig
 
 _FILE = "parameters.json"
 # Sections of a description that say nothing about bodies; an identification may have used others, which its file names.
@@ -54,7 +54,7 @@ def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
     from ident_service.estimation.certificate import stated_arm
     from ident_service.estimation.feasible.feasible_set import feasible_set
     from ident_service.model.arm_model import arm_model
-    from ident_service.model.base import base_parameters
+    from ident_service.model.base_parameters import base_parameters
 
     config = arm_from_json(Path(arm)) if arm.endswith(".json") else load_arm(arm)
     model = arm_model(config)
@@ -68,7 +68,7 @@ def _sha256(config: ArmConfig, file: Path) -> str:
     """Return the hash of the description with the sections that the file says it was identified with."""
     from pydantic import ValidationError
 
-    from ident_service.config.schema import ArmConfig
+    from ident_service.config.arm import ArmConfig
 
     try:
         changes = json.loads(read_file(file))["arm"]["changes"]

@@ -15,7 +15,7 @@ import numpy as np
 from drivers.arm import Vector
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.zero_phase import local_polynomial
-from ident_service.motion.preflight_check import Measure, measure
+from ident_service.motion.ticket import Measure, measure
 from ident_service.preflight.session import Session, Trace
 
 FREQUENCY = 15.0  # Hz: high enough for a phase, low enough for an amplitude of some encoder steps

@@ -15,15 +15,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits, Vector
+from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.zero_phase import local_polynomial
-from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, judged, measures
-from ident_service.motion.reference import Reference, Setpoint, rest
-from ident_service.motion.surroundings import way_clearance
-from ident_service.motion.way import RuckigReference, way
+from ident_service.motion.clearance import way_clearance
+from ident_service.motion.ticket import Check, Measure, Verdict, failed, judged, measures
+from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, rest, way
 from ident_service.preflight.delay import FREQUENCY, Delay, delay_measures, dither
 from ident_service.preflight.session import BAND, Rows, Session, Trace
 from ident_service.preflight.stability import INERTIA, drive_matrix, known_drives

@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits, Vector
+from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.expected_friction import ExpectedFriction
-from ident_service.motion.preflight_check import Check, Verdict, failed, joint_units, judged, measures
+from ident_service.motion.ticket import Check, Verdict, failed, joint_units, judged, measures
 from ident_service.preflight.direction import sign_failure, wrong_signs
-from ident_service.preflight.remedy import remedy_of
-from ident_service.preflight.session import Rows, Session
+from ident_service.preflight.session import Rows, Session, remedy_of
 from ident_service.preflight.static_checks import HOLDABLE
 
 SETTLE, HOLD = 0.3, 1.0  # s before the mean is taken, and over which

@@ -12,11 +12,11 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, Vector
 from drivers.axis_status import AxisStatus
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
-from ident_service.motion.preflight_check import Check, Verdict, failed, joint_units, judged, measure, measures, skipped
+from ident_service.motion.ticket import Check, Verdict, failed, joint_units, judged, measure, measures, skipped
 
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
 LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)

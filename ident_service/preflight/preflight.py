@@ -16,20 +16,30 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.axis_status import AxisStatus
 from drivers.clock import Clock, RealClock
-from ident_service.config.limits import MotionLimits, Vector, motion_limits
+from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
-from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.expected_friction import ExpectedFriction, expected_friction
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.model.threads import one_blas_thread
-from ident_service.motion.attended import attended
-from ident_service.motion.control import ComputedTorque
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.clearance import admitting, reachable
+from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.last_position import LastPosition
-from ident_service.motion.outside import admitting, reachable
-from ident_service.motion.preflight_check import ABOUT_THE_MOTION, CODES, Check, Verdict, failed, skipped
-from ident_service.motion.reference import hold, rest
-from ident_service.motion.ticket import VALID, Ticket, new_ticket, subject_of
+from ident_service.motion.run import attended
+from ident_service.motion.ticket import (
+    ABOUT_THE_MOTION,
+    CODES,
+    VALID,
+    Check,
+    Ticket,
+    Verdict,
+    failed,
+    new_ticket,
+    skipped,
+    subject_of,
+)
+from ident_service.motion.trajectory import hold, rest
 from ident_service.preflight import gravity as weight
 from ident_service.preflight.delay import delay_of
 from ident_service.preflight.direction import (
@@ -53,8 +63,7 @@ from ident_service.preflight.passive_checks import (
     rate_check,
     unreachable,
 )
-from ident_service.preflight.remedy import remedy_of
-from ident_service.preflight.session import Rows, Session, trace_of
+from ident_service.preflight.session import Rows, Session, remedy_of, trace_of
 from ident_service.preflight.static_checks import (
     away_from_home,
     configuration_check,

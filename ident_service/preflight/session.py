@@ -1,4 +1,7 @@
-"""Run the part of preflight with torque: a control loop that may move the arm by next to nothing.
+"""Run the part of preflight with torque: a closed loop that may go next to nowhere.
+
+Such a fault names its own joint. For other faults (an arm that does not go where it should) the trace must tell more:
+`preflight.py` looks there for wrong signs.
 
 The arm has just been seen at rest without torque, so it is supported where it stands. The loop is that of a run, but
 its guard stops it `FARTHEST` from where it should be, at a crawl, and its torque is kept to a band around the model's
@@ -18,16 +21,70 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Flags, Sample, StopKind, Vector
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.expected_friction import ExpectedFriction
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.deadlines import Elapsed
-from ident_service.motion.guard import Guard, Reaction
-from ident_service.motion.reference import Reference, Setpoint
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.cycle_timing import Elapsed
+from ident_service.motion.safety_monitor import Guard, Reaction
+from ident_service.motion.trajectory import Reference, Setpoint
 from ident_service.preflight.stability import INERTIA, known_drives
+
+_DRIVE = "Read the drive's own fault code and mend its cause; then `ident recover` tells what else is in the way."
+_LINK = "Check power, cables and bus of the axes named, and the drives' own fault codes."
+_ENCODER = "Check the encoder of the joint named, its cable and connectors; free the joint if it is jammed."
+
+_SUPPLY = "Check the limits that the drive keeps by itself, its temperature and its supply."
+
+# By codes of `faults.FAULTS`, also of warnings that went on for too long.
+REMEDIES: dict[str, str] = {
+    "emergency_stop": "Find out why the emergency stop was pressed or its circuit is open, then release it.",
+    "drive_fault": _DRIVE,
+    "drive_emergency": _DRIVE,
+    "drive_restarted": _DRIVE,
+    "drive_left": _DRIVE,
+    "torque_ignored": _DRIVE,
+    "drive_silent": _LINK,
+    "status_stale": _LINK,
+    "feedback_gone": _LINK,
+    "driver": _LINK,
+    "bus_off": _LINK,
+    "bus_silent": _LINK,
+    "bus_degraded": _LINK,
+    "second_host": "Stop or disconnect whatever else commands the arm.",
+    "frozen_encoder": _ENCODER,
+    "feedback_not_finite": _ENCODER,
+    "encoder_jumps": _ENCODER,
+    "encoder_jump": _ENCODER,
+    "lost_feedback": _LINK,
+    "strange_frame": _LINK,
+    "torque_not_applied": _SUPPLY,
+    "torque_limited": _SUPPLY,
+    "drive_warning": _SUPPLY,
+    "drive_notice": _DRIVE,
+    "drive_watchdog": (
+        "Compare control.rate with the drives' watchdog in the driver's section, and look for other load on this "
+        "machine: the drives must hear from it well within that time."
+    ),
+}
+
+
+def remedy_of(fault: ArmFault) -> str | None:
+    """Return one sentence that says what to do about a fault.
+
+    Args:
+        fault: that ended the loop.
+
+    Returns:
+        None where the fault does not say what failed: the arm is not where it should be, too fast, or told too much.
+    """
+    code = fault.code
+    if code == "repeated_warnings":  # its sentence begins with the warning's code
+        code = str(fault).removeprefix(f"{code}: ").split(" ", 1)[0]
+    return REMEDIES.get(code)
+
 
 FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motions that prove directions
 FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by far

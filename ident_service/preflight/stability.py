@@ -24,11 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.config.limits import MotionLimits, Vector
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
+from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import UsageError
 from ident_service.model.arm_model import ArmModel, control_model
-from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.pinocchio_models import InverseDynamics
 
 INERTIA = (0.5, 2.0)  # every link's true inertia, as a share of the model's
 # Drive inertia that the model lacks, as a share of the joint's inertia: where it has some, and where it has none.

@@ -6,21 +6,20 @@ import numpy as np
 
 from drivers.canopen.bus_load import budget
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.limits import MotionLimits, Vector, motion_limits
+from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import IdentError, ModelError, MotionRefused
-from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.proof import objections, proof_of
+from ident_service.excitation.limit_proof import objections, proof_of
+from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
-from ident_service.motion.attended import unhurried
-from ident_service.motion.plans import Destination, GoTo
-from ident_service.motion.preflight_check import Check, Measure, Verdict, failed, joint_units, judged, measure, measures
-from ident_service.motion.reference import PathReference, rest
-from ident_service.motion.stop import require_stops_within_limits
-from ident_service.motion.surroundings import stop_clearance, way_clearance
-from ident_service.motion.way import way
+from ident_service.motion.clearance import stop_clearance, way_clearance
+from ident_service.motion.run import unhurried
+from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.stop_trajectory import require_stops_within_limits
+from ident_service.motion.ticket import Check, Measure, Verdict, failed, joint_units, judged, measure, measures
+from ident_service.motion.trajectory import PathReference, rest, way
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
 
 # What drives may take to notice that the host is gone where joints can fall: what falls freely has sunk 5 cm after it

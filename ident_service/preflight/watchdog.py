@@ -16,8 +16,8 @@ from drivers.arm import Arm, Flags, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisStatus
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.preflight_check import Check, Verdict, failed, judged, measure, skipped
-from ident_service.motion.reference import Setpoint
+from ident_service.motion.ticket import Check, Verdict, failed, judged, measure, skipped
+from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.session import Session
 from ident_service.preflight.static_checks import LONGEST_SILENCE
 

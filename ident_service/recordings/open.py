@@ -8,13 +8,12 @@ from typing import Final, Literal
 
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.errors import RecordingError, UsageError
-from ident_service.recordings.csv_file import GZIP_MAGIC, CsvRecording
+from ident_service.recordings.adapters import ENOUGH, JointSideRecording, MeasuredRecording
+from ident_service.recordings.csv_reader import GZIP_MAGIC, CsvRecording
 from ident_service.recordings.files import require_file
-from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.mcap_records import MAGIC
-from ident_service.recordings.measured import ENOUGH, MeasuredRecording
 from ident_service.recordings.recording import Recording
-from ident_service.recordings.transmission import JointSideRecording
 
 PLAIN: Final = RecordingFormat()
 

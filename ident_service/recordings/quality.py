@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import UsageError
-from ident_service.recordings.grid import Grid, Segment, grid, trimmed
 from ident_service.recordings.recording import Block, Matrix, Recording, cut, join
-from ident_service.recordings.timing import Timing
+from ident_service.recordings.resampling import Grid, Segment, Timing, grid, trimmed
 
 Array = NDArray[np.float64]
 

@@ -23,10 +23,9 @@ from pathlib import Path
 from typing import Final
 
 from ident_service.errors import RecordingError
-from ident_service.recordings import ring_memory as at
+from ident_service.recordings import ring_buffer as at
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.ring import RingWriter
-from ident_service.recordings.ring_memory import State
+from ident_service.recordings.ring_buffer import RingWriter, State
 
 SHARE: Final = 0.5
 SILENCE_NS: Final = 2_000_000_000

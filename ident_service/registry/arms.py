@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
-from ident_service.config.shipped import shipped_arms
+from ident_service.config.yaml_source import shipped_arms
 from ident_service.errors import AlreadyThere, ConfigError, Problem, UnknownId, UsageError
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
-from ident_service.results.files import appearing_folder
+from ident_service.registry.database import Database, Row, note
+from ident_service.results.manifest import appearing_folder
 
 DESCRIPTIONS: Final = "descriptions"
 ARM_FILE: Final = "arm.yaml"

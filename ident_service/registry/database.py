@@ -1,19 +1,28 @@
-"""Open and migrate the registry's database, and use it in short transactions from any thread.
+"""Keep the service's memory in one SQLite file: opened, migrated, written in short transactions, with its audit log.
+
+A step that has been released is never changed; a new one is appended. Times are seconds since 1970 in UTC.
 
 Write-ahead logging with full synchronisation: what a transaction has written is on the disk when it ends, and a kill at
 any moment loses nothing of it. Other processes of the same machine (`ident accept`) may use the file at the same time.
 One connection writes and another one reads: who reads does not wait for who writes, here or in another process.
+
+What was done at a terminal while the registry was kept waits as a file below `STATE/audit.waiting`. The daemon enters
+it, or the next act at a terminal, with the time of the act.
 """
 
 from __future__ import annotations
 
 import errno
+import json
+import logging
 import math
 import os
 import re
+import secrets
 import sqlite3
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,8 +30,225 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from ident_service.errors import DiskFull, IdentError, RegistryBusy, UsageError
-from ident_service.operations.state_folder import require_whole
-from ident_service.registry.migrations import MIGRATIONS
+from ident_service.recordings.files import write_atomically
+from ident_service.registry.state_folder import leave_to_owner, require_whole
+
+_FIRST = """
+CREATE TABLE arms (
+    name TEXT PRIMARY KEY,
+    sha256 TEXT NOT NULL,
+    description TEXT NOT NULL,
+    source TEXT NOT NULL CHECK (source IN ('shipped', 'uploaded')),
+    folder TEXT,                       -- below the state folder, of an uploaded description
+    resources TEXT NOT NULL,           -- JSON list: what one motion at a time may have (arm, buses)
+    unattended INTEGER NOT NULL DEFAULT 0 CHECK (unattended IN (0, 1)),
+    added REAL NOT NULL,
+    added_by TEXT NOT NULL
+) STRICT;
+
+CREATE TABLE motions (
+    id TEXT PRIMARY KEY,
+    arm TEXT NOT NULL,
+    name TEXT NOT NULL,
+    duration REAL NOT NULL,            -- s
+    sha256 TEXT NOT NULL,
+    added REAL NOT NULL,
+    added_by TEXT NOT NULL
+) STRICT;
+
+CREATE TABLE jobs (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    id TEXT NOT NULL UNIQUE,
+    kind TEXT NOT NULL,
+    arm TEXT,
+    state TEXT NOT NULL CHECK (state IN
+        ('queued', 'running', 'done', 'refused', 'failed', 'faulted', 'cancelled', 'interrupted')),
+    motion INTEGER NOT NULL CHECK (motion IN (0, 1)),
+    request TEXT NOT NULL,             -- JSON
+    words TEXT NOT NULL,               -- JSON list: the command's
+    run TEXT,                          -- id of the folder that it makes
+    created REAL NOT NULL,
+    created_by TEXT NOT NULL,
+    started REAL,
+    ended REAL,
+    process TEXT,                      -- pid and start, to find it again after a crash of ours
+    exit_code INTEGER,
+    detail TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE INDEX jobs_by_state ON jobs (state, number);
+
+CREATE TABLE runs (
+    id TEXT PRIMARY KEY,
+    kind TEXT NOT NULL,
+    arm TEXT NOT NULL,
+    arm_sha256 TEXT,
+    created REAL NOT NULL,
+    ending TEXT NOT NULL,              -- done, stopped, an error in words, or 'killed'
+    manifest_sha256 TEXT,              -- NULL: killed before it had one
+    indexed REAL NOT NULL
+) STRICT;
+
+CREATE TABLE recordings (
+    run TEXT NOT NULL REFERENCES runs (id) ON DELETE CASCADE,
+    name TEXT NOT NULL,
+    sha256 TEXT NOT NULL,
+    bytes INTEGER NOT NULL,
+    deleted REAL,
+    PRIMARY KEY (run, name)
+) STRICT;
+
+CREATE TABLE parameter_sets (
+    run TEXT PRIMARY KEY REFERENCES runs (id) ON DELETE CASCADE,
+    sha256 TEXT NOT NULL,
+    arm TEXT NOT NULL,
+    method TEXT NOT NULL,
+    feasible INTEGER CHECK (feasible IN (0, 1)),
+    relative_error_percent REAL
+) STRICT;
+
+CREATE TABLE acceptances (
+    arm TEXT NOT NULL,
+    number INTEGER NOT NULL,
+    run TEXT NOT NULL,
+    origin INTEGER NOT NULL,           -- the acceptance whose set it is: its own number, or that rolled back to
+    parameters_sha256 TEXT NOT NULL,
+    note TEXT NOT NULL,
+    at REAL NOT NULL,
+    who TEXT NOT NULL,
+    PRIMARY KEY (arm, number)
+) STRICT;
+
+CREATE TABLE schedules (
+    id INTEGER PRIMARY KEY,
+    arm TEXT NOT NULL,
+    cron TEXT,
+    trigger TEXT,
+    request TEXT NOT NULL,             -- JSON of the job
+    enabled INTEGER NOT NULL DEFAULT 1 CHECK (enabled IN (0, 1)),
+    last REAL,
+    next REAL,
+    created REAL NOT NULL,
+    created_by TEXT NOT NULL,
+    CHECK ((cron IS NULL) <> (trigger IS NULL))
+) STRICT;
+
+CREATE TABLE maintenance_events (
+    id INTEGER PRIMARY KEY,
+    arm TEXT NOT NULL,
+    what TEXT NOT NULL,
+    note TEXT NOT NULL,
+    at REAL NOT NULL,
+    who TEXT NOT NULL
+) STRICT;
+
+CREATE TABLE tokens (
+    name TEXT PRIMARY KEY,
+    role TEXT NOT NULL CHECK (role IN ('viewer', 'operator')),
+    sha256 TEXT NOT NULL UNIQUE,
+    created REAL NOT NULL,
+    revoked REAL
+) STRICT;
+
+CREATE TABLE audit (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    at REAL NOT NULL,
+    who TEXT NOT NULL,
+    what TEXT NOT NULL,
+    about TEXT NOT NULL,
+    detail TEXT NOT NULL               -- JSON
+) STRICT;
+CREATE TRIGGER audit_stays BEFORE UPDATE ON audit BEGIN SELECT RAISE(ABORT, 'the audit trail is append-only'); END;
+CREATE TRIGGER audit_keeps BEFORE DELETE ON audit BEGIN SELECT RAISE(ABORT, 'the audit trail is append-only'); END;
+"""
+
+_MAINTENANCE = """
+ALTER TABLE runs ADD COLUMN seconds REAL;  -- that the arm was driven; NULL: its folder does not say
+ALTER TABLE schedules ADD COLUMN counted REAL NOT NULL DEFAULT 0; -- operating seconds when it was last due
+
+CREATE TABLE reidentifications (
+    id TEXT PRIMARY KEY,
+    arm TEXT NOT NULL,
+    step TEXT NOT NULL CHECK (step IN ('check', 'run', 'identify', 'judge')),
+    state TEXT NOT NULL CHECK (state IN ('running', 'unchanged', 'changed', 'impossible',
+        'refused', 'failed', 'faulted', 'cancelled', 'interrupted')),
+    motion TEXT,
+    against INTEGER NOT NULL,          -- number of the acceptance
+    unattended INTEGER NOT NULL CHECK (unattended IN (0, 1)),
+    job TEXT,                          -- of the step; NULL where a terminal does them
+    recorded TEXT,                     -- id of the run with the recording
+    run TEXT,                          -- id of the run with the parameters and the comparison
+    detail TEXT NOT NULL DEFAULT '',
+    begun REAL NOT NULL,
+    begun_by TEXT NOT NULL,
+    ended REAL
+) STRICT;
+CREATE UNIQUE INDEX one_reidentification ON reidentifications (arm) WHERE state = 'running';
+
+CREATE TABLE dues (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    arm TEXT NOT NULL,
+    schedule INTEGER NOT NULL,
+    cause TEXT NOT NULL,
+    at REAL NOT NULL,
+    late INTEGER NOT NULL CHECK (late IN (0, 1)), -- found long after its time
+    told INTEGER NOT NULL DEFAULT 0 CHECK (told IN (0, 1)),
+    tried INTEGER NOT NULL DEFAULT 0 CHECK (tried IN (0, 1)), -- whether it was decided if it begins by itself
+    closed REAL,
+    closed_by TEXT,
+    how TEXT NOT NULL DEFAULT ''
+) STRICT;
+CREATE UNIQUE INDEX one_due ON dues (schedule) WHERE closed IS NULL;
+
+CREATE TABLE alarms (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    arm TEXT NOT NULL,
+    reidentification TEXT NOT NULL,
+    run TEXT NOT NULL,
+    what TEXT NOT NULL,                -- findings, in words
+    at REAL NOT NULL,
+    told INTEGER NOT NULL DEFAULT 0 CHECK (told IN (0, 1)),
+    closed REAL,
+    closed_by TEXT,
+    how TEXT NOT NULL DEFAULT ''
+) STRICT;
+"""
+
+_SESSIONS = """
+CREATE TABLE sessions (
+    sha256 TEXT PRIMARY KEY,           -- of the word in the browser's cookie
+    token TEXT NOT NULL,               -- SHA-256 of the token that it was exchanged for
+    until REAL NOT NULL
+) STRICT;
+"""
+
+_KEYS = """
+CREATE TABLE idempotency_keys (
+    who TEXT NOT NULL,                 -- name of the token
+    key TEXT NOT NULL,
+    request TEXT NOT NULL,             -- SHA-256 of what was asked with it
+    job TEXT NOT NULL,
+    at REAL NOT NULL,
+    PRIMARY KEY (who, key)
+) STRICT;
+"""
+
+_DELIVERIES = """
+CREATE TABLE deliveries (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    id TEXT NOT NULL UNIQUE,           -- webhook-id
+    arm TEXT NOT NULL,
+    body TEXT NOT NULL,                -- JSON, as it is signed and sent
+    created REAL NOT NULL,
+    tries INTEGER NOT NULL DEFAULT 0,
+    next REAL,                         -- when it is tried; NULL: delivered, or given up
+    delivered REAL,
+    why TEXT NOT NULL DEFAULT ''       -- the last try failed
+) STRICT;
+CREATE INDEX deliveries_by_next ON deliveries (next);
+"""
+
+MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS, _DELIVERIES)
+
 
 FILE: Final = "registry.sqlite"
 _BUSY = 10.0  # s to wait for another process that writes
@@ -241,3 +467,140 @@ def _statements(script: str) -> Iterator[str]:
             statement = ""
     if statement.strip():
         yield statement
+
+
+_AGAIN: Final = 1.0  # s between attempts to enter a line that the registry cannot take
+_MOST_WAITING: Final = 10_000
+_WAITING: Final = "audit.waiting"
+LOG = logging.getLogger("ident.audit")
+_Line = tuple[float, str, str, str, str]
+
+
+def note(db: Database, who: str, what: str, about: str, **detail: Any) -> None:
+    """Add one line to the audit trail.
+
+    Args:
+        db: the registry.
+        who: the name of a token, `terminal:NAME`, or `service`.
+        what: one word or two: `job created`, `accepted`.
+        about: id of the arm, job or run.
+        detail: JSON values.
+    """
+    _enter(db, _line(who, what, about, detail))
+
+
+def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> None:
+    """Leave one line, with the time of now, for whoever can write the registry next; as `note`.
+
+    Args:
+        state: the state folder.
+        who: as for `note`.
+        what: as for `note`.
+        about: as for `note`.
+        detail: as for `note`.
+
+    Raises:
+        OSError, UsageError: it cannot be written either.
+    """
+    path = state / _WAITING / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    write_atomically(path, json.dumps(_line(who, what, about, detail)))
+    leave_to_owner(state, path)
+
+
+def enter_waiting(db: Database, state: Path) -> None:
+    """Enter the lines that `note_later` has left; each once, whoever is killed meanwhile."""
+    place = state / _WAITING
+    for path in sorted(place.glob("*.json")) if place.is_dir() else ():
+        try:
+            at, *words = json.loads(path.read_text(encoding="utf-8"))
+            who, what, about, detail = map(str, words)
+            line = (float(at), who, what, about, detail)
+        except (OSError, ValueError, TypeError) as error:  # another process was first, or somebody's file
+            LOG.warning("%s: not entered: %s", path, error)
+            continue
+        with db.transaction():
+            if db.row("SELECT 1 FROM audit WHERE (at, who, what, about) = (?, ?, ?, ?)", *line[:4]) is None:
+                _enter(db, line)
+        path.unlink(missing_ok=True)
+
+
+class AuditQueue:
+    """Queue of audit lines that a thread enters: whoever stops an arm waits neither for a disk nor for a process."""
+
+    def __init__(self, db: Database) -> None:
+        """Start the thread."""
+        self._db, self._lines, self._changed = db, deque[_Line](), threading.Condition()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="audit", daemon=True)
+        self._thread.start()
+
+    def note(self, who: str, what: str, about: str, **detail: Any) -> None:
+        """Queue one line with the present time; never waits."""
+        line = _line(who, what, about, detail)
+        with self._changed:
+            if len(self._lines) < _MOST_WAITING:
+                self._lines.append(line)
+                self._changed.notify_all()
+                return
+        LOG.error("a line of the audit trail is lost, because too many wait: %s", line)
+
+    def flush(self, seconds: float) -> bool:
+        """Wait until every line is entered, at most `seconds`; return whether all are."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._lines, seconds)
+
+    def close(self, seconds: float = 5.0) -> None:
+        """Enter the queued lines, as far as the registry takes them in `seconds`, and end the thread."""
+        self.flush(seconds)
+        self._ending.set()
+        with self._changed:
+            self._changed.notify_all()
+        self._thread.join(seconds)
+        for line in self._lines:
+            LOG.error("a line of the audit trail is lost, because the registry cannot be written: %s", line)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._lines or self._ending.is_set())
+                if self._ending.is_set():
+                    return
+                line = self._lines[0]
+            try:
+                _enter(self._db, line)
+            except sqlite3.Error as error:
+                LOG.error("the audit trail cannot be written yet: %s", error)
+                self._ending.wait(_AGAIN)
+                continue
+            with self._changed:
+                self._lines.popleft()
+                self._changed.notify_all()
+
+
+def _line(who: str, what: str, about: str, detail: dict[str, Any]) -> _Line:
+    return time.time(), who, what, about, json.dumps(detail, allow_nan=False)
+
+
+def _enter(db: Database, line: _Line) -> None:
+    db.write("INSERT INTO audit (at, who, what, about, detail) VALUES (?, ?, ?, ?, ?)", *line)
+
+
+def trail(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
+    """Return lines of the audit trail, the newest first, from the one before the id `before`."""
+    rows = db.rows(
+        "SELECT * FROM audit WHERE id < ? ORDER BY id DESC LIMIT ?", 2**62 if before is None else before, most
+    )
+    return [{**row, "detail": json.loads(row["detail"])} for row in rows]
+
+
+def trail_after(db: Database, line: int, most: int = 500) -> list[Row]:
+    """Return lines of the audit trail after the one of this id, the earliest first."""
+    rows = db.rows("SELECT * FROM audit WHERE id > ? ORDER BY id LIMIT ?", line, most)
+    return [{**row, "detail": json.loads(row["detail"])} for row in rows]
+
+
+def last_line(db: Database) -> int:
+    """Return the id of the newest line; 0 where there is none."""
+    row = db.row("SELECT MAX(id) AS id FROM audit")
+    return int(row["id"] or 0) if row is not None else 0

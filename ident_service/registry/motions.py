@@ -10,11 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.excitation.excitation import excitation_from_json, read_excitation
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
-from ident_service.results.files import appearing_folder, write_atomically
-from ident_service.results.manifest import file_sha256
+from ident_service.excitation.motion_file import excitation_from_json, read_excitation
+from ident_service.registry.database import Database, Row, note
+from ident_service.results.manifest import appearing_folder, file_sha256, write_atomically
 
 MOTIONS: Final = "motions"
 MOTION_FILE: Final = "motion.json"

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 
 Role = Literal["viewer", "operator"]
 TOKEN_FILE: Final = "token"  # noqa: S105 - a file's name

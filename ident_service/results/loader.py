@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json, load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError, ParameterError, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.dynamic_model import DynamicModel
-from ident_service.results.export.arm import IdentifiedArm, identified_arm, read_identified
+from ident_service.results.export.identified_arm import IdentifiedArm, identified_arm, read_identified
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS
 

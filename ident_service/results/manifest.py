@@ -1,19 +1,111 @@
-"""Write and verify the manifest of a folder: name and SHA-256 of every file in it.
+"""Write files whole or not at all; name and verify those of a folder by SHA-256.
 
 Nothing is believed of a folder that is read before every file has the hash that its manifest names.
+
+What an earlier result left behind would stand beside a manifest that does not name it; a file of the same name that a
+person has put there, or a recording, would be lost. So a folder that holds anything else is refused.
 """
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
-from collections.abc import Mapping
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 from ident_service import __version__
 from ident_service.errors import ParameterError, UsageError
-from ident_service.results.files import write_atomically
+from ident_service.recordings.files import (
+    write_atomically as write_atomically,  # what motion writes, too, appears whole
+)
+
+_EXCHANGE = 2  # RENAME_EXCHANGE
+
+
+def require_place(folder: Path) -> None:
+    """Refuse a folder that could not be written, before work is done for it.
+
+    Raises:
+        UsageError: it is a file, or lies where nothing can be written.
+    """
+    place = folder
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise UsageError(f"{place}: is a file, not a folder")
+    if not os.access(place, os.W_OK | os.X_OK) or str(place.resolve()).startswith("/proc"):
+        raise UsageError(f"{folder}: cannot be written: no permission in {place}")
+
+
+@contextmanager
+def appearing_folder(folder: Path) -> Iterator[Path]:
+    """Yield a place to build a folder's content in, which gets its name when the block ends without an error.
+
+    A folder that exists keeps its other files; files of the same name are replaced one by one.
+
+    Raises:
+        UsageError: the folder's place cannot be written, or is a file.
+    """
+    with staging_beside(folder) as staging:
+        yield staging
+        if folder.exists():
+            for path in sorted(staging.iterdir()):
+                path.replace(folder / path.name)
+            staging.rmdir()
+        else:
+            staging.rename(folder)
+
+
+@contextmanager
+def staging_beside(folder: Path) -> Iterator[Path]:
+    """Yield a place beside a folder to build its content in; removed with its content after an error.
+
+    Raises:
+        UsageError: the folder's place cannot be written, or is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is a file, not a folder")
+    place = folder.resolve()  # a link to a folder stays one, and "." has a name
+    staging = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        staging.mkdir()
+    except OSError as error:
+        raise UsageError(f"{folder}: cannot be written: {error.strerror}") from None
+    try:
+        yield staging
+    except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise
+
+
+def exchange_folders(one: Path, other: Path) -> None:
+    """Exchange the names of two folders of one file system, at once where the kernel can (renameat2, Linux 3.15).
+
+    Elsewhere a kill may come between two renames; nothing is lost then, but `other` stands under a hidden name.
+
+    Raises:
+        OSError: they cannot be renamed; nothing is changed.
+    """
+    renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    names = [os.fsencode(path.absolute()) for path in (one, other)]  # absolute: what they are relative to is not used
+    if renameat2 is not None and renameat2(0, names[0], 0, names[1], _EXCHANGE) == 0:
+        return
+    between = other.with_name(f".{other.name}.{secrets.token_hex(4)}.old")
+    other.rename(between)
+    try:
+        one.rename(other)
+    except OSError:
+        between.rename(other)
+        raise
+    between.rename(one)
+
 
 MANIFEST: Final = "manifest.json"
 _MAX_BYTES = 64 * 2**20
@@ -96,3 +188,70 @@ def hashes(folder: Path) -> dict[str, str]:
     """Return name to SHA-256 of every file in a folder but its manifest and hidden ones."""
     paths = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
     return {path.name: file_sha256(path) for path in paths if path.name != MANIFEST}
+
+
+# Endings of files of identifications and payloads; never of recordings, which are made once.
+_MADE = (".json", ".urdf", ".txt", ".html", ".py", ".dat-s")
+_TOLD = 3
+
+
+def require_replaceable(folder: Path) -> None:
+    """Refuse a folder that results may not be written to.
+
+    Raises:
+        UsageError: it is a file, or holds what is no earlier result; with what it is, and the remedy.
+    """
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: is a file, not a folder")
+    if not (others := _others(folder)):
+        return
+    told = ", ".join(others[:_TOLD]) + (f" and {len(others) - _TOLD} more" if len(others) > _TOLD else "")
+    raise UsageError(
+        f"{folder}: holds what is not of an earlier result: {told}; give a folder that does not exist, or move that"
+        " elsewhere"
+    )
+
+
+def _others(folder: Path) -> list[str]:
+    """Return the names of what a folder holds beside an unchanged earlier result, with the reasons."""
+    found = sorted(path.name for path in folder.iterdir())
+    try:
+        named = dict(named_files(folder)) if MANIFEST in found else {}
+    except ParameterError:
+        named = {}
+    ours = {name for name, sha256 in named.items() if name.endswith(_MADE) and _is(folder / name, sha256)}
+    ours |= {MANIFEST} if named else set()
+    return [name if name not in named else _why(folder / name, name) for name in found if name not in ours]
+
+
+def _is(path: Path, sha256: str) -> bool:
+    return path.is_file() and not path.is_symlink() and file_sha256(path) == sha256
+
+
+def _why(path: Path, name: str) -> str:
+    return name if not name.endswith(_MADE) or path.is_symlink() else f"{name} (changed since)"
+
+
+@contextmanager
+def replacing_folder(folder: Path) -> Iterator[Path]:
+    """Yield a place to build a folder of results in, which replaces an earlier result when the block ends well.
+
+    Raises:
+        UsageError: the folder holds anything but an earlier result, before or after the block, or cannot be written.
+    """
+    require_replaceable(folder)
+    with staging_beside(folder) as staging:
+        yield staging
+        require_replaceable(folder)
+        place = folder.resolve()
+        try:
+            if place.exists():
+                exchange_folders(staging, place)
+                shutil.rmtree(staging)
+            else:
+                staging.rename(place)
+        except OSError as error:
+            what = f"{folder}: cannot be replaced: {error.strerror}"
+            raise UsageError(f"{what}; give a folder that does not exist") from None

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from ident_service.errors import UsageError
-from ident_service.results.drawing import LARGEST, Array, Axes, Canvas, number, require_drawable, round_values, visible
+from ident_service.results.plots import LARGEST, Array, Axes, Canvas, number, require_drawable, round_values, visible
 
 QUANTITIES = ("position", "velocity", "acceleration", "torque")
 _UNITS = {

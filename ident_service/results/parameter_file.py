@@ -1,38 +1,154 @@
-"""Write `parameters.json` from an estimate, and read it from anywhere, always validated against its schema.
+"""Write `parameters.json` from an estimate, and read one from anywhere, always held against its schema.
+
+With it, a parameter file can be asked without its recording how well other parameters explain the same torques, and
+what a change of parameters does to them.
 
 Only the expressions and their values are required to read one, so that any paper's table can be tested.
+
+Pure computation, no I/O; what the values say of an arm is each reader's business.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
+from importlib.resources import files
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+import jsonschema_rs
 import numpy as np
 
 from ident_service import __version__
 from ident_service.certificate_verifier import INERTIAL, JOINT_TERMS, VerificationError, split_name
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import TorqueError
-from ident_service.model.base import BaseParameters, base_from_expressions
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions, parse_expression
 from ident_service.model.chain import Array
-from ident_service.model.expressions import parse_expression
+from ident_service.model.information import Information
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
-from ident_service.results.files import write_atomically
-from ident_service.results.information_document import information_document
-from ident_service.results.link_values import implausible_links
-from ident_service.results.rows_and_filter import how_fitted
-from ident_service.results.schemas import require_schema
-from ident_service.results.strict_json import strict_json
+from ident_service.results.manifest import write_atomically
+from ident_service.results.summary import how_fitted, implausible_links
+
+
+def strict_json(text: str) -> Any:
+    """Parse a JSON text strictly.
+
+    Raises:
+        ValueError: not JSON, or a number that is none.
+        RecursionError: nested too deeply.
+    """
+    return json.loads(text, parse_constant=_refuse, parse_float=_finite, parse_int=_finite_whole)
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is not a number that JSON knows")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is too large for a double")
+    return value
+
+
+def _finite_whole(text: str) -> int:
+    _finite(text)
+    return int(text)
+
+
+_MOST = 10  # mistakes that are reported
+# Each mistake holds a copy of what is wrong: 16 MB of them took 5 GB. So only these parts of a document are checked.
+_VALUES, _ENTRIES, _KEYS, _CHARACTERS = 20_000, 200, 1000, 1000
+
+
+def require_schema(content: Any, name: str, where: object, what: str) -> None:
+    """Validate a document against `NAME.schema.json`.
+
+    Args:
+        content: JSON values.
+        name: of the schema: `parameters`, `evidence`, `comparison` or `payload`.
+        where: file that it comes from or goes to.
+        what: it ought to be, for the message.
+
+    Raises:
+        ParameterError: it does not fit; the first mistakes with their places.
+    """
+    validator = _validator(name)
+    if validator.is_valid(content):
+        return
+    found = validator.iter_errors(_first(content, [_VALUES]))
+    mistakes = sorted(((_place(one.instance_path), one.message) for one in found), key=lambda mistake: mistake[0])
+    told = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
+    raise ParameterError(f"{where}: not {what}: {told or f'something is wrong beyond its first {_ENTRIES} entries'}")
+
+
+def _first(value: Any, room: list[int]) -> Any:
+    """Copy the first parts of a document; `room` is how many values it may still have."""
+    room[0] -= 1
+    if isinstance(value, list):
+        return [_first(one, room) for one in value[:_ENTRIES] if room[0] > 0]
+    if isinstance(value, dict):
+        return {key: _first(one, room) for key, one in islice(value.items(), _KEYS) if room[0] > 0}
+    return value[:_CHARACTERS] if isinstance(value, str) else value
+
+
+def _place(path: Sequence[str | int]) -> str:
+    return "$" + "".join(f".{key}" if isinstance(key, str) else f"[{key}]" for key in path)
+
+
+@cache
+def _validator(name: str) -> jsonschema_rs.Draft202012Validator:
+    schema = json.loads(files("ident_service.results").joinpath(f"{name}.schema.json").read_text(encoding="utf-8"))
+    return jsonschema_rs.Draft202012Validator(schema)
+
+
+def information_document(information: Information) -> list[dict[str, Any]]:
+    """Return one entry per joint: equations, the base parameters it feels (from 0), its triangle row by row."""
+    joints = []
+    for support, factor, rows in zip(information.supports, information.factors, information.rows, strict=True):
+        size = len(support) + 1
+        square = np.zeros((size, size))
+        square[: len(factor)] = factor
+        triangle = square[np.triu_indices(size)]
+        joints.append({"rows": int(rows), "parameters": support.tolist(), "triangle": triangle.tolist()})
+    return joints
+
+
+def information_from(joints: list[dict[str, Any]], base: int) -> Information:
+    """Return the information of a document, the inverse of `information_document`.
+
+    Args:
+        joints: as it was written.
+        base: number of base parameters.
+
+    Raises:
+        ParameterError: triangles of the wrong size, or about parameters that are not there.
+    """
+    supports, factors = [], []
+    for number, joint in enumerate(joints, 1):
+        support = np.array(joint["parameters"], dtype=np.intp)
+        size = len(support) + 1
+        upper = np.triu_indices(size)
+        if len(joint["triangle"]) != len(upper[0]) or np.any(np.diff(support) <= 0) or np.any(support >= base):
+            raise ParameterError(f"information of joint {number} is not about {base} base parameters")
+        factor = np.zeros((size, size))
+        factor[upper] = joint["triangle"]
+        supports.append(support)
+        factors.append(factor)
+    rows = np.array([joint["rows"] for joint in joints], dtype=np.int64)
+    return Information(tuple(supports), tuple(factors), rows, base)
+
 
 MAX_BYTES = 4 * 2**20
 MOST_EXPRESSIONS = 1000
@@ -329,3 +445,66 @@ def _commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
+
+
+AGREEMENT = 1e-9
+"""Largest difference between base values and those of the link values, relative to the largest base value."""
+_LARGEST = 1e30  # largest value in SI units; far beyond every arm, and its square is still finite
+
+
+def require_consistent(file: ParameterFile, where: Path) -> None:
+    """Check that the values of a parameter file belong together.
+
+    Args:
+        file: what was read.
+        where: from, for errors.
+
+    Raises:
+        ParameterError: a number that no parameter has; base values that the link values do not have; or, without
+            constraints, unconstrained values that are not the values.
+    """
+    table = file.content["base_parameters"]
+    rows = {key: table.get(key, []) for key in ("values", "unconstrained_values", "standard_deviations")}
+    rows["link values"] = file.content.get("link_parameters", {}).get("values", [])
+    rows["covariance"] = [value for row in table.get("covariance", []) for value in row]
+    for key, values in rows.items():
+        largest = max((abs(float(value)) for value in values if value is not None), default=0.0)
+        if not largest <= _LARGEST:
+            raise ParameterError(f"{where}: {largest:g} among its {key}; no parameter of an arm is that large")
+    scale = AGREEMENT * float(np.abs(file.values).max())
+    free = table.get("unconstrained_values")
+    unheld = free is not None and file.content.get("feasible_set") == "none"
+    if unheld and np.abs(np.array(free, dtype=float) - file.values).max() > scale:
+        raise ParameterError(
+            f"{where}: was fitted without constraints, but its values are not its unconstrained values; one of them "
+            "was changed"
+        )
+    delta = named_link_values(file)
+    if delta is not None and set(file.base.names) <= set(delta):
+        require_base_values(file.base, np.array([delta[name] for name in file.base.names]), file.values, where)
+
+
+def named_link_values(file: ParameterFile) -> dict[str, float] | None:
+    """Return link values by name; None where there are none, or names and values are not equally many."""
+    table = file.content.get("link_parameters")
+    if table is None or len(table["names"]) != len(table["values"]):
+        return None
+    return {name: float(value) for name, value in zip(table["names"], table["values"], strict=True)}
+
+
+def require_base_values(base: BaseParameters, delta: Array, values: Array, where: Path) -> None:
+    """Check that link values have the base values.
+
+    Args:
+        base: the grouping.
+        delta: link values in its order, shape (parameters,).
+        values: base values, shape (base,).
+        where: they come from, for errors.
+
+    Raises:
+        ParameterError: they do not.
+    """
+    if np.abs(base.K @ delta - values).max() > AGREEMENT * np.abs(values).max():
+        raise ParameterError(
+            f"{where}: its link parameters do not have the values of its base parameters; one of them was changed"
+        )

@@ -1,4 +1,9 @@
-"""Draw the arm along its motion as a stick figure, from the side and from above, with its obstacles.
+"""Draw the arm along its motion as a stick figure in its surroundings, from the side and from above.
+
+Lengths in m, points in the base frame.
+
+A view is the pair of axes it shows: (0, 2) from the side, (0, 1) from above. Solids are drawn as their outline,
+half-spaces where they meet the plane of the view through the base frame's origin.
 
 Both views are orthographic and have the same scale, so lengths can be compared between them.
 """
@@ -6,13 +11,234 @@ Both views are orthographic and have the same scale, so lengths can be compared 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
-from ident_service.results.drawing import Array, Axes, Canvas, number, round_values
-from ident_service.results.drawing_style import STEPS
-from ident_service.results.postures import Box, Postures, Rod
-from ident_service.results.surroundings import draw_obstacle, draw_workspace, write_name
+from ident_service.errors import UsageError
+from ident_service.results.plots import STEPS, Array, Axes, Canvas, number, require_drawable, round_values
+
+
+@dataclass(frozen=True)
+class Box:
+    """Obstacle with eight corners [m], shape (8, 3), in any order."""
+
+    name: str
+    corners: Array
+
+
+@dataclass(frozen=True)
+class Plane:
+    """Obstacle that fills `normal . x < offset` [m]; `normal` has shape (3,) and points to free space."""
+
+    name: str
+    normal: Array
+    offset: float
+
+
+@dataclass(frozen=True)
+class Rod:
+    """Obstacle of all points within `radius` of the line between `ends` [m], shape (2, 3)."""
+
+    name: str
+    ends: Array
+    radius: float
+
+
+@dataclass(frozen=True)
+class Closest:
+    """Posture and pair of smallest clearance along a motion.
+
+    Attributes:
+        posture: number of the posture.
+        pair: names of the two things.
+        distance: between them [m]; below zero where they overlap.
+        points: the nearest point of either [m], shape (2, 3), or None.
+    """
+
+    posture: int
+    pair: tuple[str, str]
+    distance: float
+    points: Array | None = None
+
+
+@dataclass(frozen=True)
+class Postures:
+    """Arm along a motion, as points in the base frame.
+
+    Attributes:
+        frames: origins of links, base and tool among them [m], shape (postures, points, 3).
+        times: increasing [s], shape (postures,).
+        branches: for every branch of the arm the points from base to tool, two or more.
+        obstacles: what does not move.
+        workspace: lowest and highest corner of the box that the arm must stay in [m], shape (2, 3); infinite where it
+            is open; or None.
+        closest: the posture of smallest clearance, or None.
+    """
+
+    frames: Array
+    times: Array
+    branches: tuple[tuple[int, ...], ...]
+    obstacles: tuple[Box | Plane | Rod, ...] = ()
+    workspace: Array | None = None
+    closest: Closest | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse postures that cannot be drawn.
+
+        Raises:
+            UsageError: no postures, shapes that do not belong together, values that are no numbers, branches or a
+                closest posture that do not exist, obstacles without extent.
+        """
+        if self.frames.ndim != 3:
+            raise UsageError(f"cannot draw postures: {self.frames.shape=}, not (postures, points, 3)")
+        postures, points = self.frames.shape[:2]
+        require_drawable("postures", self.frames, (postures, points, 3))
+        require_drawable("times of postures", self.times, (postures,))
+        if not (np.diff(self.times) > 0.0).all():
+            raise UsageError("cannot draw postures: their times must increase")
+        if not self.branches or any(len(branch) < 2 for branch in self.branches):
+            raise UsageError(f"cannot draw postures: a branch joins two points or more, unlike one of {self.branches}")
+        if not all(0 <= point < points for point in chain(*self.branches)):
+            raise UsageError(f"cannot draw postures: the {points} points do not include all of {self.branches}")
+        for obstacle in self.obstacles:
+            _require_obstacle(obstacle)
+        if self.workspace is not None:
+            require_drawable("workspace", self.workspace, (2, 3), unlimited=True)
+            if not (self.workspace[0] < self.workspace[1]).all():
+                raise UsageError("cannot draw a workspace whose lowest corner is not below its highest")
+        if self.closest is not None:
+            if not 0 <= self.closest.posture < postures:
+                raise UsageError(f"cannot draw posture {self.closest.posture}; there are {postures}")
+            require_drawable("smallest distance", np.array([self.closest.distance]), (1,))
+            if self.closest.points is not None:
+                require_drawable("nearest points", self.closest.points, (2, 3))
+
+
+def _require_obstacle(obstacle: Box | Plane | Rod) -> None:
+    if isinstance(obstacle, Box):
+        require_drawable(f"obstacle {obstacle.name}", obstacle.corners, (8, 3))
+    elif isinstance(obstacle, Plane):
+        require_drawable(f"normal of obstacle {obstacle.name}", obstacle.normal, (3,))
+        require_drawable(f"offset of obstacle {obstacle.name}", np.array([obstacle.offset]), (1,))
+        if not np.abs(obstacle.normal).max() > 1e-9:
+            raise UsageError(f"cannot draw obstacle {obstacle.name}: its normal has no direction")
+    else:
+        require_drawable(f"obstacle {obstacle.name}", obstacle.ends, (2, 3))
+        require_drawable(f"radius of obstacle {obstacle.name}", np.array([obstacle.radius]), (1,))
+        if not obstacle.radius > 0.0:
+            raise UsageError(f"cannot draw obstacle {obstacle.name}: its radius is not above zero")
+
+
+def draw_obstacle(
+    canvas: Canvas, axes: Axes, view: tuple[int, int], obstacle: Box | Plane | Rod
+) -> tuple[float, float] | None:
+    """Draw an obstacle; return the middle of what is seen of it [px], or None where the view does not meet it."""
+    if isinstance(obstacle, Rod):
+        ends = obstacle.ends[:, list(view)]
+        (xa, xb), (ya, yb) = axes.x(ends[:, 0]), axes.y(ends[:, 1])
+        scale = axes.width / (axes.high_x - axes.low_x)
+        # Seen along any direction, all points near a line are a thick line with round ends.
+        canvas.line("rod", float(xa), float(ya), float(xb), float(yb), width=2.0 * obstacle.radius * scale)
+        outline = ends
+    elif isinstance(obstacle, Box):
+        outline = _hull(obstacle.corners[:, list(view)])
+        if _fills(axes, outline):
+            # The hall's floor, seen from above: no line of it is in the view.
+            return None
+        canvas.polygon("solid edge", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
+    else:
+        outline, border = _behind(axes, obstacle.normal[list(view)], obstacle.offset)
+        if not len(outline) or np.abs(obstacle.normal[list(view)]).max() <= 1e-6 * np.abs(obstacle.normal).max():
+            return None
+        canvas.polygon("solid", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
+        canvas.polyline("edge", axes.x(border[:, 0]), axes.y(border[:, 1]))
+    low = np.maximum(outline.min(axis=0), (axes.low_x, axes.low_y))
+    high = np.minimum(outline.max(axis=0), (axes.high_x, axes.high_y))
+    if (low > high).any():
+        return None
+    x, y = 0.5 * (low + high)
+    return float(axes.x(x)), float(axes.y(y))
+
+
+def write_name(canvas: Canvas, axes: Axes, words: str, x: float, y: float) -> None:
+    """Write a name in the middle of the object it names, moved so that it stays inside the view."""
+    half = 3.2 * len(words) + 4
+    x = min(max(x, axes.left + half), axes.left + axes.width - half)
+    y = min(max(y + 3.5, axes.top + 14), axes.top + axes.height - 6)
+    canvas.text("ink halo", x, y, words, size=10.5, anchor="middle")
+
+
+def _hull(points: Array) -> Array:
+    """Return the corners of the convex hull of points, shape (points, 2), in order (Andrew's monotone chain)."""
+    rows = sorted({(x, y) for x, y in points.tolist()})
+
+    def half(way: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        kept: list[tuple[float, float]] = []
+        for x, y in way:
+            while len(kept) > 1:
+                (xa, ya), (xb, yb) = kept[-2:]
+                if (xb - xa) * (y - ya) - (yb - ya) * (x - xa) > 0.0:
+                    break
+                kept.pop()
+            kept.append((x, y))
+        return kept
+
+    if len(rows) < 3:
+        return np.array(rows)
+    return np.array(half(rows)[:-1] + half(rows[::-1])[:-1])
+
+
+def _fills(axes: Axes, outline: Array) -> bool:
+    """Return whether a convex outline, in order, shape (corners, 2), contains the whole view."""
+    if len(outline) < 3:
+        return False
+    along = np.roll(outline, -1, axis=0) - outline
+    corners = [(x, y) for x in (axes.low_x, axes.high_x) for y in (axes.low_y, axes.high_y)]
+    to = np.array(corners)[:, None] - outline
+    return bool((along[:, 0] * to[..., 1] - along[:, 1] * to[..., 0] >= 0.0).all())
+
+
+def _behind(axes: Axes, normal: Array, offset: float) -> tuple[Array, Array]:
+    """Return the part of a view with `normal . x < offset`, and its border there.
+
+    Returns:
+        Corners of the part, shape (corners, 2), and the ends of the border, shape (2, 2); of length 0 if there is none.
+    """
+    corners = [
+        np.array(corner)
+        for corner in (
+            (axes.low_x, axes.low_y),
+            (axes.high_x, axes.low_y),
+            (axes.high_x, axes.high_y),
+            (axes.low_x, axes.high_y),
+        )
+    ]
+    part, border = [], []
+    for start, end in zip(corners, [*corners[1:], corners[0]], strict=True):
+        a, b = float(normal @ start) - offset, float(normal @ end) - offset
+        if a <= 0.0:
+            part.append(start)
+        if a * b < 0.0:
+            crossing = start + a / (a - b) * (end - start)
+            part.append(crossing)
+            border.append(crossing)
+    return np.array(part).reshape(-1, 2), np.array(border).reshape(-1, 2)
+
+
+def draw_workspace(canvas: Canvas, axes: Axes, view: tuple[int, int], box: Array) -> None:
+    """Draw the sides of the allowed box [m], shape (2, 3), that are not infinitely far away."""
+    i, j = view
+    left, right = np.clip(axes.x(np.clip(box[:, i], axes.low_x, axes.high_x)), axes.left, axes.left + axes.width)
+    bottom, top = np.clip(axes.y(np.clip(box[:, j], axes.low_y, axes.high_y)), axes.top, axes.top + axes.height)
+    for x, value in ((left, box[0, i]), (right, box[1, i])):
+        if np.isfinite(value):
+            canvas.line("edge room", x, top, x, bottom)
+    for y, value in ((bottom, box[0, j]), (top, box[1, j])):
+        if np.isfinite(value):
+            canvas.line("edge room", left, y, right, y)
+
 
 _SIDE, _TOP_VIEW = (0, 2), (0, 1)
 _NAMES = "xyz"

@@ -11,15 +11,14 @@ from pathlib import Path
 from typing import Any
 
 from ident_service import certificate_verifier
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
-from ident_service.results.export.urdf_file import write_urdf
-from ident_service.results.files import write_atomically
+from ident_service.results.export.urdf import write_urdf
 from ident_service.results.manifest import MANIFEST as MANIFEST
 from ident_service.results.manifest import hashes as hashes
-from ident_service.results.manifest import verified_files
+from ident_service.results.manifest import verified_files, write_atomically
 from ident_service.results.manifest import write_manifest as write_manifest
 from ident_service.results.parameter_file import (
     ParameterFile,

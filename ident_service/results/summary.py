@@ -1,19 +1,136 @@
-"""Summarise an estimate for a person at a terminal: verdict, errors (table 8), parameters (table 6)."""
+"""Summarise an estimate for a person at a terminal: verdict, errors, implausible link values.
+
+Motion shows base parameters; of the bodies behind them one near to likely bodies is chosen (`model/likely_bodies.py`).
+Where data press against the feasible set, little is left to choose from, and a link may come out as heavy as the arm or
+as a point beside it. Readers of a mass in a URDF should know.
+"""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ident_service.estimation.doubt import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
+from ident_service.config.arm import Identification
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
-from ident_service.model.layout import NO_STRIBECK
-from ident_service.model.likely_bodies import IN_WORDS
-from ident_service.results.link_values import WHAT_THEN, implausible_links
-from ident_service.results.rows_and_filter import how_fitted, wrapped
+from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
+from ident_service.model.likely_bodies import IN_WORDS, likely_bodies, lines_of
+from ident_service.model.parameter_layout import NO_STRIBECK
+from ident_service.results.evidence.gathering import ellipsoid
+
+
+def rows_and_filter(options: Identification) -> tuple[str, ...]:
+    """Describe the rows and the filters behind relative torque errors (eq. 84), one sentence each.
+
+    Args:
+        options: with which the equations were made.
+    """
+    smoothing, reversal = options.smoothing, options.reversal
+    if "choose" in (smoothing.cutoff, smoothing.decimate, options.edge):
+        chosen = "Rows and filter: chosen for each recording from the spectra of its positions; its ends are left out."
+        return (chosen,)
+    thinned = f", every {_said(smoothing.decimate)}th" if smoothing.decimate != 1 else ""
+    rows = f"All rows: every sample of a recording but {_said(options.edge)} s at its ends and at gaps{thinned}."
+    slow = f"is not faster than {reversal.speed:g} rad/s (or m/s)" if reversal.speed else "stands still"
+    near = f", and without those within {reversal.window:g} s of them" if reversal.window else ""
+    rows_moving = f"Away from standstill: without rows in which a drive of that joint {slow}{near}."
+    if smoothing.method == "butterworth":
+        low_pass = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_said(smoothing.cutoff)} Hz"
+    else:
+        low_pass = f"Savitzky-Golay polynomials of degree {smoothing.order}, cut-off {_said(smoothing.cutoff)} Hz"
+    position = f"Position, velocity and acceleration: through {low_pass}."
+    if options.period is not None:
+        return rows, rows_moving, position, f"Position and torque: averaged over periods of {options.period:g} s."
+    if smoothing.filter_torque:
+        other = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_said(smoothing.cutoff)} Hz"
+        torque = f"Measured torque: through {'the same low-pass' if smoothing.method == 'butterworth' else other}."
+    else:
+        torque = "Measured torque: as recorded, so that its noise counts as error."
+    if smoothing.regressor_cutoff is None:
+        return rows, rows_moving, position, torque
+    both = f"Then measured and predicted torque: through a low-pass at {smoothing.regressor_cutoff:g} Hz."
+    return rows, rows_moving, position, torque, both
+
+
+def how_fitted(estimate: Estimate) -> tuple[str, ...]:
+    """Describe how an estimate's rows and filters came about, one sentence each: what was given, chosen and weighed."""
+    shares = estimate.standstill_shares
+    low, high = (f"{share:.2g}" for share in (shares.min(), shares.max()))
+    weighed = f"{low} to {high}" if low != high else low
+    return (
+        *rows_and_filter(estimate.model.config.identification),
+        f"Rows near standstill: multiplied in the fit by {weighed}, as their own residuals have it.",
+        *(f"Chosen: {choice}." for choice in estimate.choices),
+        _noise_and_model(estimate),
+    )
+
+
+def _noise_and_model(estimate: Estimate) -> str:
+    """Describe how much of the deviations is noise and how much error of the model, as far as repetitions tell."""
+    if estimate.noise_deviations is None:
+        return "Most of the motion is not repeated, so that noise and error of the model cannot be told apart."
+    variances = np.diag(estimate.covariance)
+    known = np.isfinite(variances) & (variances > 0.0)
+    share = np.clip(estimate.noise_deviations[known] ** 2 / variances[known], 0.0, 1.0)
+    return (
+        f"The motion is repeated: {np.median(share):.0%} of a parameter's variance is noise (median; "
+        f"{share.min():.0%} to {share.max():.0%}), the rest is error of the model, which more periods do not diminish."
+    )
+
+
+def wrapped(sentences: Iterable[str]) -> list[str]:
+    """Wrap sentences into lines for a terminal."""
+    return [line for sentence in sentences for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")]
+
+
+def _said(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+MASSES = 10.0  # factor above or below a likely mass
+_REACH = 1.0 / 3.0  # of the arm's, from a likely centre, or the link's own length
+_SIZE, _TIMES = 0.5, 3.0  # of the arm's reach, and times a likely size
+
+WHAT_THEN = (
+    "Link values are chosen among bodies that move alike: torques are right all the same, but do not take these for the"
+    " arm's. Bounds in joints.*.body and constraints.total_mass, or a prior, tell more."
+)
+
+
+def implausible_links(estimate: Estimate) -> tuple[str, ...]:
+    """Return the links whose chosen values are implausible: which value, and beside which bound.
+
+    Args:
+        estimate: with link values; one without, or with values that a prior or custom knowledge asked for, has none
+            to name.
+    """
+    if estimate.delta is None or estimate.nearest_to is None:
+        return ()
+    model = estimate.model
+    chain, layout = model.chain, model.layout
+    likely = likely_bodies(model).delta
+    reach = float(np.linalg.norm([*chain.translation[1:], *chain.link_translation], axis=1).sum())
+    found = []
+    for link, name in enumerate(chain.names):
+        place = layout.inertial(link)
+        (mass, center, axes), (usual, middle, shape) = ellipsoid(estimate.delta[place]), ellipsoid(likely[place])
+        wrong = []
+        if not usual / MASSES <= mass <= usual * MASSES:
+            wrong.append(f"{mass:.2g} kg, where {usual / MASSES:.2g} to {usual * MASSES:.2g} kg are likely")
+        own = max(float(np.linalg.norm(np.subtract(line.end, line.start))) for line in lines_of(model, link))
+        away, most = float(np.linalg.norm(center - middle)), max(own, _REACH * reach)
+        if away > most:
+            wrong.append(f"its centre {away:.2g} m from a likely place, where {most:.2g} m would be much")
+        if axes is not None and shape is not None:
+            size, most = (float(np.linalg.norm(one, axis=1).max()) for one in (axes, shape))
+            most = max(_SIZE * reach, _TIMES * most)
+            if size > most:
+                wrong.append(f"an inertia as of a body that reaches {size:.2g} m, where {most:.2g} m would be much")
+        if wrong:
+            found.append(f"{name}: its link has {'; '.join(wrong)}")
+    return tuple(found)
 
 
 def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "commanded") -> str:

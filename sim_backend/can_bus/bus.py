@@ -13,7 +13,7 @@ from typing import Any
 
 import can
 
-from drivers.can.bus_errors import BusError
+from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 from sim_backend.can_bus.host import WireThread

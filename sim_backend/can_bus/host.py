@@ -13,9 +13,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
-from drivers.can.bus_errors import BusError
-from drivers.can.can_frame import Frame
-from drivers.can.sendable import check_sendable
+from drivers.can.bus_state import BusError
+from drivers.can.can_frame import Frame, check_sendable
 from drivers.clock import RealClock
 from sim_backend.can_bus.hub import Wire
 from sim_backend.can_bus.medium import Port

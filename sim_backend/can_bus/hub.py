@@ -18,12 +18,11 @@ from threading import RLock
 from types import TracebackType
 from typing import Final, Self
 
-from drivers.can.bus_errors import BusError
-from drivers.can.can_frame import Frame
-from drivers.can.kernel_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, pack_frames, unpack_frames
-from drivers.canopen.frame_bits import exact
+from drivers.can.bus_state import BusError
+from drivers.can.can_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, Frame, pack_frames, unpack_frames
+from drivers.canopen.bus_load import exact
 from ident_service.errors import DriverError
-from sim_backend.can_bus import address, packets
+from sim_backend.can_bus import link, packets
 from sim_backend.can_bus.medium import Medium, Port, overflow
 
 MOST_ENDS: Final = 32
@@ -93,7 +92,7 @@ class Wire:
         Raises:
             BusError: another process runs this wire, or its address cannot be had.
         """
-        self._listener = address.listen(self.name)
+        self._listener = link.listen(self.name)
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         return self
 
@@ -110,7 +109,7 @@ class Wire:
                 return
             for end in list(self._ends.values()):
                 self._drop(end)
-            address.forget(self.name, self._listener)
+            link.forget(self.name, self._listener)
             self._listener = None
             os.close(self._wake)
 
@@ -176,7 +175,7 @@ class Wire:
             return
         sock.setblocking(False)
         # A refused end is told in answer to its greeting: closed before, its unread greeting would hide the answer.
-        if address.trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
+        if link.trusted(sock) and len(self._ends) < 2 * MOST_ENDS and sock.fileno() < _SELECT_LIMIT:
             self._ends[sock.fileno()] = _End(sock)
         else:
             sock.close()
@@ -212,7 +211,7 @@ class Wire:
         if not self._answer(end, packets.CROWDED if crowded else packets.ACCEPTED) or crowded:
             self._drop(end)
             return
-        end.port = Port(hello.label, address.peer_pid(end.socket), own=hello.own, filters=hello.filters, fd=hello.fd)
+        end.port = Port(hello.label, link.peer_pid(end.socket), own=hello.own, filters=hello.filters, fd=hello.fd)
         self.medium.add(end.port)
 
     def _answer(self, end: _End, answer: int) -> bool:

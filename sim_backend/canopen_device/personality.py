@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.canopen.capabilities import TORQUE_UNITS
-from drivers.canopen.families import entry_of, family_of
+from drivers.canopen.capabilities import TORQUE_UNITS, entry_of, family_of
 from ident_service.config.canopen import CanopenDrive
+from ident_service.config.drive_family import Family, TorqueUnit
 from ident_service.config.eds import DataSheet, data_sheet
-from ident_service.config.family import Family, TorqueUnit
 from sim_backend.canopen_device.node import Node
 from sim_backend.canopen_device.objects import Objects
 
@@ -42,7 +41,7 @@ class Personality:
         rated: key of what a thousandth is of; None where a count is `scale`.
         scale: N m per unit of `rated`, or per count.
         shipped: whether it is the shipped data sheet's drive: it does at once what frames ask for, and has the
-            watchdogs of `makers.py`.
+            watchdogs of `drive.py`.
         motor: values that its maker's tool has entered, by key.
     """
 

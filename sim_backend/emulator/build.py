@@ -11,18 +11,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDrive, CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from sim_backend.build import build_machine
 from sim_backend.canopen_device.drive import CanopenDrive as Drive
 from sim_backend.canopen_device.personality import personality_of
-from sim_backend.emulator.body import Body
+from sim_backend.emulator.body import Body, Gears
 from sim_backend.emulator.emulator import Emulator
 from sim_backend.emulator.faults import PuckFault, configured
-from sim_backend.emulator.gears import Gears
 from sim_backend.emulator.motor import Motor, Power
 
 

@@ -15,8 +15,7 @@ from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 from sim_backend.emulator.body import Body
 from sim_backend.emulator.face import Face
-from sim_backend.emulator.faults import PuckFault
-from sim_backend.emulator.injection import Injection, Sent
+from sim_backend.emulator.faults import Injection, PuckFault, Sent
 from sim_backend.machine import Truth
 
 # An arm that moves is brought forward this often when nothing else happens [ns].

@@ -12,10 +12,9 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from drivers.can.can_frame import Frame
-from drivers.can.sendable import FD_LENGTHS
+from drivers.can.can_frame import FD_LENGTHS, Frame
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from sim_backend.can_bus.hub import Wire
 from sim_backend.can_bus.link import Connection, WireLink
 from sim_backend.can_bus.packets import Hello

@@ -9,9 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_bench import frames
 
-from drivers.can.can_frame import Frame
-from drivers.can.kernel_frame import MAX_PACKET_BYTES, from_kernel, pack_frames, to_kernel, unpack_frames
-from drivers.can.sendable import check_sendable
+from drivers.can.can_frame import (
+    MAX_PACKET_BYTES,
+    Frame,
+    check_sendable,
+    from_kernel,
+    pack_frames,
+    to_kernel,
+    unpack_frames,
+)
 from ident_service.errors import DriverError
 from sim_backend.can_bus import packets
 

@@ -14,11 +14,10 @@ from hypothesis import HealthCheck, given, settings
 from link_bench import arm_on_bus, frames, soon
 
 from drivers.can import python_can_link
-from drivers.can.bus_errors import BUS_OFF, RESTARTED, BusError
-from drivers.can.can_frame import Frame
+from drivers.can.bus_state import BUS_OFF, RESTARTED, BusError
+from drivers.can.can_frame import MOST_AT_ONCE, Frame
 from drivers.can.can_link import Link, open_links
 from drivers.can.python_can_link import PythonCanLink, bus_error
-from drivers.can.receive_filter import MOST_AT_ONCE
 from ident_service.config.canopen import CanBus
 from ident_service.errors import DriverError
 

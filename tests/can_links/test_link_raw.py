@@ -12,10 +12,9 @@ from collections.abc import Iterator
 import pytest
 from link_bench import arm_on_bus, soon
 
-from drivers.can.bus_errors import BUS_OFF, BusError
-from drivers.can.can_frame import Frame
+from drivers.can.bus_state import BUS_OFF, BusError
+from drivers.can.can_frame import Frame, from_kernel, to_kernel
 from drivers.can.can_link import open_links
-from drivers.can.kernel_frame import from_kernel, to_kernel
 from drivers.can.socketcan_link import RawLink
 from ident_service.errors import DriverError
 

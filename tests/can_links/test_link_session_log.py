@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import frames, process, wait_for
 
-from drivers.can.bus_errors import BUS_OFF
+from drivers.can.bus_state import BUS_OFF
 from drivers.can.can_frame import Frame
 from drivers.can.frame_log import SessionLog
 from drivers.can.frame_log_process import OrderedLog

@@ -18,12 +18,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, greeted, process, soon
 
-from drivers.can.bus_errors import BUS_OFF, CONTROLLER, RESTARTED, RX_OVERFLOW, BusError
-from drivers.can.can_frame import Frame
+from drivers.can.bus_state import BUS_OFF, CONTROLLER, RESTARTED, RX_OVERFLOW, BusError
+from drivers.can.can_frame import MAX_PACKET_BYTES, Frame, pack_frames
 from drivers.can.can_link import open_links
-from drivers.can.kernel_frame import MAX_PACKET_BYTES, pack_frames
 from ident_service.errors import DriverError
-from sim_backend.can_bus import address, packets
+from sim_backend.can_bus import link as address
+from sim_backend.can_bus import packets
 from sim_backend.can_bus.host import LocalPort, WireThread
 from sim_backend.can_bus.hub import MOST_ENDS, Wire
 from sim_backend.can_bus.link import Connection, WireLink
@@ -106,7 +106,7 @@ def test_a_link_hears_sdo_and_all_else_of_canopen_but_not_itself(wire: Wire) -> 
 
 
 def test_without_a_wire_the_message_says_how_to_start_one(name: str) -> None:
-    with pytest.raises(BusError, match=rf"nobody runs this wire; start `ident emulate.*canopen\.wire {name}") as caught:
+    with pytest.raises(BusError, match=rf"nobody runs this wire; start `ident emulate.*can_bus {name}") as caught:
         open_links(arm_on_bus(interface="ident_wire", channel=name))
     assert caught.value.kind == "absent"
     with pytest.raises(can.CanInitializationError, match="nobody runs this wire"):
@@ -339,7 +339,7 @@ def test_a_connection_is_of_one_user_only(name: str) -> None:
         pytest.skip("only root can become somebody else")
     with WireThread(Wire(name)) as thread:
         code = (
-            "import os, sys; from sim_backend.can_bus import address\n"
+            "import os, sys; from sim_backend.can_bus import link as address\n"
             "where = address.address_of(sys.argv[1]); import socket; os.setuid(65534)\n"
             "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); s.settimeout(30); s.connect(where)\n"
             "sys.exit(0 if s.recv(100) == b'' else 3)"

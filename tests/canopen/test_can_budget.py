@@ -9,8 +9,7 @@ import pytest
 from can_arms import EDS, wam_driver
 
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, Budget, budget, frame_cost
-from drivers.canopen.frame_bits import unstuffed, worst
+from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, Budget, budget, frame_cost, unstuffed, worst
 from drivers.canopen.object_dictionary import Entry
 from drivers.canopen.pdo_mapping import HEARTBEAT, RPDO1, SYNC, TPDO1
 from ident_service.config.canopen import CanBus

@@ -13,12 +13,11 @@ from can_arms import MAX_TORQUE, RATED
 from drivers.canopen.motor_units import coordinates
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.canopen_checks import disagreements
-from ident_service.config.limits import motion_limits
-from ident_service.config.load import load_arm
+from ident_service.config.load import disagreements, load_arm
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_check import Verdict
+from ident_service.motion.ticket import Verdict
 from ident_service.preflight.static_checks import configuration_check, stability_check
 
 ARMS = ("wam7_canopen", "wam7_canopen_500hz")

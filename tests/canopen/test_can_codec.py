@@ -10,9 +10,8 @@ from can_arms import wam_driver
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.can.bus_event import HOST, Event, EventCode
+from drivers.can.bus_state import HOST, ControllerState, Event, EventCode
 from drivers.can.can_frame import Frame
-from drivers.can.controller_state import ControllerState
 from drivers.canopen.cia402 import DriveState, NmtCommand, NmtState
 from drivers.canopen.pdo_codec import BusCodec
 from drivers.canopen.pdo_mapping import bus_profiles

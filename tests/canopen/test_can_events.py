@@ -9,7 +9,7 @@ from can_arms import wam_driver
 
 from drivers.axis_status import AxisEventCode
 from drivers.can.can_frame import Frame
-from drivers.canopen.axis_events import axis_events
+from drivers.canopen.driver import axis_events
 from drivers.canopen.pdo_codec import BusCodec
 from drivers.canopen.pdo_mapping import bus_profiles
 

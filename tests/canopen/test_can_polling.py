@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.can.can_frame import Frame
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.polling import BURST, Answers, poll, upload_request
+from drivers.canopen.sdo import BURST, Answers, poll, upload_request
 from drivers.clock import VirtualClock
 
 MS = 1_000_000

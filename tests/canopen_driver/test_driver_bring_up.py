@@ -16,7 +16,7 @@ from drivers.axis_status import AxisEventCode
 from drivers.can.can_frame import Frame
 from drivers.canopen.cia402 import DISABLE_VOLTAGE, ENABLE, SHUTDOWN, SWITCH_ON
 from drivers.canopen.driver import CanopenArm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.faults import PuckFault

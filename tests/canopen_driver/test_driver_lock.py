@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from drivers.can.bus_lock import BusLock
+from drivers.can.can_link import BusLock
 from ident_service.config.canopen import CanBus
 from ident_service.errors import DriverError
 
 HOLDER = """
 import sys
-from drivers.can.bus_lock import BusLock
+from drivers.can.can_link import BusLock
 from ident_service.config.canopen import CanBus
 lock = BusLock(CanBus(interface=sys.argv[1], channel=sys.argv[2]))
 print("held", flush=True)

@@ -11,9 +11,9 @@ from test_driver_watchdogs import Bench as HeldBench
 
 from drivers.arm import StopKind
 from drivers.axis_status import AxisStatus
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
-from ident_service.motion.preflight_check import Verdict
+from ident_service.motion.ticket import Verdict
 
 ZERO = np.zeros(2)
 PROVEN = {"maxon_epos4_50-5_0170h.eds", "elmo_gold_V002.dcf", "elmo_simpliq.dcf"}

@@ -7,13 +7,12 @@ import pytest
 from helpers.emulated_arms import Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
-from drivers.can.bus_errors import BusError
+from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from drivers.canopen.driver import CanopenArm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
-from sim_backend.canopen_device.drive import CanopenDrive
-from sim_backend.canopen_device.power import PowerState
+from sim_backend.canopen_device.drive import CanopenDrive, PowerState
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.emulator.motor import Power

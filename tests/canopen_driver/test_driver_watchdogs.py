@@ -15,15 +15,15 @@ from drivers.canopen.bus_load import budget
 from drivers.canopen.driver import CanopenArm
 from drivers.canopen.object_dictionary import Entry, Kind
 from drivers.canopen.pdo_mapping import HEARTBEAT, Write
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDrive, CanopenDriver, quick_stop_decelerations
-from ident_service.config.canopen_checks import disagreements
-from ident_service.config.limits import motion_limits
-from ident_service.config.schema import ArmConfig
+from ident_service.config.load import disagreements
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.expected_friction import expected_friction
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.reference import hold
+from ident_service.motion.ticket import Verdict
+from ident_service.motion.trajectory import hold
 from ident_service.preflight.session import Session
 from ident_service.preflight.watchdog import watchdog_check
 from sim_backend.emulator.faults import parse_fault

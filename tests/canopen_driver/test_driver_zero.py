@@ -15,7 +15,7 @@ from drivers.canopen.driver import CanopenArm
 from drivers.canopen.object_dictionary import ZERO_COUNTS, ZERO_MARK
 from drivers.canopen.pdo_mapping import SDO_REQUEST
 from drivers.canopen.stored_zero import Zeros
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.faults import PuckFault

@@ -16,7 +16,7 @@ from typing import Any, Self
 import yaml
 
 from ident_service.cli import main
-from ident_service.operations.arm_state import fault_file
+from ident_service.registry.state_folder import fault_file
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PATIENCE = 60.0  # s of the machine's time; nothing is judged by it but what never happens

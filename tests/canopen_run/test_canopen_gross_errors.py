@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from drivers.canopen.driver import CanopenArm
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_check import Check, Verdict
+from ident_service.motion.ticket import Check, Verdict
 from ident_service.preflight.preflight import preflight
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from canopen_run_bench import PATIENCE, canopen, channel, described, write
 
-from drivers.can.bus_errors import BusError
+from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from drivers.canopen.driver import CanopenArm
 from ident_service.config.load import load_arm

@@ -35,12 +35,12 @@ from ident_service.cli import main
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import base_parameters
-from ident_service.motion.attended import attended
-from ident_service.motion.factory import make_arm
+from ident_service.model.base_parameters import base_parameters
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.last_position import FILE, PositionFile
-from ident_service.operations.arm_state import arm_folder, fault_file
+from ident_service.motion.run import attended
 from ident_service.recordings.open import open_recording
+from ident_service.registry.state_folder import arm_folder, fault_file
 
 NAME, RATE, KP, KD = "far", 50.0, 100.0, 16.0
 DEADLINE, BRAKING = 0.2, [4.0, 2.0]

@@ -20,9 +20,9 @@ from drivers.canopen.driver import CanopenArm
 from drivers.canopen.pdo_mapping import SYNC
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, ConfigError, DriverError
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.controls import StopWhen
+from ident_service.motion.command_channel import StopWhen
 from ident_service.motion.run import RunReport, run
 from sim_backend.can_bus.link import Connection
 from sim_backend.can_bus.packets import Hello

@@ -27,7 +27,7 @@ from canopen_run_bench import (
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 NAME, RATE, KP, KD = "relative", 50.0, 100.0, 16.0
 HOME = {"shoulder": 0.3, "elbow": -0.2}  # so that a zero that were ignored would show in every parameter

@@ -11,13 +11,13 @@ import pytest
 from canopen_run_bench import canopen, checked, described, simulated, truth, write
 
 from ident_service.cli import main
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError
-from ident_service.excitation.demands import demands
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.limit_proof import demands
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

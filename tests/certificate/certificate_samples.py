@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.estimation.certificate import Certificate
-from ident_service.model.base import BaseParameters, base_from_expressions
-from ident_service.model.layout import INERTIAL
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions
+from ident_service.model.parameter_layout import INERTIAL
 
 Array = np.ndarray
 

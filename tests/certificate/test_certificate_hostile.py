@@ -15,8 +15,8 @@ from ident_service.certificate_verifier import verify
 from ident_service.errors import UsageError
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.model.base import base_from_expressions
-from ident_service.model.layout import INERTIAL
+from ident_service.model.base_parameters import base_from_expressions
+from ident_service.model.parameter_layout import INERTIAL
 from ident_service.operations.verify import verify_file
 
 NAMES = tuple(f"{symbol}1" for symbol in INERTIAL)

@@ -20,7 +20,7 @@ from ident_service.certificate_verifier import verify
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 
 Document = dict[str, Any]
 

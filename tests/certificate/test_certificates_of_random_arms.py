@@ -12,8 +12,8 @@ from ident_service.certificate_verifier import verify
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import base_from_expressions, base_parameters
-from ident_service.model.layout import INERTIAL
+from ident_service.model.base_parameters import base_from_expressions, base_parameters
+from ident_service.model.parameter_layout import INERTIAL
 
 
 @settings(max_examples=15)

@@ -11,10 +11,10 @@ from certificate_samples import parameter_file, table_1, table_6, text
 from ident_service.certificate_verifier import verify
 from ident_service.errors import ParameterError
 from ident_service.estimation.certificate import certify
-from ident_service.estimation.feasible.feasibility import feasibility_correction, feasibility_test
 from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import feasibility_correction, feasibility_test
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 
 def test_table_1_r1_is_feasible_and_r2_is_not(wam7_data: Path) -> None:

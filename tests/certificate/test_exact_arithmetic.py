@@ -20,9 +20,9 @@ from ident_service.certificate_verifier import (
     rational_text,
     set_blocks,
 )
-from ident_service.estimation.certificate_rounding import exact_block, repair
+from ident_service.estimation.certificate import exact_block, repair
 from ident_service.estimation.feasible.feasible_set import feasible_set
-from ident_service.model.layout import INERTIAL
+from ident_service.model.parameter_layout import INERTIAL
 
 small = st.fractions(min_value=-3, max_value=3, max_denominator=7)
 

@@ -21,13 +21,12 @@ from certificate_samples import random_bodies
 
 from ident_service.certificate_verifier import INERTIAL, Arm, rational_text, verify
 from ident_service.cli import main
+from ident_service.config.arm import Ellipsoid
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import Ellipsoid
-from ident_service.estimation.certificate import certify, stated_arm
-from ident_service.estimation.certificate_rounding import exact_block
+from ident_service.estimation.certificate import certify, exact_block, stated_arm
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 Document = dict[str, Any]
 SET = "a mass distribution exists"

@@ -9,16 +9,16 @@ import pytest
 from certificate_samples import random_bodies, random_config, table_1
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasible.feasibility import (
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.problems import (
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.feasible.sdpa import bpfc_sdpa, bpft_sdpa, fbpe_sdpa
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import Information
 
 Array = np.ndarray

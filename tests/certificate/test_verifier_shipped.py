@@ -17,8 +17,8 @@ from ident_service.config.load import load_arm
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import base_parameters
-from ident_service.model.layout import INERTIAL, TERM_SYMBOLS
+from ident_service.model.base_parameters import base_parameters
+from ident_service.model.parameter_layout import INERTIAL, TERM_SYMBOLS
 from ident_service.results.manifest import write_manifest
 from ident_service.results.run_folder import write_verifier
 

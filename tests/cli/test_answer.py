@@ -11,12 +11,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from ident_service.cli.answer import StopOnSignal, interrupting, print_answer, tell
+from ident_service.cli.output import StopOnSignal, interrupting, print_answer, tell
 
 TALK = """
 import sys
 from argparse import Namespace
-from ident_service.cli.answer import print_answer, tell
+from ident_service.cli.output import print_answer, tell
 words = Namespace(json=False)
 for _ in range(3):
     tell(words, "exciting")

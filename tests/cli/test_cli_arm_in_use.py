@@ -13,11 +13,9 @@ from cli.conftest import Ident
 from drivers.arm import Arm
 from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.controls import Homing
-from ident_service.motion.factory import make_arm
-from ident_service.motion.stoppable import StoppableArm
-from ident_service.operations.arm_state import control_path, fault_file
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.command_channel import ControlFile, Homing, StoppableArm
+from ident_service.registry.state_folder import control_path, fault_file
 
 
 @pytest.mark.parametrize("verb", ["check", "watch"])
@@ -62,7 +60,7 @@ def test_drives_that_hold_an_arm_are_not_told_to_let_go_without_its_name(
 ) -> None:
     let_go: list[str] = []
     monkeypatch.setattr(
-        "ident_service.operations.recover.let_go", lambda config, _: let_go.append(config.name) or ("j1",)
+        "ident_service.operations.recovery.let_go", lambda config, _: let_go.append(config.name) or ("j1",)
     )
     assert ident("supported", "planar2").code == 2
     assert let_go == []

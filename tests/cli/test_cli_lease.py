@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from cli.conftest import COARSE, Ident, quick_arm
 
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import in_use
+from ident_service.registry.state_folder import control_path
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over,
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError
-from ident_service.operations.commission import simulate
+from ident_service.operations.commissioning import simulate
 
 TABLE = {"format": "ident-parameters", "version": 1, "base_parameters": {"expressions": ["m1"], "values": [-1.0]}}
 

@@ -9,7 +9,7 @@ import pytest
 from cli.conftest import Ident
 
 from ident_service.cli import GROUPS, main, parser
-from ident_service.cli.words import Verbs, asks_for_json
+from ident_service.cli.arguments import Verbs, asks_for_json
 
 WRONG = [
     ((), "the following arguments are required: VERB"),

@@ -16,9 +16,9 @@ from cli.hands import REPEAT, Hands
 from helpers.tickets import write_checked_ticket
 
 from ident_service.cli import main
-from ident_service.cli.moving import RELEASED, REPEATS, HeldKey
+from ident_service.cli.motion_commands import RELEASED, REPEATS, HeldKey
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.motion.controls import HOLD_TO_RUN_SECONDS
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 
 SLOWEST = 0.092  # s, the Linux console's
 
@@ -197,7 +197,7 @@ def test_a_rehearsal_ends_with_the_key(
 ) -> None:
     path, state = arm(tmp_path), ["--state", str(tmp_path / "state")]
     write_checked_ticket(load_arm(path), tmp_path / "state")
-    monkeypatch.setattr("ident_service.cli.moving.RELEASED", 2.0)  # a busy machine is no hand that lets go
+    monkeypatch.setattr("ident_service.cli.motion_commands.RELEASED", 2.0)  # a busy machine is no hand that lets go
     before = termios.tcgetattr(keyboard.slave)
     with os.fdopen(os.dup(keyboard.slave)) as stdin, Hands(keyboard.master) as hands:
         monkeypatch.setattr("sys.stdin", stdin)
@@ -208,7 +208,7 @@ def test_a_rehearsal_ends_with_the_key(
             if line == "approaching":
                 hands.let_go()
 
-        monkeypatch.setattr("ident_service.cli.moving.tell", told)
+        monkeypatch.setattr("ident_service.cli.motion_commands.tell", told)
         assert main(["rehearse", str(path), "--out", str(tmp_path / "run"), *state]) == 1
     assert "stopped after" in capsys.readouterr().out
     assert said[-2:] == ["stopping", "stopped"]

@@ -13,19 +13,19 @@ from hypothesis import strategies as st
 from model.test_locked_joints import PANDA, joint, link
 
 from ident_service.cli import main
-from ident_service.config.limits import motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import ModelError
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model, control_model
 from ident_service.model.likely_bodies import drawn_about
 from ident_service.model.outline import capsule_around
-from ident_service.model.rigid_body import InverseDynamics, inertia_from_delta
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.reference import rest
-from ident_service.operations.urdf_says import arm_part
+from ident_service.model.pinocchio_models import InverseDynamics, inertia_from_delta
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.trajectory import rest
+from ident_service.operations.new_description import arm_part
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -23,13 +23,12 @@ from report.pages import sections
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.rigid_body import InverseDynamics, joint_frame_inertias
-from ident_service.motion.factory import make_arm
-from ident_service.motion.states import State
-from ident_service.operations.commission import record_motion
-from ident_service.operations.score import true_parameters
+from ident_service.model.pinocchio_models import InverseDynamics, joint_frame_inertias
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.state_machine import State
+from ident_service.operations.commissioning import record_motion, true_parameters
 from ident_service.recordings.open import open_recording
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.report_files import read_evidence_of

@@ -18,10 +18,8 @@ from compare.conftest import Ident
 from ident_service.config.load import load_arm
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.least_squares import weighted_least_squares
-from ident_service.results.comparison.comparison import compare
-from ident_service.results.comparison.findings import findings
-from ident_service.results.comparison.sides import read_side
-from ident_service.results.information_document import information_document, information_from
+from ident_service.results.comparison.comparison import compare, findings, read_side
+from ident_service.results.parameter_file import information_document, information_from
 
 
 def table(folder: Path, name: str, **more: Any) -> Path:

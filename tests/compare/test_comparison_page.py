@@ -10,10 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident_service.results.comparison.comparison import Comparison, compare
-from ident_service.results.comparison.figures import friction_curves, z_figure
-from ident_service.results.comparison.page import comparison_html
-from ident_service.results.comparison.sides import read_side
+from ident_service.results.comparison.comparison import Comparison, compare, read_side
+from ident_service.results.comparison.presentation import comparison_html, friction_curves, z_figure
 
 _VOID = {"meta", "path", "line", "rect", "circle", "polyline", "polygon", "br"}
 

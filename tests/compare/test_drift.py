@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.drift import ALPHA, Identified, Motion, drift, holm
+from ident_service.estimation.change_detection import ALPHA, Identified, Motion, drift, holm
 
 LEADING = ("Lzz1", "lx1", "ly1", "fv1", "fc1", "fo1", "Lzz2", "lx2", "fv2", "fc2", "fo2")
 SIZE = len(LEADING)

@@ -7,12 +7,10 @@ from pathlib import Path
 import pytest
 from helpers.changed_arms import COARSE, changed, recorded_arm
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
-from ident_service.results.comparison.comparison import Pair, compare
-from ident_service.results.comparison.findings import findings
-from ident_service.results.comparison.sides import Side, read_side
+from ident_service.results.comparison.comparison import Pair, Side, compare, findings, read_side
 from ident_service.results.parameter_file import parameters_document, write_parameters
 
 SEEDS = 20

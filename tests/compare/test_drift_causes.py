@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from helpers.random_arms import model_around, random_body, random_chain, random_delta
 
-from ident_service.estimation.drift import Identified, Motion, drift
-from ident_service.estimation.drift_causes import Cause, causes, friction_ratio, meaning_of_cause, meaning_of_effect
-from ident_service.model.base import base_parameters
+from ident_service.estimation.change_detection import (
+    Cause,
+    Identified,
+    Motion,
+    causes,
+    drift,
+    friction_ratio,
+    meaning_of_cause,
+    meaning_of_effect,
+)
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.information import information_of, supports
 from ident_service.model.regressor import joint_regressor
 

@@ -13,9 +13,8 @@ import pytest
 from compare.conftest import Ident
 
 from ident_service.errors import ParameterError
-from ident_service.results.comparison.comparison import Comparison, compare
-from ident_service.results.comparison.page import comparison_html
-from ident_service.results.comparison.sides import read_side
+from ident_service.results.comparison.comparison import Comparison, compare, read_side
+from ident_service.results.comparison.presentation import comparison_html
 
 TABLE = {"expressions": ["fc1", "fv1"], "values": [0.4, 0.1]}
 

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from ident_service.config.drivers import PluginDriver, SimulatedDriver
-from ident_service.config.limits import motion_limits
+from ident_service.config.arm import ArmConfig, FourierMotion, PluginDriver, SeededMotion, SimulatedDriver
 from ident_service.config.load import find_arm, load_arm, shipped_arms
+from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import Angle, Interval
-from ident_service.config.schema import ArmConfig, FourierMotion, SeededMotion
 from ident_service.errors import ConfigError, MotionRefused
 from ident_service.model.arm_model import arm_model
 

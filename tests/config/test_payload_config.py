@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ident_service.config.limits import motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
+from ident_service.config.motion_limits import motion_limits
 from ident_service.config.payload import Payload, knowledge_with_payload
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ConfigError, ModelError
-from ident_service.estimation.feasible.constraints import configured
+from ident_service.estimation.feasible.feasible_set import configured
 from ident_service.model.arm_model import arm_model
 from ident_service.model.regressor import joint_regressor
 from ident_service.motion.after_stop import falling_joints

@@ -21,7 +21,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.daemon.app import create_app
 from ident_service.daemon.dependencies import Service
 from ident_service.daemon.settings import Settings
-from ident_service.operations.commission import simulate
+from ident_service.operations.commissioning import simulate
 from ident_service.registry import jobs as rows
 from ident_service.registry.tokens import add_token
 

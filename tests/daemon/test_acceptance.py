@@ -13,8 +13,7 @@ from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import accepted_description
 from ident_service.errors import ParameterError, UnknownId, UsageError
 from ident_service.operations.acceptance import accept, acceptances, rollback, settle
-from ident_service.operations.import_run import import_run
-from ident_service.operations.retention import expendable, let_go
+from ident_service.operations.run_archive import expendable, import_run, let_go
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database
 from ident_service.registry.runs import (

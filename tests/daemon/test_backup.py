@@ -22,13 +22,11 @@ from hypothesis import strategies as st
 
 from ident_service.cli import main
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.motion.control_file import ControlFile
+from ident_service.motion.command_channel import ControlFile
 from ident_service.operations import backup
-from ident_service.operations.arm_state import control_path
 from ident_service.operations.backup import back_up, restore
-from ident_service.operations.state_folder import RESTORING, single_instance
-from ident_service.registry.audit import note, trail
-from ident_service.registry.database import FILE, Database
+from ident_service.registry.database import FILE, Database, note, trail
+from ident_service.registry.state_folder import RESTORING, control_path, single_instance
 from ident_service.registry.tokens import Access, access, add_token, first_token
 
 RUN = "runs/20261101T080000-quick"

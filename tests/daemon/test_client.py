@@ -37,10 +37,9 @@ from ident_service.errors import (
     UnknownId,
     UsageError,
 )
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database
+from ident_service.motion.command_channel import in_use
+from ident_service.registry.database import Database, note
+from ident_service.registry.state_folder import control_path
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).resolve().parents[2]

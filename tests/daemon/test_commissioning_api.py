@@ -13,10 +13,10 @@ from daemon.conftest import Asked, checked_before, patient_text, quick_text, ser
 from daemon.verbs_bench import with_run
 
 from ident_service.daemon.jobs.requests import Run
-from ident_service.motion.control_file import ControlFile, in_use
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.registry import jobs as rows
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
+from ident_service.registry.state_folder import control_path
 
 pytestmark = pytest.mark.slow
 ARM = "quick"

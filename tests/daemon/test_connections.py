@@ -22,7 +22,7 @@ from benchmarks import stops
 from ident_service.client import IdentClient
 from ident_service.daemon import connections
 from ident_service.daemon.connections import BODY_SECONDS, HEADER_SECONDS, Connection, Connections
-from ident_service.daemon.logs import AsideHandler, JsonLines, NotTooOften
+from ident_service.daemon.serve import AsideHandler, JsonLines, NotTooOften
 from ident_service.errors import ArmError
 
 NEAR, FAR = "127.0.0.1", "203.0.113.9"

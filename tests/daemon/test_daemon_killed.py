@@ -14,10 +14,10 @@ from daemon.served import daemon_process
 
 from ident_service.client import IdentClient
 from ident_service.errors import MotionRefused
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import in_use
 from ident_service.recordings.open import open_recording
 from ident_service.registry.database import Database
+from ident_service.registry.state_folder import control_path
 from ident_service.results.manifest import verified_files
 
 ARM = "quick"

@@ -12,16 +12,15 @@ from daemon.conftest import Asked, quick_text, serving
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
-from ident_service.daemon.web.commissioning_steps import ladder
-from ident_service.motion.control_file import ControlFile
+from ident_service.daemon.web.arm_pages import ladder
+from ident_service.motion.command_channel import ControlFile
 from ident_service.operations import deletion
 from ident_service.operations.acceptance import accept
-from ident_service.operations.arm_state import control_path, fault_file
 from ident_service.operations.maintenance_schedule import When, add_schedule, known_schedule
 from ident_service.registry import jobs
-from ident_service.registry.audit import trail
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, trail
 from ident_service.registry.runs import index_run, operating_seconds
+from ident_service.registry.state_folder import control_path, fault_file
 
 FIRST, SECOND, THIRD = (f"2026010{day}T000000Z-quick" for day in (1, 2, 3))
 

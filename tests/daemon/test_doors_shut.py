@@ -16,10 +16,9 @@ from ident_service.daemon.authentication import CHALLENGE_SECONDS, SESSION_SECON
 from ident_service.daemon.request_guard import MOST_BODY, MOST_UPLOAD
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path
-from ident_service.registry.audit import trail
-from ident_service.registry.database import Database
+from ident_service.motion.command_channel import ControlFile
+from ident_service.registry.database import Database, trail
+from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token, revoke_token
 
 OPEN = {("GET", "/healthz"), ("POST", "/api/v1/login"), ("POST", "/api/v1/logout")}

@@ -14,9 +14,9 @@ from daemon.served import daemon_process
 
 from ident_service.client import Event, IdentClient
 from ident_service.daemon.news import LOOK, Watch
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path, fault_file
-from ident_service.registry.audit import note, trail
+from ident_service.motion.command_channel import ControlFile
+from ident_service.registry.database import note, trail
+from ident_service.registry.state_folder import control_path, fault_file
 
 
 class Clock:

@@ -21,13 +21,12 @@ from daemon.conftest import Asked, checked_before, patient_text, serving
 from daemon.served import daemon_process
 
 from ident_service.cli import main
-from ident_service.daemon.jobs.reach import held_arm
 from ident_service.errors import ArmError, ArmFault, UsageError
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import ControlFile
+from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
-from ident_service.registry.audit import note, trail
-from ident_service.registry.database import FILE, Database
+from ident_service.registry.database import FILE, Database, note, trail
+from ident_service.registry.state_folder import control_path
 
 
 @pytest.mark.slow
@@ -201,7 +200,7 @@ def test_a_registry_is_damaged_where_its_bytes_are(tmp_path: Path, capsys: pytes
 def test_a_stop_that_the_registry_does_not_take_is_entered_later(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ident_service.cli.keeping._PATIENCE", 0.05)
+    monkeypatch.setattr("ident_service.cli.archive_commands._PATIENCE", 0.05)
     state = tmp_path / "state"
     with serving(state) as daemon, closing(sqlite3.connect(state / FILE)) as other:
         other.execute("BEGIN IMMEDIATE")

@@ -13,8 +13,7 @@ from daemon.conftest import Asked, quick_text
 from daemon.test_doors_shut import refusal
 
 from ident_service.registry import jobs as rows
-from ident_service.registry.audit import note, trail
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, note, trail
 from ident_service.registry.tokens import add_token
 
 COUNT = 12

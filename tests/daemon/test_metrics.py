@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from ident_service.daemon.jobs.outcome import lateness_of
 from ident_service.daemon.jobs.requests import Run
 from ident_service.daemon.metrics import Metrics
-from ident_service.motion.histogram import Histogram
+from ident_service.motion.cycle_timing import Histogram
 
 
 def figures(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:

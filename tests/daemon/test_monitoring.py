@@ -13,7 +13,7 @@ import yaml
 from daemon.conftest import Asked
 from prometheus_client.parser import text_string_to_metric_families
 
-from ident_service.operations.arm_state import fault_file
+from ident_service.registry.state_folder import fault_file
 
 FOLDER = Path(__file__).parents[2] / "configs" / "monitoring"
 _NAME = re.compile(r"\b(?:ident|process)_[a-z_]+\b")

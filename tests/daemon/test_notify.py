@@ -19,8 +19,8 @@ from daemon.conftest import patient_text, quick_text
 from daemon.served import daemon_process, started
 from daemon.test_daemon_killed import ARM, begin, checked, excited
 
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import in_use
+from ident_service.registry.state_folder import control_path
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

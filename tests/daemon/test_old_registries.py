@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 from daemon.conftest import serving
 
-from ident_service.config.shipped import shipped_arms
-from ident_service.registry.database import FILE, Database
-from ident_service.registry.migrations import MIGRATIONS
+from ident_service.config.yaml_source import shipped_arms
+from ident_service.registry.database import FILE, MIGRATIONS, Database
 from ident_service.registry.tokens import add_token
 
 SAMPLES = sorted((Path(__file__).parent / "old_registries").glob("*.sql"))

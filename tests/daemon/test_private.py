@@ -20,10 +20,9 @@ from ident_service.cli import main
 from ident_service.daemon.serve import serve
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path
-from ident_service.registry.audit import trail
-from ident_service.registry.database import FILE, Database
+from ident_service.motion.command_channel import ControlFile
+from ident_service.registry.database import FILE, Database, trail
+from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
 

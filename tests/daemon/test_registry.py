@@ -14,9 +14,7 @@ import pytest
 from ident_service.daemon.jobs.outcome import Said, outcome
 from ident_service.errors import UnknownId, UsageError
 from ident_service.registry import jobs
-from ident_service.registry.audit import note, trail
-from ident_service.registry.database import FILE, Database
-from ident_service.registry.migrations import MIGRATIONS
+from ident_service.registry.database import FILE, MIGRATIONS, Database, note, trail
 from ident_service.registry.tokens import TOKEN_FILE, access, add_token, first_token, read_token, revoke_token, tokens
 
 
@@ -100,7 +98,7 @@ def test_what_was_written_survives_a_kill(tmp_path: Path) -> None:
     script = (
         "import os, sys; from pathlib import Path\n"
         "from ident_service.registry.database import Database\n"
-        "from ident_service.registry.audit import note\n"
+        "from ident_service.registry.database import note\n"
         "db = Database(Path(sys.argv[1]))\n"
         "note(db, 'me', 'written', 'x')\n"
         "with db.transaction():\n"

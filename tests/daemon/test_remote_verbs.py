@@ -23,12 +23,12 @@ from daemon.served import daemon_process
 from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
+from ident_service.cli.arguments import Parser
+from ident_service.cli.output import lines_of
 from ident_service.cli.remote import LOCAL_ONLY, table
-from ident_service.cli.remote_words import lines_of
-from ident_service.cli.words import Parser
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError
-from ident_service.operations.arm_state import fault_file
+from ident_service.registry.state_folder import fault_file
 
 RUN = "20260101T000000Z-quick"
 SINGULAR = "20260103T000000Z-quick"
@@ -258,7 +258,7 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
 def test_a_rehearsal_elsewhere_ends_with_the_key_here(
     state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("ident_service.cli.moving.RELEASED", 2.0)  # a busy machine is no hand that lets go
+    monkeypatch.setattr("ident_service.cli.motion_commands.RELEASED", 2.0)  # a busy machine is no hand that lets go
     master, slave = pty.openpty()
     texts = {"patient": patient_text("patient"), "short": quick_text("short", 1)}
     for text in texts.values():

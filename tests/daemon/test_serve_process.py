@@ -21,10 +21,10 @@ from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
 from ident_service.daemon.jobs.socket_activation import taken
-from ident_service.daemon.service_manager import tell_manager, watchdog_seconds
+from ident_service.daemon.serve import tell_manager, watchdog_seconds
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import ControlFile
+from ident_service.registry.state_folder import control_path
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

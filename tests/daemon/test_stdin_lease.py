@@ -8,7 +8,7 @@ from contextlib import suppress
 
 import pytest
 
-from ident_service.cli.lease import StdinLease
+from ident_service.cli.operator_input import StdinLease
 
 
 class _Clock:

@@ -17,11 +17,10 @@ from daemon.conftest import Asked, checked_before, patient_text, serving
 
 from ident_service.cli import main
 from ident_service.daemon.jobs.requests import Run
-from ident_service.motion.control_file import ControlFile
-from ident_service.operations.arm_state import control_path, fault_file
+from ident_service.motion.command_channel import ControlFile
 from ident_service.registry import jobs as rows
-from ident_service.registry.audit import trail
-from ident_service.registry.database import FILE
+from ident_service.registry.database import FILE, trail
+from ident_service.registry.state_folder import control_path, fault_file
 
 FAR = "203.0.113.9"
 SOON = 8.0  # s: less than the ten that a write waits for another process

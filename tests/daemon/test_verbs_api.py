@@ -16,7 +16,7 @@ from ident_service.daemon.jobs.requests import BusScan, Zero
 from ident_service.daemon.request_guard import MOST_UPLOAD
 from ident_service.operations.acceptance import accept
 from ident_service.registry.arms import known_arm, resources
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
 from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]

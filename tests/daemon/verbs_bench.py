@@ -12,7 +12,7 @@ import numpy as np
 from daemon.conftest import Asked, quick_text
 
 from ident_service.config.load import shipped_arms
-from ident_service.operations.import_run import import_run
+from ident_service.operations.run_archive import import_run
 from ident_service.results.manifest import write_manifest
 
 ON_A_BUS = "relative"

@@ -9,10 +9,9 @@ import numpy as np
 from mcap_ros2.writer import Writer as BagWriter
 from numpy.typing import NDArray
 
-from ident_service.recordings.assemble import assemble
-from ident_service.recordings.messages import DEFINITIONS, JOINT_STATE
-from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, join
-from ident_service.recordings.segments import Piece
+from ident_service.recordings.mcap_writer import DEFINITIONS, JOINT_STATE
+from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, assemble, join
+from ident_service.recordings.resampling import Piece
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ from made_recordings import MadeRecording, moving, whole, write_bag
 
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.errors import RecordingError, UsageError
+from ident_service.recordings.adapters import JointSideRecording
 from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Block
-from ident_service.recordings.transmission import JointSideRecording
-from ident_service.recordings.writer import RecordingWriter
 
 COUPLED = Transmission(ratios=(50.0, -40.0), coupling=((1.0, 0.0), (0.5, 1.0)), offsets=(0.1, -0.2))
 COLUMNS = {"t": "zeit", "q1": "w 1", "q2": "w 2", "tau1": "m 1", "tau2": "m 2", "dq1": "v 1", "dq2": "v 2"}

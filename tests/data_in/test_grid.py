@@ -10,8 +10,8 @@ from made_recordings import MadeRecording, jittered, moving
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.recordings.grid import Segment, grid, trimmed
 from ident_service.recordings.recording import join
+from ident_service.recordings.resampling import Segment, grid, trimmed
 
 PLAIN = RecordingFormat()
 

@@ -13,12 +13,10 @@ from made_recordings import curve, segments_of, whole, write_bag
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.recordings.assemble import assemble
-from ident_service.recordings.grid import grid
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.quality import quality
-from ident_service.recordings.recording import Block, join
-from ident_service.recordings.segments import uniform
+from ident_service.recordings.recording import Block, assemble, join
+from ident_service.recordings.resampling import grid, uniform
 
 SKIP = RecordingFormat(missing="skip")
 MOTION = curve([0.5, 1.3])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from made_recordings import MadeRecording
 
+from ident_service.config.arm import ArmConfig, Joint
 from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import ArmConfig, Joint
 from ident_service.estimation.plausibility import reasons_in_recording, remarks_on_limits
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.recordings.quality import JointQuality, quality

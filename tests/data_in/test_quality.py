@@ -8,8 +8,8 @@ from made_recordings import MadeRecording, jittered, moving
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import UsageError
-from ident_service.recordings.grid import grid
 from ident_service.recordings.quality import quality
+from ident_service.recordings.resampling import grid
 
 PLAIN = RecordingFormat()
 MILLISECONDS = np.arange(10_000) * 1_000_000

@@ -13,14 +13,13 @@ from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
 from ident_service.config.recording import RecordingFormat
 from ident_service.model.arm_model import arm_model
-from ident_service.model.rigid_body import read_urdf
-from ident_service.recordings.csv_file import CsvRecording
-from ident_service.recordings.grid import grid
-from ident_service.recordings.kept import KeptRecording
+from ident_service.model.pinocchio_models import read_urdf
+from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.csv_reader import CsvRecording
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.quality import Quality, quality
 from ident_service.recordings.recording import Recording
-from ident_service.recordings.segments import uniform
+from ident_service.recordings.resampling import grid, uniform
 
 RECORDINGS = [
     ("kuka_lwr4", "kuka_lwr4/recording_1.csv.gz"),

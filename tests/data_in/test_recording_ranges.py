@@ -14,18 +14,18 @@ from made_recordings import moving, whole
 from ident_service.cli import main
 from ident_service.cli.remote_recordings import recording
 from ident_service.client import IdentClient
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import ArmConfig
 from ident_service.daemon.jobs.commands import range_words
 from ident_service.daemon.jobs.requests import RecordingOf
 from ident_service.errors import RecordingError, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.operations.identification import Request, identify_files
 from ident_service.operations.recordings import file_and_range, open_for, own_formats
+from ident_service.recordings.adapters import RangeRecording, overlap, without_standstill
 from ident_service.recordings.files import split_range
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.part import RangeRecording, overlap, without_standstill
 
 PERIOD = 0.005
 EDGES = 200  # rows at both ends that are not used, 0.5 s each

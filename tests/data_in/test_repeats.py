@@ -12,10 +12,9 @@ from made_recordings import MadeRecording, moving, whole, write_bag
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.recordings.assemble import assemble
-from ident_service.recordings.grid import grid
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.recording import Block, cut
+from ident_service.recordings.recording import Block, assemble, cut
+from ident_service.recordings.resampling import grid
 
 
 def test_a_message_delivered_twice(tmp_path: Path) -> None:

@@ -16,9 +16,8 @@ from made_recordings import Array, MadeRecording, curve, jittered, moving, segme
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
-from ident_service.recordings.grid import grid
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block
-from ident_service.recordings.segments import uniform
+from ident_service.recordings.resampling import grid, uniform
 
 PLAIN = RecordingFormat()
 SMOOTH = curve([0.3, 1.1, 2.7])

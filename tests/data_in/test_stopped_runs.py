@@ -13,7 +13,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.operations.recordings import open_together
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.writer import RecordingWriter
+from ident_service.recordings.mcap_writer import RecordingWriter
 
 FIRST_NS, STEP_NS, SAMPLES = 10**9, 1_000_000, 400
 

@@ -14,7 +14,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
 from ident_service.operations.recordings import open_together, torque_in
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.writer import RecordingWriter
+from ident_service.recordings.mcap_writer import RecordingWriter
 
 STEP_NS = 1_000_000
 LOST = 0.25  # N m between what drives were told and what they measured

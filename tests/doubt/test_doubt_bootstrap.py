@@ -14,10 +14,10 @@ from helpers.random_arms import model_around, random_delta
 from ident_service.errors import ModelError, SolverError
 from ident_service.estimation.bootstrap import bootstrap, drawn, run_length
 from ident_service.estimation.equations import Equations
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import Information
 
 Array = np.ndarray

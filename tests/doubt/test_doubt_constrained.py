@@ -8,10 +8,10 @@ from estimation.synthetic import random_information
 from helpers.random_arms import model_around, random_chain, random_delta
 
 from ident_service.estimation.bootstrap import constrained_intervals
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 
 @pytest.mark.slow

@@ -8,10 +8,10 @@ import scipy.signal
 from estimation.synthetic import one_joint_information
 
 from ident_service.errors import ModelError
-from ident_service.estimation.doubt import block_covariance
 from ident_service.estimation.equations import Equations
-from ident_service.estimation.essential import effective_samples, essential_parameters
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
+from ident_service.estimation.model_reduction import effective_samples, essential_parameters
+from ident_service.estimation.uncertainty import block_covariance
 
 Array = np.ndarray
 TRUTH = np.array([5.0, 0.0, -2.0, 0.0, 0.8, 0.0, 0.0, 3.0, 0.0, 0.0])

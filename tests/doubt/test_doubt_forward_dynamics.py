@@ -12,9 +12,9 @@ from sim.sim_arms import pendulum, random_arm
 from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
-from ident_service.model.layout import TERM_SYMBOLS, Layout
+from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
+from ident_service.model.pinocchio_models import ForwardDynamics, InverseDynamics
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import ForwardDynamics, InverseDynamics
 from sim_backend.plant import Plant
 
 

@@ -12,15 +12,15 @@ from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.errors import ModelError
-from ident_service.estimation.doubt import block_covariance
 from ident_service.estimation.equations import equation_rows, equations
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import identify
-from ident_service.estimation.instruments import InstrumentalEstimate, instrumental_variables, simulated
+from ident_service.estimation.instrumental_variables import InstrumentalEstimate, instrumental_variables, simulated
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
+from ident_service.estimation.uncertainty import block_covariance
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 Array = np.ndarray
 GAINS = {"kp": 400.0, "kd": 40.0}

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, exact_torque, stamps, with_options
 
+from ident_service.config.arm import FrictionShape, Identification, Smoothing
 from ident_service.config.load import load_arm
-from ident_service.config.schema import FrictionShape, Identification, Smoothing
-from ident_service.estimation.doubt import negligible, verdicts
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.fit import Fit, prepare, unconstrained
+from ident_service.estimation.uncertainty import negligible, verdicts
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import BaseParameters, base_parameters
-from ident_service.operations.score import true_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
+from ident_service.operations.commissioning import true_parameters
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RATE = 100.0

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from drivers.arm import Arm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 
 PERIOD_NS = 2_000_000
 

@@ -15,12 +15,12 @@ from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen.bus_monitor import RATE, SHARE, look_rate
 from drivers.canopen.driver import CanopenArm
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
 from ident_service.config.simulation import SimulatedFault
 from ident_service.errors import DriverError
-from ident_service.motion.watch import Watched, watch
-from ident_service.operations.preflight import watch_document, watch_text
+from ident_service.motion.read_only_monitor import Watched, watch
+from ident_service.operations.arm_checks import watch_document, watch_text
 from sim_backend.emulator.faults import configured
 from sim_backend.emulator.lock_step import LockStepArm
 

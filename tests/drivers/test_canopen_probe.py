@@ -16,14 +16,14 @@ from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of, sheet
 
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
-from drivers.canopen.families import family_of, shipped_families
+from drivers.canopen.capabilities import family_of, shipped_families
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
-from ident_service.config.family import family_from
+from ident_service.config.arm import ArmConfig
+from ident_service.config.drive_family import family_from
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ConfigError, DriverError, UsageError
-from ident_service.operations.bus_probe import Probe, bus_probe, probe_document, probe_text
+from ident_service.operations.fieldbus import Probe, bus_probe, probe_document, probe_text
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.process import emulate
 

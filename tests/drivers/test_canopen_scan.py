@@ -20,10 +20,10 @@ from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen.bus_scan import NODES
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError, UsageError
-from ident_service.operations.bus_scan import Match, Scan, bus_scan, scan_document, scan_text
+from ident_service.operations.fieldbus import Match, Scan, bus_scan, scan_document, scan_text
 from sim_backend.emulator.process import emulate
 
 MS = 1_000_000

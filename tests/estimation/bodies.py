@@ -8,9 +8,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from ident_service.model.base import BaseParameters, base_from_expressions
-from ident_service.model.expressions import parse_expression
-from ident_service.model.layout import INERTIAL
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions, parse_expression
+from ident_service.model.parameter_layout import INERTIAL
 
 Array = np.ndarray
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from helpers.random_arms import bodies_of, friction_torque, random_chain, reference_model, reference_torque
 
-from ident_service.config.schema import Identification
+from ident_service.config.arm import Identification
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
 from ident_service.recordings.recording import Block

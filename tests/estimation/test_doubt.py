@@ -10,10 +10,10 @@ import scipy.signal
 from estimation.synthetic import one_joint_information, random_information, serial_chain
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.estimation.doubt import jackknife, negligible, uncertainty, verdicts, widening
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.model.base import base_parameters
+from ident_service.estimation.uncertainty import jackknife, negligible, uncertainty, verdicts, widening
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 

@@ -8,13 +8,13 @@ from estimation.synthetic import SampledRecording, recorded, serial_chain, stamp
 from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Reversal
+from ident_service.config.arm import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import equations as module
-from ident_service.estimation import smoothing
+from ident_service.estimation import signal_processing as smoothing
 from ident_service.estimation.equations import Equations, equations, kept_motion
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.regressor import joint_regressor
 
 OPTIONS = plain_options(smoothing=plain_smoothing(cutoff=40.0))

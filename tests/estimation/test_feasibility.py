@@ -15,20 +15,20 @@ from helpers.random_arms import model_around, random_chain, random_delta
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.schema import ArmConfig, Constraints, FeasibleSetName
+from ident_service.config.arm import ArmConfig, Constraints, FeasibleSetName
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.equations import equations
-from ident_service.estimation.feasible.feasibility import (
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.formulation import insets
+from ident_service.estimation.feasible.problems import (
     EPSILON,
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
-from ident_service.estimation.feasible.posing import insets
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, torque_error
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_from_expressions, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions, base_parameters
 from ident_service.model.information import Information
 
 KINDS = ("inertia", "pseudo_inertia")

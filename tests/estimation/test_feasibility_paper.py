@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from estimation.bodies import grouping, table6_expression, table_names
 
-from ident_service.estimation.feasible.feasibility import EPSILON, feasibility_correction, feasibility_test
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.problems import EPSILON, feasibility_correction, feasibility_test
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 
 Column = np.ndarray
 Table1 = tuple[BaseParameters, Column, Column, Column]

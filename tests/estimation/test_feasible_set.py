@@ -8,9 +8,9 @@ from estimation.bodies import cloud, eq17, moments_of, ten_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, symmetric
-from ident_service.model.layout import INERTIAL
+from ident_service.model.parameter_layout import INERTIAL
 
 NAMES = tuple(f"{symbol}{link}" for link in (1, 2) for symbol in (*INERTIAL, "Ia", "fv", "fc", "fo"))
 ONE = tuple(f"{symbol}1" for symbol in INERTIAL)

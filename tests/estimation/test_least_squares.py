@@ -7,11 +7,11 @@ import pytest
 from estimation.synthetic import one_joint_information, random_information, serial_chain
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.estimation.doubt import block_covariance
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.least_squares import ordinary_least_squares, torque_error
+from ident_service.estimation.uncertainty import block_covariance
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import information_of, supports
 from ident_service.model.regressor import joint_regressor
 

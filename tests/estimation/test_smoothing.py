@@ -8,14 +8,14 @@ import scipy.signal
 from estimation.synthetic import SampledRecording, stamps, waves
 from helpers.plain import plain_options, plain_smoothing
 
+from ident_service.config.arm import FrictionShape, Identification, Reversal
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import FrictionShape, Identification, Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation import smoothing
+from ident_service.estimation import signal_processing as smoothing
 from ident_service.estimation.equations import kept_motion
-from ident_service.estimation.smoothing import Motion, smoothed
-from ident_service.recordings.kept import KeptRecording
-from ident_service.recordings.part import RangeRecording
+from ident_service.estimation.signal_processing import Motion, smoothed
+from ident_service.recordings.adapters import RangeRecording
+from ident_service.recordings.cached_recording import KeptRecording
 
 RATE = 200.0
 

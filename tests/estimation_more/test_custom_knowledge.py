@@ -15,24 +15,24 @@ import pytest
 from estimation.synthetic import SampledRecording, exact_torque, random_information, stamps, waves
 
 from ident_service.cli import main
+from ident_service.config.arm import Constraints
 from ident_service.config.load import arm_from_json, load_arm
-from ident_service.config.schema import Constraints
 from ident_service.errors import ConfigError, UsageError
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
 from ident_service.estimation.feasible.convex import available_solvers, convex_least_squares
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.feasible.priors import Prior
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.estimation.second_opinion import second_opinion
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.operations.identification import Request, identify_files
 from ident_service.recordings.open import open_recording
-from ident_service.results.evidence.making import gather_evidence
+from ident_service.results.evidence.gathering import gather_evidence
 from ident_service.results.parameter_file import ParameterFile, convex_document
-from ident_service.results.report.reservations import reservations
+from ident_service.results.report.verdict import reservations
 from ident_service.results.summary import summary
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "extending.md"

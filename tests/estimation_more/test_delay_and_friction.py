@@ -11,21 +11,21 @@ from estimation.synthetic import SampledRecording, Waves, exact_torque, serial_c
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import FrictionShape, Reversal
+from ident_service.config.arm import FrictionShape, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.choices import clearly_chosen
-from ident_service.estimation.delay import Delay, estimate_delay, with_delay
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.fit import prepare, unconstrained
 from ident_service.estimation.friction_fit import at_the_edge, fit_friction, friction_trials, with_friction
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
-from ident_service.estimation.shape_doubt import shape_covariance
+from ident_service.estimation.shape_uncertainty import shape_covariance
+from ident_service.estimation.torque_delay import Delay, estimate_delay, with_delay
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
-from ident_service.model.coulomb_direction import direction
-from ident_service.model.layout import NO_STRIBECK, Layout
+from ident_service.model.base_parameters import BaseParameters, base_parameters
+from ident_service.model.friction_state import direction
+from ident_service.model.parameter_layout import NO_STRIBECK, Layout
 from ident_service.model.regressor import joint_regressor
 
 RATE = 250.0

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ident_service.model.coulomb_direction import direction
+from ident_service.model.friction_state import direction
 
 PERIOD = 0.004
 RATES = arrays(np.float64, st.integers(1, 60), elements=st.sampled_from([-2.0, -0.3, -0.01, 0.0, 0.0, 0.02, 0.5, 3.0]))

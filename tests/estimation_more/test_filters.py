@@ -11,14 +11,14 @@ from estimation.synthetic import SampledRecording, recorded, serial_chain, stamp
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Identification, Reversal
+from ident_service.config.arm import Identification, Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation import smoothing
+from ident_service.estimation import signal_processing as smoothing
 from ident_service.estimation.equations import equation_rows, equations, kept_motion
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
-from ident_service.model.coulomb_direction import direction
+from ident_service.model.base_parameters import base_parameters
+from ident_service.model.friction_state import direction
 from ident_service.model.regressor import joint_regressor
 
 RATE = 200.0

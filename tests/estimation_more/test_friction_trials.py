@@ -10,14 +10,13 @@ from estimation.synthetic import SampledRecording, stamps, with_options
 from estimation_more.test_delay_and_friction import FIT, RATE, rubbed, rubbing
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 
-from ident_service.config.schema import Reversal
+from ident_service.config.arm import Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation import friction_trials
+from ident_service.estimation import friction_fit as friction_trials
 from ident_service.estimation.equations import equations
-from ident_service.estimation.friction_fit import with_friction
-from ident_service.estimation.friction_trials import FrictionTrials
+from ident_service.estimation.friction_fit import FrictionTrials, with_friction
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 X0, V_S = np.array([0.004, 0.02]), np.array([0.09, 0.3])
 

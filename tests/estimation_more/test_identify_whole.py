@@ -13,8 +13,8 @@ import pytest
 from estimation.synthetic import SampledRecording, exact_torque, stamps, waves, with_options
 
 from ident_service.cli import main
+from ident_service.config.arm import PriorPull
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import PriorPull
 from ident_service.errors import UsageError
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model

@@ -10,11 +10,11 @@ from estimation.synthetic import SampledRecording, recorded, serial_chain, waves
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Identification
+from ident_service.config.arm import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 RATE = 250.0
 COARSE = 2e-3  # rad

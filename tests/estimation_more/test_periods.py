@@ -10,13 +10,13 @@ from estimation.synthetic import SampledRecording, exact_torque, serial_chain, s
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
+from ident_service.config.arm import Reversal
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.identify import identify
-from ident_service.estimation.periodic import averaged
+from ident_service.estimation.signal_processing import averaged
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.coulomb_direction import direction
+from ident_service.model.friction_state import direction
 
 RATE, PERIOD = 200.0, 5.0
 LENGTH = round(RATE * PERIOD)

@@ -11,12 +11,12 @@ from helpers.random_arms import random_chain, random_delta, random_states
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.schema import JointTerm
+from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.chain import Chain
 from ident_service.model.information import supports
-from ident_service.model.layout import INERTIAL, Layout
+from ident_service.model.parameter_layout import INERTIAL, Layout
 from ident_service.model.regressor import joint_regressor
 
 ALL: tuple[JointTerm, ...] = (
@@ -39,7 +39,7 @@ def three_joints(seed: int = 3, coupling: np.ndarray | None = None) -> tuple[Cha
 
 
 def drive_torques(layout: Layout, delta: np.ndarray, rate: np.ndarray, change: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """The formula in `layout.py`, and drive inertia, per drive."""
+    """The formula in `parameter_layout.py`, and drive inertia, per drive."""
     Ia, fv, fc, fo, fs, fq, fa = (layout.term_values(term, delta) for term in ALL)
     friction = fv * rate + fc * s + fo + fs * s * np.exp(-((rate / np.array(VELOCITIES)) ** 2))
     return Ia * change + friction + fq * rate * np.abs(rate) + fa * np.abs(rate)

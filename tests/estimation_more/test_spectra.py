@@ -7,9 +7,9 @@ import pytest
 from estimation.synthetic import SampledRecording, stamps, with_options
 from helpers.plain import plain_options, plain_smoothing
 
+from ident_service.config.arm import Identification
 from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
-from ident_service.config.schema import Identification
 from ident_service.estimation.spectra import remarks_on_noise, spectrum, with_filter
 from ident_service.model.arm_model import arm_model
 

@@ -10,14 +10,14 @@ from estimation.synthetic import SampledRecording, recorded, serial_chain, waves
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Reversal
+from ident_service.config.arm import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import weighted_least_squares
-from ident_service.estimation.standstill import standstill_shares
+from ident_service.estimation.robust_regression import standstill_shares
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 
 RATE = 250.0
 NOISE = np.array([0.3, 0.1])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ident_service.model.tape import Program, Symbol, Tape, Value
+from ident_service.model.symbolic import Program, Symbol, Tape, Value
 
 SAMPLES = 5
 CONSTANTS = (0.0, 1.0, -1.0, 2.0, 3.0, 0.5, -2.0)

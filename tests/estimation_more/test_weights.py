@@ -13,14 +13,14 @@ from estimation.synthetic import SampledRecording, one_joint_information, record
 from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import Reversal
-from ident_service.estimation import robust
+from ident_service.config.arm import Reversal
+from ident_service.estimation import robust_regression as robust
 from ident_service.estimation.equations import equations
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
-from ident_service.estimation.robust import huber
+from ident_service.estimation.robust_regression import huber
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.parameter_file import parameters_document, write_parameters
@@ -213,7 +213,7 @@ def test_every_method_finds_the_parameters(estimates: dict[str, np.ndarray]) -> 
 
 def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
     model, _, _ = three_links()
-    monkeypatch.setattr("ident_service.estimation.robust._MOST_ROUNDS", 2)
+    monkeypatch.setattr("ident_service.estimation.robust_regression._MOST_ROUNDS", 2)
     estimate = identify(model, [with_noise(0.02)], method="huber")
     assert np.isfinite(estimate.beta).all()
     assert "Huber's weights did not settle: of all rounds the one is used" in estimate.remarks[0]
@@ -225,8 +225,8 @@ def test_instruments_that_do_not_settle_give_the_best_round_and_say_so(monkeypat
     model, _, _ = three_links()
     settled = identify(model, [with_noise(0.0)], method="iv")
     assert settled.remarks == ()
-    monkeypatch.setattr("ident_service.estimation.instruments._MOST_ROUNDS", 3)
-    monkeypatch.setattr("ident_service.estimation.instruments.SETTLED", 0.0)
+    monkeypatch.setattr("ident_service.estimation.instrumental_variables._MOST_ROUNDS", 3)
+    monkeypatch.setattr("ident_service.estimation.instrumental_variables.SETTLED", 0.0)
     estimate = identify(model, [with_noise(0.0)], method="iv")
     (remark,) = estimate.remarks
     assert remark.startswith("the instrumental estimate did not settle: of all rounds the one is used that changed a")

@@ -10,23 +10,20 @@ import numpy as np
 from helpers.random_arms import random_delta
 from helpers.random_bodies import arm_with_bodies
 
-from ident_service.config.design import Design
-from ident_service.config.limits import MotionLimits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
-from ident_service.config.workspace import Supply
-from ident_service.excitation.basis import Basis, FourierBasis, PostureBasis
-from ident_service.excitation.clearance import certified_clearance
-from ident_service.excitation.demands import demands
+from ident_service.config.motion_design import Design, Supply
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.excitation.design import Designed
-from ident_service.excitation.proof import objections
+from ident_service.excitation.limit_proof import certified_clearance, demands, objections
+from ident_service.excitation.optimal_design import Task
 from ident_service.excitation.search import Budget
-from ident_service.excitation.task import Task
+from ident_service.excitation.trajectory import Basis, FourierBasis, PostureBasis
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.collision import CollisionModel
 from ident_service.model.expected_friction import ExpectedFriction
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 
 Array = np.ndarray
 QUICK = {"base_frequency": 0.2, "harmonics": 2, "periods": 1, "ramp": 1.0}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.trajectory import FourierPath, FourierSeries, PosturePath
 
 Array = np.ndarray
 

@@ -10,16 +10,15 @@ from helpers.random_bodies import arm_with_bodies, random_postures
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
-from ident_service.config.workspace import Workspace
+from ident_service.config.motion_design import Workspace
 from ident_service.errors import ModelError, MotionRefused
-from ident_service.excitation.clearance import certified_along, certified_clearance, posture_clearance
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import FourierPath, Path, PosturePath
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.limit_proof import certified_along, certified_clearance, posture_clearance
+from ident_service.excitation.trajectory import FourierPath, FourierSeries, Path, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.capsules import CapsuleModel
+from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.collision import CollisionModel
 
 BALL = {"from": [0, 0, 0], "to": [0, 0, 0], "radius": 0.1}

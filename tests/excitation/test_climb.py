@@ -10,10 +10,10 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.climb import Candidate, Interrupted, Stopped, climbed, keeps, kept, random_variables
 from ident_service.excitation.design import family, settled
+from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.problem import Problem
+from ident_service.excitation.search import Candidate, Interrupted, Stopped, climbed, keeps, kept, random_variables
 
 Array = np.ndarray
 SEEDS = st.integers(0, 2**32 - 1)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.criteria import condition_number, criterion
+from ident_service.excitation.optimal_design import condition_number, criterion
 
 Array = np.ndarray
 SEEDS = st.integers(0, 2**32 - 1)

@@ -12,14 +12,13 @@ from helpers.random_arms import model_around, random_chain, random_delta
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.demands import demands, require_within_limits
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import FourierPath
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.limit_proof import demands, require_within_limits
+from ident_service.excitation.trajectory import FourierPath, FourierSeries
 from ident_service.model.arm_model import ArmModel, arm_model
 
 Array = np.ndarray

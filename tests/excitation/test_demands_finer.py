@@ -12,17 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from motions import random_fourier_path, random_path, random_posture_path
 
-from ident_service.config.limits import MotionLimits
 from ident_service.config.load import load_arm
-from ident_service.config.workspace import Supply
-from ident_service.excitation.basis import FourierBasis
-from ident_service.excitation.demands import Demands, demands, power_bounds, torque_enclosures
+from ident_service.config.motion_design import Supply
+from ident_service.config.motion_limits import MotionLimits
+from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import per_period
-from ident_service.excitation.enclosure import stretches
-from ident_service.excitation.path import FourierPath, PosturePath
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.limit_proof import Demands, demands, power_bounds, stretches, torque_enclosures
+from ident_service.excitation.trajectory import FourierBasis, FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from design_bench import ONE_START, moves, quick, small, unproven
 
-from ident_service.config.limits import motion_limits
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.design import Designed, criterion_of, design_motion, family, settled
-from ident_service.excitation.excitation import excitation_from_json
+from ident_service.excitation.motion_file import excitation_from_json
+from ident_service.excitation.optimal_design import usable_limits
 from ident_service.excitation.search import Budget
-from ident_service.excitation.task import usable_limits
 from ident_service.model.arm_model import ArmModel
 
 KINDS: list[Any] = ["d_optimal", "a_optimal", "condition_number"]

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from design_bench import ONE_START, quick
 
-from ident_service.config.limits import motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_limits import motion_limits
 from ident_service.excitation.design import design_motion
-from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.search import Budget
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.factory import make_arm
-from ident_service.motion.states import State
-from ident_service.operations.commission import record_motion
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.state_machine import State
+from ident_service.operations.commissioning import record_motion
 
 
 def assert_runs(arm: ArmConfig, motion: Excitation, folder: Path) -> None:

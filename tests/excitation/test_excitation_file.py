@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from motions import random_path
 
 from ident_service.errors import UsageError
-from ident_service.excitation.excitation import Excitation, excitation_from_json, read_excitation
-from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.motion_file import Excitation, excitation_from_json, read_excitation
+from ident_service.excitation.trajectory import FourierPath, PosturePath
 
 SHA = "ab" * 32
 SEEDS = st.integers(0, 2**32 - 1)

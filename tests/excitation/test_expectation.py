@@ -9,19 +9,19 @@ import pytest
 from design_bench import ONE_START, quick, small
 from motions import random_fourier_path
 
-from ident_service.config.limits import motion_limits
-from ident_service.config.schema import Control
+from ident_service.config.arm import Control
+from ident_service.config.motion_limits import motion_limits
 from ident_service.excitation.design import criterion_of, design_motion, family, settled
-from ident_service.excitation.expectation import (
+from ident_service.excitation.prediction import (
     NoiseModel,
     described_noise,
     expected_deviations,
     information,
     seconds_of_information,
 )
-from ident_service.excitation.path import FourierPath, PosturePath
+from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

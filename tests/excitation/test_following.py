@@ -11,8 +11,8 @@ from helpers.random_arms import bodies_of, reference_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.limits import motion_limits
-from ident_service.excitation.following import forecast, rate_of_change
+from ident_service.config.motion_limits import motion_limits
+from ident_service.excitation.prediction import forecast, rate_of_change
 from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.regressor import joint_regressor
 

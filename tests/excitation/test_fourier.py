@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
-from ident_service.excitation.fourier import FourierSeries
+from ident_service.excitation.trajectory import FourierSeries
 
 Array = np.ndarray
 

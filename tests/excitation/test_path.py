@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from motions import random_fourier_path, random_path, random_posture_path
 
 from ident_service.errors import ModelError
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import STEP_PEAKS, FourierPath, PosturePath
+from ident_service.excitation.trajectory import STEP_PEAKS, FourierPath, FourierSeries, PosturePath
 
 Array = np.ndarray
 SEEDS = st.integers(0, 2**32 - 1)

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from design_bench import ONE_START, moves, quick, small, unproven
 
-from ident_service.config.limits import motion_limits
-from ident_service.excitation.basis import PostureBasis
+from ident_service.config.motion_limits import motion_limits
 from ident_service.excitation.design import design_motion, family
-from ident_service.excitation.expectation import described_noise, expected_deviations
-from ident_service.excitation.path import PosturePath
-from ident_service.excitation.task import usable_limits
-from ident_service.model.base import base_parameters, static_base_parameters
+from ident_service.excitation.optimal_design import usable_limits
+from ident_service.excitation.prediction import described_noise, expected_deviations
+from ident_service.excitation.trajectory import PostureBasis, PosturePath
+from ident_service.model.base_parameters import base_parameters, static_base_parameters
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

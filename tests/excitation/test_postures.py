@@ -8,12 +8,11 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.limits import MotionLimits, motion_limits
-from ident_service.excitation.climb import keeps
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.excitation.design import family, settled
+from ident_service.excitation.optimal_design import Problem, usable_limits
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.problem import Problem
-from ident_service.excitation.task import usable_limits
+from ident_service.excitation.search import keeps
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 

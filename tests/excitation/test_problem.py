@@ -11,15 +11,13 @@ from design_bench import FOURIER, POSTURES, quick, random_task, small
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.design import Design
-from ident_service.config.limits import MotorLimits
-from ident_service.config.workspace import Workspace
-from ident_service.excitation.basis import Basis
-from ident_service.excitation.climb import keeps
+from ident_service.config.motion_design import Design, Workspace
+from ident_service.config.motion_limits import MotorLimits
 from ident_service.excitation.design import family, settled
-from ident_service.excitation.problem import Problem
-from ident_service.excitation.task import usable_limits
-from ident_service.model.base import static_base_parameters
+from ident_service.excitation.optimal_design import Problem, usable_limits
+from ident_service.excitation.search import keeps
+from ident_service.excitation.trajectory import Basis
+from ident_service.model.base_parameters import static_base_parameters
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

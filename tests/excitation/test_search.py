@@ -12,11 +12,10 @@ import pytest
 from design_bench import quick, small
 
 from ident_service.excitation import search as searching
-from ident_service.excitation.climb import keeps
 from ident_service.excitation.design import family, settled
+from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.problem import Problem
-from ident_service.excitation.search import Budget, Found, Progress, search
+from ident_service.excitation.search import Budget, Found, Progress, keeps, search
 
 GRID = 60
 

@@ -10,9 +10,9 @@ from helpers.changed_arms import recorded_arm
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import MotionRefused
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.operations.commission import require_clear_from_home
+from ident_service.operations.commissioning import require_clear_from_home
 
 SIMULATED = [name for name in shipped_arms() if isinstance(load_arm(name).driver, SimulatedDriver)]
 

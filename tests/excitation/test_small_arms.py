@@ -10,13 +10,13 @@ import pytest
 from ident_service.config.load import load_arm
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.motion.factory import make_arm
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.run import RunReport, run
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.recorder_process import RecorderProcess
+from ident_service.recordings.recorder import RecorderProcess
 
 
 def recorded(model: ArmModel, purpose: str, path: Path) -> RunReport:

@@ -11,27 +11,25 @@ import numpy as np
 import pytest
 from design_bench import FOURIER, ONE_START, quick, small
 
-from ident_service.config.design import Criterion, Design
-from ident_service.config.limits import motion_limits
+from ident_service.config.motion_design import Criterion, Design
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.binding import binding, binding_words, gain_words, needed_stiffness, stiffer_gains
-from ident_service.excitation.clearance import certified_clearance
-from ident_service.excitation.climb import Candidate, climbed, random_variables
+from ident_service.excitation.active_limits import binding, binding_words, gain_words, needed_stiffness, stiffer_gains
+from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import criterion_of, design_motion, family, per_period, settled
-from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.limit_proof import certified_clearance, largest_proven, objections, proof_of
 from ident_service.excitation.mending import Prover
-from ident_service.excitation.path import FourierPath, PosturePath
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.motion_file import Excitation
+from ident_service.excitation.optimal_design import Problem, Task
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.problem import Problem
-from ident_service.excitation.proof import largest_proven, objections, proof_of
-from ident_service.excitation.task import Task
+from ident_service.excitation.search import Candidate, climbed, random_variables
 from ident_service.excitation.tracking import cases, track, way_width
+from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.factory import make_arm
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.run import run
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 from ident_service.preflight.stability import stability
 
 SLOW = {"control": {"rate": 250.0}}

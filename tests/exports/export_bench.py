@@ -15,10 +15,10 @@ from helpers.random_arms import random_delta
 
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.chain import Chain
 from ident_service.model.regressor import joint_regressor
-from ident_service.results.export.arm import IdentifiedArm
+from ident_service.results.export.identified_arm import IdentifiedArm
 
 Array = np.ndarray
 States = tuple[Array, Array, Array]

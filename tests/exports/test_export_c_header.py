@@ -27,11 +27,10 @@ from hypothesis import strategies as st
 from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
-from ident_service.model.layout import TERM_SYMBOLS, Layout
+from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
 from ident_service.results.export import c_header as writer
-from ident_service.results.export.arm import IdentifiedArm
-from ident_service.results.export.c_code import run_c_lines
-from ident_service.results.export.c_header import c_header, c_prefix, read_c_header
+from ident_service.results.export.c_header import c_header, c_prefix, read_c_header, run_c_lines
+from ident_service.results.export.identified_arm import IdentifiedArm
 
 Array = np.ndarray
 STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-fPIC", "-shared"]

@@ -31,9 +31,9 @@ from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Chain
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 from ident_service.results.export import mjcf
-from ident_service.results.export.arm import IdentifiedArm
+from ident_service.results.export.identified_arm import IdentifiedArm
 from ident_service.results.export.mjcf import mjcf_export
 
 

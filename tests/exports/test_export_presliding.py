@@ -17,14 +17,14 @@ from exports.export_bench import assert_same, compiler, identified, some_delta, 
 from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.coulomb_direction import direction as directions
 from ident_service.model.dynamic_model import DynamicModel
+from ident_service.model.friction_state import direction as directions
 from ident_service.model.regressor import joint_regressor
 from ident_service.results import load_model
 from ident_service.results.export import c_header as writer
-from ident_service.results.export.arm import IdentifiedArm
 from ident_service.results.export.c_header import c_header, c_prefix, read_c_header
 from ident_service.results.export.formats import export_texts
+from ident_service.results.export.identified_arm import IdentifiedArm
 
 Array = np.ndarray
 PERIOD = 1e-3

@@ -25,11 +25,10 @@ from hypothesis import strategies as st
 from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
-from ident_service.model.drives import joint_drives
+from ident_service.model.parameter_layout import joint_drives
 from ident_service.results.export import sdf
-from ident_service.results.export.arm import IdentifiedArm
-from ident_service.results.export.sdf import sdf_export
-from ident_service.results.export.sdf_reader import read_sdf
+from ident_service.results.export.identified_arm import IdentifiedArm
+from ident_service.results.export.sdf import read_sdf, sdf_export
 
 GRAVITY = (0.0, 0.0, -9.81)
 

@@ -30,11 +30,9 @@ from hypothesis import strategies as st
 from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
-from ident_service.model.layout import TERM_SYMBOLS, Layout
-from ident_service.results.export import json_model
-from ident_service.results.export.formats import export_texts
-from ident_service.results.export.json_model import json_export
-from ident_service.results.export.table import csv_export
+from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
+from ident_service.results.export import formats as json_model
+from ident_service.results.export.formats import csv_export, export_texts, json_export
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "exports.md"
 

@@ -30,13 +30,11 @@ from ident_service.config.load import load_arm
 from ident_service.errors import IdentError, ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
-from ident_service.results.export import urdf_file
-from ident_service.results.export.arm import IdentifiedArm
+from ident_service.results.export import urdf as urdf_file
 from ident_service.results.export.bodies import is_real, moved
-from ident_service.results.export.check import carried
-from ident_service.results.export.original_urdf import original_urdf
-from ident_service.results.export.urdf_file import urdf_export
-from ident_service.results.export.xml_places import xml_places
+from ident_service.results.export.identified_arm import IdentifiedArm
+from ident_service.results.export.round_trip import carried
+from ident_service.results.export.urdf import original_urdf, urdf_export, xml_places
 
 Array = np.ndarray
 

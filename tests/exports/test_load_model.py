@@ -22,7 +22,7 @@ from ident_service.errors import ModelError, ParameterError, UsageError
 from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.dynamic_model import DynamicModel
-from ident_service.model.layout import TERM_SYMBOLS, Layout
+from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
 from ident_service.model.regressor import joint_regressor
 from ident_service.results import load_model
 from ident_service.results.run_folder import write_manifest, write_results

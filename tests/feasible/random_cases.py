@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from helpers.random_arms import random_chain
 
-from ident_service.config.schema import ArmConfig, JointTerm
+from ident_service.config.arm import ArmConfig, JointTerm
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import Information, information_of, supports
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 from feasible.random_cases import random_case
 
+from ident_service.config.arm import FeasibleSetName
 from ident_service.config.load import load_arm
-from ident_service.config.schema import FeasibleSetName
-from ident_service.estimation.feasible.blocks import reference, symmetric
 from ident_service.estimation.feasible.central import Near, central
-from ident_service.estimation.feasible.feasibility import constrained_least_squares, feasibility_test
-from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
-from ident_service.estimation.feasible.posing import EPSILON, Lift
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, reference, symmetric
+from ident_service.estimation.feasible.formulation import EPSILON, Lift
+from ident_service.estimation.feasible.problems import constrained_least_squares, feasibility_test
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.likely_bodies import likely_bodies
 
 KINDS: tuple[FeasibleSetName, ...] = ("inertia", "pseudo_inertia")

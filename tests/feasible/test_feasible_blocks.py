@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasible.feasibility import (
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.problems import (
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.model.base import base_from_expressions
-from ident_service.model.layout import INERTIAL
+from ident_service.model.base_parameters import base_from_expressions
+from ident_service.model.parameter_layout import INERTIAL
 
 NAMES = tuple(f"{symbol}1" for symbol in INERTIAL)
 TETRAHEDRON = ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.4))

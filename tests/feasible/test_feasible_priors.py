@@ -13,13 +13,13 @@ from helpers.random_arms import random_rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.schema import FeasibleSetName
+from ident_service.config.arm import FeasibleSetName
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasible.feasibility import EPSILON, FeasibleEstimate, constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import feasible_set, symmetric
 from ident_service.estimation.feasible.priors import Prior, choose_weight, residual_deviation
-from ident_service.model.base import BaseParameters
-from ident_service.model.layout import INERTIAL
+from ident_service.estimation.feasible.problems import EPSILON, FeasibleEstimate, constrained_least_squares
+from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.parameter_layout import INERTIAL
 
 Kind = Literal["euclidean", "entropic"]
 KINDS: tuple[Kind, ...] = ("euclidean", "entropic")

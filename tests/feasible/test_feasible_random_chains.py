@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from feasible.random_cases import random_case
 
-from ident_service.config.schema import FeasibleSetName
-from ident_service.estimation.feasible.feasibility import (
+from ident_service.config.arm import FeasibleSetName
+from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import (
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.feasible.feasible_set import feasible_set
 
 KINDS: tuple[FeasibleSetName, ...] = ("inertia", "pseudo_inertia")
 

@@ -9,10 +9,10 @@ import pytest
 from feasible.random_cases import one_link, random_case
 from pydantic import ValidationError
 
-from ident_service.config.schema import Constraints
+from ident_service.config.arm import Constraints
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
 from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.information import Information

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from feasible.random_cases import one_link, random_case
 
-from ident_service.config.schema import Constraints, FeasibleSetName
+from ident_service.config.arm import Constraints, FeasibleSetName
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
-from ident_service.estimation.feasible.feasibility import EPSILON, feasibility_correction, feasibility_test
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, symmetric
-from ident_service.model.base import BaseParameters, base_from_expressions
-from ident_service.model.layout import INERTIAL
+from ident_service.estimation.feasible.formulation import ConditionsError, contradiction
+from ident_service.estimation.feasible.problems import EPSILON, feasibility_correction, feasibility_test
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions
+from ident_service.model.parameter_layout import INERTIAL
 
 NAMES = tuple(f"{symbol}1" for symbol in INERTIAL)
 

@@ -24,21 +24,22 @@ from helpers.forks import fork
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ident_service.config import load, source
+from ident_service.config import load
+from ident_service.config import yaml_source as source
 from ident_service.config.eds import LONGEST, data_sheet
 from ident_service.config.load import arm_from_json, load_arm, load_recording_format
 from ident_service.config.quantities import TextFile
-from ident_service.config.shipped import shipped_arms
+from ident_service.config.yaml_source import shipped_arms
 from ident_service.errors import DriverError, IdentError
-from ident_service.excitation import excitation as motion_file
-from ident_service.excitation.excitation import read_excitation
-from ident_service.excitation.plan import excitation
+from ident_service.excitation import motion_file as motion_file
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.motion_file import read_excitation
 from ident_service.model import mechanism
 from ident_service.model.arm_model import arm_model
 from ident_service.model.mechanism import Kind, read_mechanism
 from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.writer import RecordingWriter
 from ident_service.results import parameter_file
 from ident_service.results.parameter_file import read_parameters
 from sim_backend.canopen_device.objects import Objects

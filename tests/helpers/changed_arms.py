@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from ident_service.config.arm import ArmConfig, SeededMotion
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import ParameterTable
-from ident_service.config.schema import ArmConfig, SeededMotion
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.factory import make_arm
-from ident_service.operations.commission import record_motion
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.commissioning import record_motion
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Recording
 from ident_service.results.run_folder import write_manifest, write_results

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from drivers.can.bus_errors import BusError
+from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from drivers.canopen.pdo_mapping import SYNC
 from drivers.clock import Clock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
-from ident_service.config.schema import ArmConfig
 from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 
 EDS = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text(encoding="utf-8")

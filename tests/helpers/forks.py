@@ -68,4 +68,4 @@ class ForkedPlant:
 def fork_plants(patch: pytest.MonkeyPatch) -> None:
     """Have plants of their own process forked from this one."""
     processes = SimpleNamespace(Popen=ForkedPlant, PIPE=subprocess.PIPE, TimeoutExpired=subprocess.TimeoutExpired)
-    patch.setattr("sim_backend.plant_launch.subprocess", processes)
+    patch.setattr("sim_backend.remote_arm.subprocess", processes)

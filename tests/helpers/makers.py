@@ -9,7 +9,7 @@ from typing import Any
 from helpers.emulated_arms import Tapped, tapped, weightless_config
 
 from drivers.canopen.driver import CanopenArm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from sim_backend.emulator.lock_step import LockStepArm
 
 SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"

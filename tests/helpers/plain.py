@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ident_service.config.schema import FrictionShape, Identification, Smoothing
+from ident_service.config.arm import FrictionShape, Identification, Smoothing
 
 
 def plain_smoothing(**given: Any) -> Smoothing:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Chain
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 
 Array = np.ndarray
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from helpers.random_arms import model_around, random_chain
 
-from ident_service.config.workspace import Capsule, Workspace
+from ident_service.config.motion_design import Capsule, Workspace
 from ident_service.model.arm_model import ArmModel
 
 TRAVEL = 0.3  # m, of sliding joints to either side

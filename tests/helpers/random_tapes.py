@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from ident_service.model.tape import Symbol, Tape, Value
+from ident_service.model.symbolic import Symbol, Tape, Value
 
 Recipe = list[tuple[str, int, int]]
 OPERATIONS = ("add", "sub", "mul", "neg", "sin", "cos", "exp", "abs", "sign", "constant")

@@ -5,15 +5,14 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from pathlib import Path
 
-from ident_service.config.schema import ArmConfig
-from ident_service.excitation.plan import excitation
+from ident_service.config.arm import ArmConfig
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.ticket import VALID, Ticket
-from ident_service.operations.arm_state import ticket_path
-from ident_service.operations.preflight import write_ticket
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.ticket import VALID, Ticket, Verdict
+from ident_service.operations.arm_checks import write_ticket
 from ident_service.preflight.preflight import preflight
+from ident_service.registry.state_folder import ticket_path
 
 _MADE: dict[str, Ticket] = {}
 

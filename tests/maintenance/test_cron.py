@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.errors import UsageError
-from ident_service.operations.cron import parse_cron
+from ident_service.operations.maintenance_schedule import parse_cron
 
 BOUNDS = ((0, 59), (0, 23), (1, 31), (1, 12), (0, 7))
 

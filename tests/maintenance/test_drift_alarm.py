@@ -10,11 +10,10 @@ from maintenance.conftest import ARM
 from maintenance.drifting import reidentified
 
 from ident_service.cli import main
-from ident_service.operations.arm_state import fault_file
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import When, add_schedule, dues
-from ident_service.registry.audit import trail
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, trail
+from ident_service.registry.state_folder import fault_file
 from ident_service.results.manifest import verified_files
 
 DRIER = 1.3

@@ -12,16 +12,14 @@ from maintenance.conftest import ARM, MONDAY, Clock, description
 
 from ident_service.config.load import load_arm
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import outcome, said
+from ident_service.daemon.jobs.outcome import explain_interrupted, mark_interrupted, outcome, said
 from ident_service.daemon.jobs.queue import Engine
-from ident_service.daemon.jobs.recovery import explain_interrupted, mark_interrupted
 from ident_service.daemon.jobs.requests import Check, Run
 from ident_service.daemon.maintenance.reidentification import Wanted, reidentifications
 from ident_service.daemon.maintenance.scheduler import Keeper
 from ident_service.daemon.maintenance.webhook import deliveries
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.operations.acceptance import accepted_set, rollback
-from ident_service.operations.arm_state import fault_file
 from ident_service.operations.maintenance_schedule import (
     When,
     add_event,
@@ -32,8 +30,8 @@ from ident_service.operations.maintenance_schedule import (
 )
 from ident_service.registry import jobs
 from ident_service.registry.arms import add_arm
-from ident_service.registry.audit import trail
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, trail
+from ident_service.registry.state_folder import fault_file
 
 HOUR = 3600.0
 pytestmark = pytest.mark.slow  # one commissioning for all of them

@@ -23,8 +23,7 @@ from ident_service.operations.maintenance_schedule import (
     schedules,
 )
 from ident_service.registry.arms import add_arm
-from ident_service.registry.audit import trail
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, trail
 from ident_service.registry.runs import _driven
 
 HOUR, DAY = 3600.0, 86400.0

@@ -23,8 +23,7 @@ from standardwebhooks.webhooks import WebhookVerificationError
 from ident_service.daemon.maintenance.webhook import WAITS, Webhook, deliveries, read_secret, require_address
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
-from ident_service.registry.audit import trail
-from ident_service.registry.database import Database
+from ident_service.registry.database import Database, trail
 
 SECRET = b"0123456789abcdef0123456789abcdef"
 NOTICE = {"id": 7, "arm": "quick", "what": "maintenance: öl"}

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
-from ident_service.model.adjoint import Differentiable
-from ident_service.model.tape import Symbol, Tape, Value
+from ident_service.model.symbolic import Differentiable, Symbol, Tape, Value
 
 INPUTS, SAMPLES = 4, 5
 

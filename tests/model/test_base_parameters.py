@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from ident_service.config.load import load_arm
 from ident_service.errors import ParameterError
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import BaseParameters, base_from_expressions, base_parameters
-from ident_service.model.layout import INERTIAL, Layout
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions, base_parameters
+from ident_service.model.parameter_layout import INERTIAL, Layout
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

@@ -8,13 +8,12 @@ from helpers.random_bodies import arm_with_bodies, random_postures
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ident_service.config.schema import ArmConfig
-from ident_service.config.workspace import Workspace
+from ident_service.config.arm import ArmConfig
+from ident_service.config.motion_design import Workspace
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.capsules import CapsuleModel
+from ident_service.model.capsule_distances import CapsuleModel, between_segments, to_boxes
 from ident_service.model.collision import CollisionModel
-from ident_service.model.segments import between_segments, to_boxes
 
 SHAPES = (
     '<box size="{0} {1} {2}"/>',

@@ -13,8 +13,8 @@ from helpers.random_bodies import arm_with_bodies, random_postures
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.collision import CollisionModel

@@ -11,12 +11,11 @@ from helpers.random_bodies import arm_with_bodies, random_postures
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.collision import CollisionModel
-from ident_service.model.contact import AT_ONCE, Contact
+from ident_service.model.collision import AT_ONCE, CollisionModel, Contact
 
 Array = np.ndarray
 

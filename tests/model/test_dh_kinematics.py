@@ -15,7 +15,7 @@ from ident_service.config.kinematics import DHTable
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Chain, chain_from_dh, rotation_x, rotation_z
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.errors import ParameterError
-from ident_service.model.expressions import format_expression, format_number, parameter_matrix, parse_expression
+from ident_service.model.base_parameters import format_expression, format_number, parameter_matrix, parse_expression
 
 NAMES = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,8}", fullmatch=True)
 COEFFICIENTS = st.one_of(

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
 from ident_service.model import information
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.chain import Chain
 from ident_service.model.information import Information, empty_information, information_of, supports
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

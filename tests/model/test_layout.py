@@ -8,7 +8,7 @@ import pytest
 from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ParameterError
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 
 LINK = ["Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m"]
 ALL = ("drive_inertia", "viscous", "coulomb", "offset")

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ident_service.config.arm import Mass
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import Mass
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.likely_bodies import likely_bodies
-from ident_service.model.rigid_body import inertia_from_delta
+from ident_service.model.pinocchio_models import inertia_from_delta
 
 ARMS = [name for name in shipped_arms() if name != "wam7_canopen_500hz"]
 

@@ -10,16 +10,16 @@ import pinocchio as pin
 import pytest
 from pydantic import ValidationError
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import Chain
+from ident_service.model.collision import scene
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.scene import scene
-from ident_service.results.export.urdf_file import urdf_export
+from ident_service.results.export.urdf import urdf_export
 
 
 def inertial(mass: float, x: float, y: float, z: float) -> str:

@@ -9,14 +9,14 @@ import pinocchio as pin
 import pytest
 from helpers.random_arms import random_states, reference_model, reference_torque
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Chain
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
+from ident_service.model.pinocchio_models import read_mjcf, read_urdf
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import read_mjcf, read_urdf
 
 GRAVITY = (0.0, 0.0, -9.81)
 BALL = '<inertial><origin xyz="0.1 0.2 0.3"/><mass value="2"/>'

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.chain import Chain
-from ident_service.model.layout import TERM_SYMBOLS, Layout
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
+from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.tape import Program, Tape, Value
+from ident_service.model.symbolic import Program, Tape, Value
 
 Array = np.ndarray
 

@@ -8,7 +8,7 @@ import pytest
 
 from ident_service.certificate_verifier import INERTIAL, JOINT_TERMS, split_name
 from ident_service.errors import ParameterError
-from ident_service.model.expressions import parse_exactly
+from ident_service.model.base_parameters import parse_exactly
 from ident_service.model.notation import Notation, regrouped, translate
 
 KHALIL = ["XX", "XY", "XZ", "YY", "YZ", "ZZ", "MX", "MY", "MZ", "M", "IA", "FV", "FS", "OFF"]

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.layout import Layout
+from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
 ALL = ("drive_inertia", "viscous", "coulomb", "offset")

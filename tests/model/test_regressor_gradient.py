@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
 from ident_service.model.chain import Chain
-from ident_service.model.layout import Layout
-from ident_service.model.regressor import joint_regressor
-from ident_service.model.regressor_gradient import RegressorGradient
+from ident_service.model.parameter_layout import Layout
+from ident_service.model.regressor import RegressorGradient, joint_regressor
 
 Array = np.ndarray
 TERMS = ("drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry")

@@ -15,7 +15,7 @@ from ident_service.config.kinematics import snapped
 from ident_service.config.load import load_arm
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import BaseParameters, base_parameters, remarks_on_angles
+from ident_service.model.base_parameters import BaseParameters, base_parameters, remarks_on_angles
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 

@@ -8,8 +8,7 @@ from helpers.random_tapes import Recipe, followed, recipes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.model.tape import Program, Symbol, Tape, Value
-from ident_service.model.taylor import Taylor, enclose
+from ident_service.model.symbolic import Program, Symbol, Tape, Taylor, Value, enclose
 
 Array = np.ndarray
 INPUTS, FINER = 4, 1000

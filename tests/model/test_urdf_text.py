@@ -25,8 +25,8 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import Chain
-from ident_service.model.layout import Layout
-from ident_service.model.rigid_body import InverseDynamics, joint_frame_inertias, pinocchio_model, read_urdf
+from ident_service.model.parameter_layout import Layout
+from ident_service.model.pinocchio_models import InverseDynamics, joint_frame_inertias, pinocchio_model, read_urdf
 from ident_service.model.urdf import urdf_text
 
 Array = np.ndarray

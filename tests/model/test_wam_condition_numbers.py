@@ -11,7 +11,7 @@ import pytest
 import scipy.signal
 
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import base_parameters
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray

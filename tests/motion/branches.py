@@ -21,9 +21,9 @@ from helpers.forks import fork
 from motion_bench import Story, WatchedArm
 
 from ident_service.errors import ArmFault
-from ident_service.motion.latch import Latch
+from ident_service.motion.faults import Latch
 from ident_service.motion.run import run
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 from sim_backend.arm import Truth
 from sim_backend.faults import Fault
 

@@ -16,22 +16,22 @@ from typing import Any
 import numpy as np
 from motion_bench import Story, WatchedArm, bench_config
 
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import ArmFault
-from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
-from ident_service.motion.checks import MAX_AGE
-from ident_service.motion.controls import Switches
-from ident_service.motion.latch import Latch
+from ident_service.motion.command_channel import Switches
+from ident_service.motion.faults import Latch
 from ident_service.motion.run import Sink, run
-from ident_service.motion.states import State
+from ident_service.motion.safety_monitor import MAX_AGE
+from ident_service.motion.state_machine import State
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.writer import RecordingWriter
+from ident_service.recordings.mcap_writer import RecordingWriter
 from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault, FaultKind
 

@@ -17,11 +17,11 @@ from motion_bench import JOINTS, TRUTH, WatchedArm, bench_config
 from drivers.arm import Sample
 from drivers.can.can_frame import Frame
 from drivers.canopen.driver import CanopenArm
-from ident_service.config.limits import motion_limits
-from ident_service.config.schema import ArmConfig
-from ident_service.excitation.plan import excitation
+from ident_service.config.arm import ArmConfig
+from ident_service.config.motion_limits import motion_limits
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.checks import MAX_AGE
+from ident_service.motion.safety_monitor import MAX_AGE
 from sim_backend.emulator.faults import PUCK_FAULTS, PuckFault
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth

@@ -33,14 +33,14 @@ from motion_bench import LOOKED
 
 from drivers.arm import StopKind
 from ident_service.errors import MotionRefused
-from ident_service.motion.checks import VELOCITY_OFF
+from ident_service.motion.control_loop import REST_CYCLES
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Reaction
-from ident_service.motion.loop import REST_CYCLES
 from ident_service.motion.lowering import RESTING, SPEED
 from ident_service.motion.run import run
+from ident_service.motion.safety_monitor import VELOCITY_OFF
 from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.writer import RecordingWriter
 from sim_backend.faults import Fault
 
 

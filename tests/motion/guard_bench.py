@@ -9,10 +9,9 @@ import numpy as np
 from motion_bench import bench_limits
 
 from drivers.arm import Sample
-from ident_service.motion.checks import JUMP
 from ident_service.motion.faults import FAULTS, Fault, Reaction
-from ident_service.motion.guard import Guard
-from ident_service.motion.reference import rest
+from ident_service.motion.safety_monitor import JUMP, Guard
+from ident_service.motion.trajectory import rest
 
 Array = np.ndarray
 NAMES = ("shoulder", "elbow")

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
-from ident_service.config.limits import MotionLimits, motion_limits
-from ident_service.config.schema import ArmConfig
-from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.plan import excitation
+from ident_service.config.arm import ArmConfig
+from ident_service.config.motion_limits import MotionLimits, motion_limits
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.recordings.cycle import Cycle
 from sim_backend.arm import Truth, from_config

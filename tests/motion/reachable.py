@@ -7,16 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from hypothesis import strategies as st
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import FourierPath, PosturePath
-from ident_service.motion.pause import Paused
-from ident_service.motion.profile import after
-from ident_service.motion.reference import PathReference, Reference, Setpoint, rest
-from ident_service.motion.speed import Slowed, SpeedChange
-from ident_service.motion.stop import stop
-from ident_service.motion.way import way
+from ident_service.excitation.trajectory import FourierPath, FourierSeries, PosturePath
+from ident_service.motion.sequencer import Paused
+from ident_service.motion.speed_scaling import Slowed, SpeedChange
+from ident_service.motion.stop_trajectory import after, stop
+from ident_service.motion.trajectory import PathReference, Reference, Setpoint, rest, way
 
 Array = np.ndarray
 Motion = FourierPath | PosturePath

@@ -11,10 +11,9 @@ import pytest
 from motion_bench import Story, WatchedArm, bench_excitation, bench_limits, bench_model
 
 from ident_service.errors import ArmFault, DriverError
-from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.fourier import FourierSeries
-from ident_service.excitation.path import FourierPath
-from ident_service.motion.controls import StopWhen
+from ident_service.excitation.motion_file import Excitation
+from ident_service.excitation.trajectory import FourierPath, FourierSeries
+from ident_service.motion.command_channel import StopWhen
 from ident_service.motion.run import RunReport, run
 from sim_backend.arm import Truth
 

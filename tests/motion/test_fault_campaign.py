@@ -19,7 +19,7 @@ from campaign_checks import keep_their_promises, keeps_its_promise, together
 
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.motion.faults import FAULTS, Reaction
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
 STATES = (

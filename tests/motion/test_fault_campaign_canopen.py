@@ -21,7 +21,7 @@ from campaign_checks import keep_their_promises, keeps_its_promise, together
 from test_fault_campaign import STATES
 
 from ident_service.motion.faults import FAULTS
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 from sim_backend.emulator.faults import PUCK_FAULTS
 from sim_backend.emulator.motor import Power
 

@@ -11,21 +11,19 @@ import pytest
 from motion_bench import JOINTS, LOOKED, Story, WatchedArm, bench_config
 
 from drivers.arm import StopKind
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused, UsageError
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.controls import Homing, Switches
-from ident_service.motion.latch import Latch
-from ident_service.motion.lifeline import Lifeline
-from ident_service.motion.loop import LEADS, LOWERS, WAITS
+from ident_service.motion.command_channel import ControlFile, Homing, Lifeline, Switches
+from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
+from ident_service.motion.faults import Latch
 from ident_service.motion.lowering import SPEED, lowest_point
-from ident_service.motion.plans import Destination, GoTo
 from ident_service.motion.run import RunReport, follow, run
-from ident_service.motion.states import State
+from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.state_machine import State
 from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault, FaultKind
 

@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from drivers.clock import Clock, RealClock, VirtualClock
-from ident_service.config.limits import motion_limits
 from ident_service.config.load import load_arm
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.attended import attended
 from ident_service.motion.realtime import asked
+from ident_service.motion.run import attended
 from ident_service.preflight import static_checks as plan
 
 

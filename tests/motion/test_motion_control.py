@@ -14,10 +14,10 @@ from motion_bench import PRIOR, bench_config, bench_limits, bench_model
 from drivers.arm import StopKind
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.expected_friction import ExpectedFriction, FrictionFeedforward, expected_friction
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.guard import TORQUE_RATE
-from ident_service.motion.reference import Setpoint, rest
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.safety_monitor import TORQUE_RATE
+from ident_service.motion.trajectory import Setpoint, rest
 from sim_backend.arm import from_config
 
 Array = np.ndarray

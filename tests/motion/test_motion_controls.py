@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS, StopWhen, Switches
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LEASE_SECONDS, StopWhen, Switches
 
 
 def test_a_function_can_stop_a_run() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.arm import Watchdog
-from ident_service.motion.deadlines import LATE, LONGEST_GAP, LONGEST_STALL, Deadlines, Elapsed, longest_stall
+from ident_service.motion.cycle_timing import LATE, LONGEST_GAP, LONGEST_STALL, Deadlines, Elapsed, longest_stall
 from ident_service.motion.faults import WINDOW, Fault, Findings
 
 MS = 1_000_000

@@ -7,7 +7,7 @@ from motion_bench import bench_config
 
 from drivers.clock import VirtualClock
 from ident_service.errors import DriverError
-from ident_service.motion.factory import make_arm
+from ident_service.motion.arm_factory import make_arm
 from sim_backend.arm import SimulatedArm
 
 

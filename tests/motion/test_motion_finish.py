@@ -14,14 +14,14 @@ from motion_bench import JOINTS, LOOKED, WatchedArm, bench_model, watched
 from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy
 
 from drivers.arm import StopKind
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.pause import Paused
-from ident_service.motion.plans import Destination, GoTo
-from ident_service.motion.reference import Reference, rest
+from ident_service.motion.clearance import Surroundings
 from ident_service.motion.run import RunReport, follow, run
-from ident_service.motion.states import State
-from ident_service.motion.surroundings import Surroundings
+from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.sequencer import Paused
+from ident_service.motion.state_machine import State
+from ident_service.motion.trajectory import Reference, rest
 from sim_backend.arm import Truth
 
 Array = np.ndarray

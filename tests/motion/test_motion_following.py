@@ -7,11 +7,11 @@ import pytest
 from motion_bench import Story
 
 from ident_service.config.load import load_arm
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.factory import make_arm
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.run import run
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 
 # Largest error of every joint over the published motion [rad], measured at 1 kHz and at 250 Hz alike under the law that
 # knew the CAD model alone, with the gains of table 4.

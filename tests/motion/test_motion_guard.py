@@ -11,7 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from drivers.arm import Sample
 from drivers.axis_status import AxisStatus
-from ident_service.motion.checks import (
+from ident_service.motion.faults import Fault
+from ident_service.motion.safety_monitor import (
+    ABSURD,
     FROZEN_CYCLES,
     FROZEN_EFFORT,
     MAX_AGE,
@@ -20,9 +22,7 @@ from ident_service.motion.checks import (
     VELOCITY_OFF,
     VELOCITY_STOP,
 )
-from ident_service.motion.faults import Fault
-from ident_service.motion.guard import ABSURD
-from ident_service.motion.reference import Setpoint
+from ident_service.motion.trajectory import Setpoint
 
 Array = np.ndarray
 

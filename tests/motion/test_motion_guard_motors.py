@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from motion_bench import bench_config
 
-from ident_service.config.limits import MotionLimits, motion_limits
+from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.config.recording import Transmission
-from ident_service.motion.guard import Guard
+from ident_service.motion.safety_monitor import Guard
 
 Array = np.ndarray
 RATIOS, COUPLING, MOST = (20.0, -30.0), ((1.0, -0.5), (1.0, 0.5)), (0.8, 0.5)

@@ -12,8 +12,10 @@ from motion_bench import bench_model
 
 from drivers.arm import StopKind
 from drivers.axis_status import AxisEventCode, AxisStatus
-from ident_service.model.contact import Contact
-from ident_service.motion.checks import (
+from ident_service.model.collision import Contact
+from ident_service.motion.faults import FAULTS, Fault, Findings, Reaction, Severity
+from ident_service.motion.safety_monitor import (
+    ABSURD,
     ENVELOPE,
     ENVELOPE_SLACK,
     FOLLOWING_LOST,
@@ -21,12 +23,12 @@ from ident_service.motion.checks import (
     FROZEN_EFFORT,
     MAX_AGE,
     NOT_APPLIED,
+    TORQUE_RATE,
+    TORQUE_RATE_SHARE,
     VELOCITY_OFF,
     VELOCITY_STOP,
     approach_speed,
 )
-from ident_service.motion.faults import FAULTS, Fault, Findings, Reaction, Severity
-from ident_service.motion.guard import ABSURD, TORQUE_RATE, TORQUE_RATE_SHARE
 
 Array = np.ndarray
 ON = int(AxisStatus.POWERED)

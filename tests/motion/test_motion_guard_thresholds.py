@@ -12,12 +12,13 @@ from guard_bench import HOME, LIMITS, NAMES, PERIOD, STILL, WINDOW, Bench, is_fa
 from motion_bench import bench_model
 
 from drivers.axis_status import AxisStatus
-from ident_service.config.limits import Vector
-from ident_service.model.contact import Contact
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion import checks, guard
-from ident_service.motion.checks import approach_speed
-from ident_service.motion.owed import Owed
+from ident_service.config.motion_limits import Vector
+from ident_service.model.collision import Contact
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion import safety_monitor as checks
+from ident_service.motion import safety_monitor as guard
+from ident_service.motion.encoder_observer import Owed
+from ident_service.motion.safety_monitor import approach_speed
 
 Array = np.ndarray
 

@@ -12,13 +12,13 @@ from motion_bench import ELBOW, JOINTS, SHOULDER, bench_model
 from run_bench import HOLD, HOME, LIMITS, PERIOD, Bench
 
 from drivers.arm import StopKind
-from ident_service.config.limits import motion_limits
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.controls import Switches
-from ident_service.motion.outside import admitting, just_inside
-from ident_service.motion.plans import Destination, GoTo
+from ident_service.motion.clearance import admitting, just_inside
+from ident_service.motion.command_channel import Switches
 from ident_service.motion.run import RunReport, follow
-from ident_service.motion.states import State
+from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.state_machine import State
 
 Array = np.ndarray
 OUT = LIMITS.upper[0] + 0.1  # of the shoulder, half a following error outside

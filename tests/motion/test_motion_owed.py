@@ -7,9 +7,9 @@ import pytest
 from guard_bench import HOME, LIMITS, PERIOD, Bench, is_fault, unit
 from motion_bench import PRIOR, bench_model
 
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.checks import FROZEN_CYCLES, FROZEN_EFFORT
-from ident_service.motion.owed import OWED, SLID, SLIDING, STANDING, STEPS, Owed, owed_ways
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.encoder_observer import OWED, SLID, SLIDING, STANDING, STEPS, Owed, owed_ways
+from ident_service.motion.safety_monitor import FROZEN_CYCLES, FROZEN_EFFORT
 
 Array = np.ndarray
 MODEL = bench_model()

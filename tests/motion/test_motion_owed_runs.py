@@ -11,11 +11,11 @@ from campaign_bench import Subject, play, subject
 from guard_bench import PERIOD
 from motion_bench import TRUTH, bench_config
 
-from ident_service.config.schema import ArmConfig
-from ident_service.excitation.plan import excitation
+from ident_service.config.arm import ArmConfig
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.checks import VELOCITY_OFF
-from ident_service.motion.states import State
+from ident_service.motion.safety_monitor import VELOCITY_OFF
+from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray

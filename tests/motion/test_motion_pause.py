@@ -12,9 +12,9 @@ from motion_bench import bench_excitation, bench_limits
 from reachable import close, keeps_to, random_limits, random_path, sampled
 
 from ident_service.errors import MotionRefused
-from ident_service.motion.pause import Paused, Resumed
-from ident_service.motion.reference import PathReference, Setpoint, rest
-from ident_service.motion.speed import Slowed, slowed_limits
+from ident_service.motion.sequencer import Paused, Resumed
+from ident_service.motion.speed_scaling import Slowed, slowed_limits
+from ident_service.motion.trajectory import PathReference, Setpoint, rest
 
 Array = np.ndarray
 LIMITS = bench_limits()

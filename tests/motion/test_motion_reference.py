@@ -8,7 +8,7 @@ from reachable import (
     close,
 )
 
-from ident_service.motion.reference import PathReference, Setpoint, hold, rest
+from ident_service.motion.trajectory import PathReference, Setpoint, hold, rest
 
 Array = np.ndarray
 LIMITS = bench_limits()

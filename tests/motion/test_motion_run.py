@@ -12,10 +12,10 @@ from run_bench import HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy, with
 
 from drivers.arm import Sample
 from ident_service.errors import UsageError
-from ident_service.motion.controls import StopWhen
-from ident_service.motion.loop import REST_CYCLES
+from ident_service.motion.command_channel import StopWhen
+from ident_service.motion.control_loop import REST_CYCLES
 from ident_service.motion.run import run
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 
 Array = np.ndarray
 

@@ -11,8 +11,8 @@ from motion_bench import LOOKED
 from run_bench import FOREVER, LIMITS, MIDWAY, PERIOD, Bench, Healthy
 
 from drivers.arm import Sample
-from ident_service.motion.checks import FROZEN_CYCLES, JUMP
-from ident_service.motion.states import State
+from ident_service.motion.safety_monitor import FROZEN_CYCLES, JUMP
+from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray

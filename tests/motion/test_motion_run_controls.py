@@ -13,13 +13,12 @@ from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench
 
 from drivers.arm import StopKind
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, Switches
-from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE
-from ident_service.motion.latch import Latch
-from ident_service.motion.loop import HOLD_SPEED, REST_CYCLES, REST_SPEED
-from ident_service.motion.pause import Paused
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, Switches
+from ident_service.motion.control_loop import HOLD_SPEED, REST_CYCLES, REST_SPEED
+from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, Latch
 from ident_service.motion.run import RunReport, run
-from ident_service.motion.states import State
+from ident_service.motion.sequencer import Paused
+from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray

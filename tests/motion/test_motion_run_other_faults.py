@@ -14,9 +14,9 @@ from run_bench import HOME, LIMITS, MIDWAY, PERIOD, Bench
 from drivers.arm import Sample, StopKind
 from drivers.axis_status import AxisEvent, AxisEventCode
 from ident_service.errors import DriverError, MotionRefused
-from ident_service.motion.control import ComputedTorque
-from ident_service.motion.guard import TORQUE_RATE, TORQUE_RATE_SHARE
-from ident_service.motion.states import State
+from ident_service.motion.controller import ComputedTorque
+from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
+from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray
@@ -246,9 +246,9 @@ def test_a_fault_that_the_table_does_not_know_takes_the_torque_away_all_the_same
     from types import SimpleNamespace
 
     from ident_service.errors import ArmFault
-    from ident_service.motion.latch import Latch
+    from ident_service.motion.faults import Latch
     from ident_service.motion.run import _Run
-    from ident_service.motion.states import State
+    from ident_service.motion.state_machine import State
 
     stopped: list[StopKind] = []
     latch = Latch()

@@ -11,9 +11,9 @@ from motion_bench import JOINTS, LOOKED, PRIOR, bench_model
 from run_bench import HOME, LIMITS, MOTION, PERIOD, Bench, with_series
 
 from ident_service.errors import DriverError, MotionRefused
-from ident_service.excitation.excitation import Excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.motion.run import run
-from ident_service.motion.states import State
+from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray
@@ -105,6 +105,6 @@ def test_no_run_begins_whose_stops_would_leave_the_limits(
 ) -> None:
     # The motion itself keeps to its limits wherever its demands are asked for; the stops are looked at on their own.
     bench = make()
-    monkeypatch.setattr("ident_service.motion.plans.require_within_limits", lambda *_: None)
+    monkeypatch.setattr("ident_service.motion.run_plan.require_within_limits", lambda *_: None)
     series = replace(MOTION.path.series.scaled(0.0), q0=LIMITS.upper + 0.1)
     _refused(bench, "a stop out of the motion would leave", with_series(series))

@@ -12,9 +12,8 @@ from motion_bench import bench_excitation, bench_limits
 from reachable import PathPeaks, close, keeps_to, path_peaks, random_limits, random_path, sampled
 
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.motion.reference import PathReference, Setpoint, rest
-from ident_service.motion.speed import Slowed, SpeedChange, slowed_limits
-from ident_service.motion.way import way
+from ident_service.motion.speed_scaling import Slowed, SpeedChange, slowed_limits
+from ident_service.motion.trajectory import PathReference, Setpoint, rest, way
 
 LIMITS = bench_limits()
 PATH = bench_excitation().path

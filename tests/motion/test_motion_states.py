@@ -7,8 +7,8 @@ from itertools import product
 import pytest
 
 from ident_service.errors import ArmError, UsageError
-from ident_service.motion.latch import Latch
-from ident_service.motion.states import LAWFUL, MOVING, STOPPABLE, State, States
+from ident_service.motion.faults import Latch
+from ident_service.motion.state_machine import LAWFUL, MOVING, STOPPABLE, State, States
 
 MOVES = ("approaching", "exciting", "returning")
 WAYS = {

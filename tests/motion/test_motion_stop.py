@@ -23,12 +23,11 @@ from reachable import (
     turning_state,
 )
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.path import PosturePath
-from ident_service.motion.profile import ToRest
-from ident_service.motion.reference import PathReference, Setpoint, rest
-from ident_service.motion.stop import require_stops_within_limits, stop, stop_extent, stop_overshoot
+from ident_service.excitation.trajectory import PosturePath
+from ident_service.motion.stop_trajectory import ToRest, require_stops_within_limits, stop, stop_extent, stop_overshoot
+from ident_service.motion.trajectory import PathReference, Setpoint, rest
 
 Array = np.ndarray
 LIMITS = bench_limits()

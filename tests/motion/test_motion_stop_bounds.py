@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from motion_bench import bench_excitation, bench_limits
 
-from ident_service.excitation.path import PosturePath
-from ident_service.motion.stop import require_stops_within_limits, stop_extent
+from ident_service.excitation.trajectory import PosturePath
+from ident_service.motion.stop_trajectory import require_stops_within_limits, stop_extent
 
 LIMITS = bench_limits()
 

@@ -11,16 +11,15 @@ import pytest
 from motion_bench import bench_excitation, bench_limits, bench_model
 from run_bench import Bench
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.controls import Switches
-from ident_service.motion.pause import Paused, Resumed
-from ident_service.motion.reference import PathReference, Reference, Setpoint, rest
+from ident_service.motion.clearance import Surroundings, require_clear, stops_touching
+from ident_service.motion.command_channel import Switches
 from ident_service.motion.run import run
-from ident_service.motion.surroundings import Surroundings, require_clear, stops_touching
-from ident_service.motion.way import at_once, way
+from ident_service.motion.sequencer import Paused, Resumed
+from ident_service.motion.trajectory import PathReference, Reference, Setpoint, at_once, rest, way
 
 Array = np.ndarray
 LIMITS = bench_limits()

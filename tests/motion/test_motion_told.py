@@ -7,8 +7,8 @@ import pytest
 from guard_bench import HOME, LIMITS, Bench, is_fault, unit
 
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
-from ident_service.motion.checks import VELOCITY_OFF
 from ident_service.motion.faults import FAULTS, Reaction
+from ident_service.motion.safety_monitor import VELOCITY_OFF
 
 WARNED = AxisEvent(AxisEventCode.DRIVE_WARNING, 0, "node 1: warns")
 BUS = AxisEvent(AxisEventCode.BUS_DEGRADED, None, "can0: error passive")

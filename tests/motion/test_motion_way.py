@@ -15,10 +15,9 @@ from reachable import (
     setpoints,
 )
 
-from ident_service.config.limits import MotionLimits
+from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
-from ident_service.motion.reference import Setpoint, rest
-from ident_service.motion.way import RuckigReference, way
+from ident_service.motion.trajectory import RuckigReference, Setpoint, rest, way
 
 Array = np.ndarray
 LIMITS = bench_limits()

@@ -52,7 +52,7 @@ class Group:
 
 GROUPS = {
     "guard": Group(
-        {"ident_service/motion/guard.py": 95, "ident_service/motion/checks.py": 55},
+        {"ident_service/motion/safety_monitor.py": 150},
         (
             "tests/motion/test_motion_guard_thresholds.py",
             "tests/motion/test_motion_guard_table.py",
@@ -63,7 +63,7 @@ GROUPS = {
         ),
     ),
     "stop": Group(
-        {"ident_service/motion/stop.py": 50, "ident_service/motion/profile.py": 15},
+        {"ident_service/motion/stop_trajectory.py": 65},
         ("tests/motion/test_motion_stop_bounds.py", "tests/motion/test_motion_stop.py"),
     ),
     "verifier": Group(

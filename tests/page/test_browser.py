@@ -16,11 +16,11 @@ from daemon.conftest import checked_before, patient_text, quick_text
 from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import in_use
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
+from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]

@@ -12,13 +12,13 @@ import pytest
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.daemon.live import BIN_NS, LiveRun
 from ident_service.errors import RecordingError
-from ident_service.estimation.growing import GrowingInformation
+from ident_service.estimation.online import GrowingInformation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.regressor import joint_regressor
 from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_follower import RecordingTail
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recording import Block
-from ident_service.recordings.tail import RecordingTail
-from ident_service.recordings.writer import RecordingWriter
 
 NAMES = ("shoulder", "elbow")
 STEP_NS = 2_000_000

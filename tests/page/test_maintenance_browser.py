@@ -15,13 +15,13 @@ from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, Page, expect
 
 from ident_service.daemon.maintenance.reidentification import reidentifications
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path
+from ident_service.motion.command_channel import in_use
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import dues
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
+from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]

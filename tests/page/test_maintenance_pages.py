@@ -15,13 +15,12 @@ from page.test_pages import commissioned as commissioned
 from page.test_pages import daemon as daemon
 
 from ident_service.daemon.maintenance.reidentification import reidentifications
-from ident_service.operations.arm_state import fault_file
-from ident_service.operations.comparison import compare_into
-from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.drift_verdict import verdict_of
+from ident_service.operations.drift_alarms import alarms, verdict_of
 from ident_service.operations.maintenance_schedule import dues, events, schedules
+from ident_service.operations.parameter_files import compare_into
 from ident_service.registry import jobs as rows
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
+from ident_service.registry.state_folder import fault_file
 
 
 def sent(daemon: Asked, address: str, **fields: str) -> tuple[int, str]:

@@ -9,8 +9,8 @@ from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, expect
 
 from ident_service.daemon.jobs.requests import Base
-from ident_service.operations.arm_state import fault_file
 from ident_service.registry.arms import add_arm
+from ident_service.registry.state_folder import fault_file
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
 

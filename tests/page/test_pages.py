@@ -19,12 +19,11 @@ from fastapi.routing import APIRoute
 from ident_service.daemon.maintenance.reidentification import enter_concluded
 from ident_service.daemon.web.render import STATIC, mark, static
 from ident_service.daemon.web.routes import PAGES
-from ident_service.operations.arm_state import arm_folder, fault_file
-from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.drift_verdict import Verdict
-from ident_service.operations.import_run import import_run
+from ident_service.operations.drift_alarms import Verdict, alarms
 from ident_service.operations.maintenance_schedule import When, add_event, add_schedule, dues, events, schedules
+from ident_service.operations.run_archive import import_run
 from ident_service.registry import jobs as rows
+from ident_service.registry.state_folder import arm_folder, fault_file
 from ident_service.registry.tokens import add_token
 
 ARM = "quick"

@@ -10,7 +10,7 @@ from helpers.random_arms import model_around, random_chain, random_delta
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.payload import KnownArm
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.base import BaseParameters, base_parameters
+from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import Information, information_of, supports
 from ident_service.model.regressor import joint_regressor
 

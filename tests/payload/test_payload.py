@@ -10,8 +10,7 @@ import scipy  # its statistics load for a second where they are used
 from payload.known_arms import ARM, BASE, DELTA, LAST, NOISE, blocks_of, body, known, with_body
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.feasible.blocks import symmetric
-from ident_service.estimation.feasible.feasible_set import feasible_set
+from ident_service.estimation.feasible.feasible_set import feasible_set, symmetric
 from ident_service.estimation.payload import (
     FAR,
     KnownArm,
@@ -20,7 +19,7 @@ from ident_service.estimation.payload import (
     identify_payload,
     loaded_covariance,
 )
-from ident_service.results.payload_document import payload_text
+from ident_service.results.payload_file import payload_text
 
 TOOL = body(1.3, (0.05, -0.02, 0.12))
 NAMES = ARM.layout.names[LAST]

@@ -13,7 +13,7 @@ from ident_service.estimation.fit import gather
 from ident_service.estimation.identify import identify
 from ident_service.estimation.payload import KnownArm, center_of_mass, identify_payload
 from ident_service.model.arm_model import arm_model
-from ident_service.model.layout import INERTIAL
+from ident_service.model.parameter_layout import INERTIAL
 
 SEEDS = {"planar2": 20, "sixaxis": 10}
 LOADS = {"planar2": body(0.2, (0.03, 0.01, 0.0), 0.02), "sixaxis": body(1.0, (0.02, -0.01, 0.06))}

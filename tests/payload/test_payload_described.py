@@ -11,8 +11,8 @@ import pytest
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
-from ident_service.model.base import base_parameters
-from ident_service.operations.score import true_parameters
+from ident_service.model.base_parameters import base_parameters
+from ident_service.operations.commissioning import true_parameters
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 MOTION = "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}"

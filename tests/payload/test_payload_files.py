@@ -18,8 +18,8 @@ from helpers.once import made_once
 from ident_service.certificate_verifier import verify
 from ident_service.operations.verify import verify_file
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_file import McapRecording
-from ident_service.recordings.writer import RecordingWriter
+from ident_service.recordings.mcap_reader import McapRecording
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.results.run_folder import read_results
 
 pytestmark = pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident_service.results.payload_document import rounded
+from ident_service.results.payload_file import rounded
 
 
 def test_rounding_beside_its_own_quantity_is_zero() -> None:

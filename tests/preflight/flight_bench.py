@@ -12,13 +12,12 @@ import pytest
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.clock import VirtualClock
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
-from ident_service.excitation.excitation import Excitation
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.motion.preflight_check import Check, Verdict
-from ident_service.motion.ticket import Ticket
+from ident_service.motion.ticket import Check, Ticket, Verdict
 from ident_service.preflight.preflight import preflight
 from sim_backend.arm import SimulatedArm, from_config
 from sim_backend.faults import Fault

@@ -9,7 +9,7 @@ import pytest
 from flight_bench import Flight, check_of, flight_config
 
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_check import Verdict, judged
+from ident_service.motion.ticket import Verdict, judged
 from ident_service.preflight.delay import FREQUENCY, MOST, Delay, delay_measures, delay_of
 from ident_service.preflight.passive_checks import loop_rate_check
 from ident_service.preflight.session import Trace

@@ -12,14 +12,14 @@ import pytest
 from canopen_run.canopen_run_bench import canopen, described, write
 
 from drivers.canopen.driver import CanopenArm
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion import last_position
 from ident_service.motion.last_position import FILE, LastPosition, PositionFile, turned
-from ident_service.motion.preflight_check import Check, Verdict
-from ident_service.operations.zeroing import take_home
+from ident_service.motion.ticket import Check, Verdict
+from ident_service.operations.recovery import take_home
 from ident_service.preflight.preflight import preflight
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
@@ -151,7 +151,7 @@ def test_an_arm_that_moves_or_does_not_answer_leaves_no_position(
 
 
 def test_a_simulated_arm_is_new_every_time_and_keeps_none(tmp_path: Path) -> None:
-    from ident_service.motion.factory import make_arm
+    from ident_service.motion.arm_factory import make_arm
 
     config = load_arm("planar2")
     kept = PositionFile(tmp_path, config)

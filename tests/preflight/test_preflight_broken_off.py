@@ -11,10 +11,9 @@ from flight_bench import Flight, Flown, check_of, verdicts
 
 from drivers.arm import Arm
 from ident_service.errors import DriverError
-from ident_service.excitation.excitation import Excitation
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.stoppable import StoppableArm
-from ident_service.motion.ticket import Ticket
+from ident_service.excitation.motion_file import Excitation
+from ident_service.motion.command_channel import StoppableArm
+from ident_service.motion.ticket import Ticket, Verdict
 from ident_service.preflight.preflight import preflight
 
 

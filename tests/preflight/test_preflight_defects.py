@@ -13,14 +13,14 @@ from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_chan
 from drivers.arm import Sample, Watchdog
 from drivers.axis_status import AxisStatus
 from drivers.clock import VirtualClock
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ArmFault, DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.faults import FAULTS
-from ident_service.motion.preflight_check import CODES, Verdict
+from ident_service.motion.ticket import CODES, Verdict
 from ident_service.preflight.preflight import preflight
-from ident_service.preflight.remedy import REMEDIES, remedy_of
+from ident_service.preflight.session import REMEDIES, remedy_of
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 

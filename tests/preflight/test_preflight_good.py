@@ -14,13 +14,12 @@ from helpers.forks import fork_plants
 from drivers.arm import Sample
 from ident_service.cli import main
 from ident_service.config.load import load_arm
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.model.rigid_body import InverseDynamics
-from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight_check import CODES, Verdict
-from ident_service.motion.reference import Setpoint
-from ident_service.motion.ticket import Ticket
+from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.ticket import CODES, Ticket, Verdict
+from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.direction import LEAST_ANSWER
 from ident_service.preflight.preflight import preflight
 from ident_service.preflight.session import trace_of

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from flight_bench import SHOULDER, Flight, FlightArm, check_of, flight_config, joint_changes, only_failure
 
-from ident_service.config.limits import motion_limits
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.ticket import Ticket
+from ident_service.config.motion_limits import motion_limits
+from ident_service.motion.ticket import Ticket, Verdict
 from sim_backend.arm import from_config
 
 UPPER, AWAY = SHOULDER["position"][1], SHOULDER["following_error"]

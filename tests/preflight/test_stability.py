@@ -11,12 +11,12 @@ from flight_bench import PRIOR, flight_config
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ident_service.config.limits import motion_limits
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import UsageError
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
-from ident_service.model.rigid_body import InverseDynamics
+from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.preflight.stability import Loop, spectral_radius, stability
 
 Array = np.ndarray

@@ -15,11 +15,24 @@ from flight_bench import flight_config, joint_changes
 
 from drivers.arm import ArmDescription
 from ident_service.errors import UsageError
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.preflight_check import CODES, Check, Verdict, failed, judged, measure, skipped
-from ident_service.motion.ticket import Subject, Ticket, new_ticket, read_ticket, subject_of, ticket_from_json
-from ident_service.operations.preflight import ticket_document, ticket_text, write_ticket
+from ident_service.motion.ticket import (
+    CODES,
+    Check,
+    Subject,
+    Ticket,
+    Verdict,
+    failed,
+    judged,
+    measure,
+    new_ticket,
+    read_ticket,
+    skipped,
+    subject_of,
+    ticket_from_json,
+)
+from ident_service.operations.arm_checks import ticket_document, ticket_text, write_ticket
 
 NOW_NS = 1_700_000_000 * 10**9
 MODEL = arm_model(flight_config())

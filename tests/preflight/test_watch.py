@@ -12,8 +12,8 @@ from flight_bench import FOREVER, flight_config
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.clock import VirtualClock
 from ident_service.errors import DriverError, UsageError
-from ident_service.motion.watch import watch
-from ident_service.operations.preflight import watch_document, watch_text
+from ident_service.motion.read_only_monitor import watch
+from ident_service.operations.arm_checks import watch_document, watch_text
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pucks_bench import Host, pucks_config
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,8 @@ import yaml
 
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link, open_links
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 from sim_backend.machine import Truth
 

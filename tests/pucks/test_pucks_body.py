@@ -15,9 +15,8 @@ from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend.build import build_machine
-from sim_backend.emulator.body import Body
+from sim_backend.emulator.body import Body, Gears
 from sim_backend.emulator.build import build_emulator
-from sim_backend.emulator.gears import Gears
 from sim_backend.emulator.motor import Power
 
 WAM = Transmission(

@@ -144,7 +144,7 @@ def test_frames_are_of_the_kind_they_were_sent_as() -> None:
     """A bus that nobody listens on must not hinder the sender; python-can's virtual bus keeps kinds apart."""
     from drivers.can.can_frame import Frame
     from ident_service.config.canopen import CanBus
-    from sim_backend.emulator.station import Station
+    from sim_backend.emulator.process import Station
 
     with can.Bus(interface="virtual", channel="pucks-kinds") as other:
         station = Station([CanBus(interface="virtual", channel="pucks-kinds")])

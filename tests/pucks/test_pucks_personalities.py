@@ -9,10 +9,10 @@ import pytest
 from pucks_bench import Host, pucks_config
 
 from drivers.can.can_frame import Frame
+from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.eds import data_sheet
 from ident_service.config.load import with_sheets
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.canopen_device.objects import Objects

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pucks_bench import MS, Host, pucks_config
 
-from sim_backend.canopen_device.power import TRANSITIONS, Command, PowerState, command_of
+from sim_backend.canopen_device.drive import TRANSITIONS, Command, PowerState, command_of
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.motor import Power
 

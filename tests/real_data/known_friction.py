@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ident_service.config.schema import FrictionShape
+from ident_service.config.arm import FrictionShape
 from ident_service.estimation.friction_fit import with_friction
 from ident_service.model.arm_model import ArmModel
 

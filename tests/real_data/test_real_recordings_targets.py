@@ -10,10 +10,10 @@ from real_data.conftest import Identified
 
 from benchmarks.real_data import CASES, Case, case_estimate, judged, violations
 from ident_service.config.load import load_arm
-from ident_service.estimation.feasible.feasibility import constrained_least_squares
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate
 from ident_service.model.arm_model import arm_model
-from ident_service.results.link_values import implausible_links
+from ident_service.results.summary import implausible_links
 
 pytestmark = pytest.mark.slow
 

@@ -16,10 +16,10 @@ from real_data.conftest import Identified
 
 from benchmarks.real_data import CASES, DATA
 from ident_service.cli import main
+from ident_service.config.arm import ArmConfig, Identification
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import ArmConfig, Identification
 from ident_service.errors import ConfigError, ModelError
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model

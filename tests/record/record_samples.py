@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recording import Block, Recording
-from ident_service.recordings.writer import RecordingWriter
 
 OFFSET_NS = 1_700_000_000_123_456_789
 START_NS = 55_000_000_000

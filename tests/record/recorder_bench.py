@@ -14,11 +14,11 @@ import numpy as np
 from record_samples import read_all
 from ring_actors import JOINTS, command, record, store
 
-from ident_service.recordings import ring_memory
+from ident_service.recordings import ring_buffer as ring_memory
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_file import McapRecording
-from ident_service.recordings.recorder_process import RecorderProcess
-from ident_service.recordings.ring import RingReader
+from ident_service.recordings.mcap_reader import McapRecording
+from ident_service.recordings.recorder import RecorderProcess
+from ident_service.recordings.ring_buffer import RingReader
 from ident_service.recordings.ring_sink import RingSink
 
 URDF = "<robot/>"

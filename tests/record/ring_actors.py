@@ -19,10 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.recorder_process import RecorderProcess
-from ident_service.recordings.ring import RingReader, RingWriter
+from ident_service.recordings.recorder import RecorderProcess
+from ident_service.recordings.ring_buffer import EventRecord, Record, RingReader, RingWriter
 from ident_service.recordings.ring_sink import RingSink, SinkEnds
-from ident_service.recordings.ring_slot import EventRecord, Record
 
 JOINTS = ("shoulder", "elbow", "wrist_roll")
 STEP_NS = 1_000_000

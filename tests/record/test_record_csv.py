@@ -14,8 +14,8 @@ from record_samples import read_all
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError, UsageError
-from ident_service.recordings import csv_file
-from ident_service.recordings.csv_file import CsvRecording
+from ident_service.recordings import csv_reader as csv_file
+from ident_service.recordings.csv_reader import CsvRecording
 from ident_service.recordings.open import open_recording
 
 HEADER = "t,q1,q2,tau1,tau2\n"

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from ident_service.errors import RecordingError, UsageError
+from ident_service.recordings.cached_recording import KeptRecording
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.cycles import read_cycles
-from ident_service.recordings.kept import KeptRecording
+from ident_service.recordings.mcap_reader import read_cycles
+from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Block
-from ident_service.recordings.writer import RecordingWriter
 
 JOINTS = ("a", "b", "c", "d", "e")
 
@@ -65,7 +65,7 @@ def test_what_has_no_cycles_gives_none(tmp_path: Path) -> None:
 
 
 def test_a_foreign_message_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ident_service.recordings.cdr import CycleEncoder
+    from ident_service.recordings.mcap_writer import CycleEncoder
 
     encode = CycleEncoder.encode
     monkeypatch.setattr(CycleEncoder, "encode", lambda *words: encode(*words)[:-4])

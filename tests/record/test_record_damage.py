@@ -25,10 +25,8 @@ from record_samples import (
 )
 
 from ident_service.errors import RecordingError
-from ident_service.recordings.cdr import JointStateEncoder
-from ident_service.recordings.joint_state import JointStateDecoder, PayloadError
-from ident_service.recordings.mcap_file import McapRecording
-from ident_service.recordings.messages import JOINT_STATE
+from ident_service.recordings.mcap_reader import JointStateDecoder, McapRecording, PayloadError
+from ident_service.recordings.mcap_writer import JOINT_STATE, JointStateEncoder
 
 ROOT = Path(__file__).parents[2]
 
@@ -36,7 +34,7 @@ ROOT = Path(__file__).parents[2]
 KILLED = """
 import os, signal, sys
 sys.path[:0] = [{here!r}]
-from ident_service.recordings.writer import RecordingWriter
+from ident_service.recordings.mcap_writer import RecordingWriter
 from record_samples import JOINTS, URDF, OFFSET_NS, write_samples
 writer = RecordingWriter({path!r}, JOINTS, URDF, OFFSET_NS)
 writer.__enter__()

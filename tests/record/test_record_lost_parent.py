@@ -14,7 +14,7 @@ import pytest
 from ident_service.errors import UsageError
 from ident_service.recordings.files import require_writable
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.ring import create_ring
+from ident_service.recordings.ring_buffer import create_ring
 
 REQUEST = {
     "joint_names": ["a"],
@@ -35,7 +35,7 @@ def test_a_parent_killed_during_the_start_ends_the_recorder_in_silence(share: fl
     ours.sendall(request[: round(share * len(request))])
     ours.close()  # before it can answer
     done = subprocess.run(
-        [sys.executable, "-m", "ident_service.recordings.recorder_loop", *map(str, numbers)],
+        [sys.executable, "-m", "ident_service.recordings.recorder_main", *map(str, numbers)],
         pass_fds=numbers,
         capture_output=True,
         timeout=60,

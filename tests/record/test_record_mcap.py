@@ -24,12 +24,10 @@ from record_samples import (
 )
 
 from ident_service.errors import RecordingError, UsageError
-from ident_service.recordings.cdr import JointStateEncoder
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_file import McapRecording
-from ident_service.recordings.messages import DEFINITIONS, JOINT_STATE
+from ident_service.recordings.mcap_reader import McapRecording
+from ident_service.recordings.mcap_writer import DEFINITIONS, JOINT_STATE, JointStateEncoder, RecordingWriter
 from ident_service.recordings.open import open_recording
-from ident_service.recordings.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 

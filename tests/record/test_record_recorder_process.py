@@ -19,10 +19,10 @@ from ring_actors import STEP_NS, holders, inode, record, store
 
 from ident_service.errors import RecordingError, UsageError
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_file import McapRecording
-from ident_service.recordings.recorder_process import RecorderProcess
+from ident_service.recordings.mcap_reader import McapRecording
+from ident_service.recordings.mcap_writer import RecordingWriter
+from ident_service.recordings.recorder import RecorderProcess
 from ident_service.recordings.ring_sink import RingSink
-from ident_service.recordings.writer import RecordingWriter
 
 
 @pytest.fixture(autouse=True)

@@ -18,11 +18,9 @@ from hypothesis import strategies as st
 from ring_actors import record, same, store
 
 from ident_service.errors import UsageError
-from ident_service.recordings import ring_memory
+from ident_service.recordings import ring_buffer as ring_memory
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.ring import RingReader, RingWriter, create_ring
-from ident_service.recordings.ring_memory import Closed
-from ident_service.recordings.ring_slot import EventRecord, slot_bytes
+from ident_service.recordings.ring_buffer import Closed, EventRecord, RingReader, RingWriter, create_ring, slot_bytes
 
 Store = tuple[int, bytes]
 

@@ -12,8 +12,8 @@ import time
 import pytest
 from ring_actors import command, holders, inode
 
-from ident_service.recordings import ring_memory
-from ident_service.recordings.ring import RingReader, create_ring
+from ident_service.recordings import ring_buffer as ring_memory
+from ident_service.recordings.ring_buffer import RingReader, create_ring
 
 
 def campaign(rounds: int, seed: int) -> None:

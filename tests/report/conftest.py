@@ -11,7 +11,7 @@ from estimation.synthetic import SampledRecording, exact_torque, serial_chain, s
 from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.schema import ArmConfig, Identification
+from ident_service.config.arm import ArmConfig, Identification
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel

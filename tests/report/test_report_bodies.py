@@ -11,9 +11,8 @@ from report.conftest import Made
 from results.svg import Svg
 
 from ident_service.model.kinematics import frame_origins, link_poses
-from ident_service.results.evidence.bodies import bounds_of, ellipsoid, posed
-from ident_service.results.report.body_figures import body_figures, ellipse
-from ident_service.results.report.figure import Figure
+from ident_service.results.evidence.gathering import bounds_of, ellipsoid, posed
+from ident_service.results.report.figures import Figure, body_figures, ellipse
 
 
 def inertial_of(mass: float, center: np.ndarray, about_center: np.ndarray) -> np.ndarray:
@@ -152,10 +151,10 @@ def test_friction_points_are_the_friction_that_was_put_in(good: Made) -> None:
 
 
 def test_a_model_without_friction_has_none(good: Made) -> None:
-    from ident_service.results.evidence.friction import FrictionSeen
+    from ident_service.results.evidence.gathering import FrictionSeen
 
     model = replace(good.estimate.model, layout=replace(good.estimate.model.layout, terms=("drive_inertia",)))
-    from ident_service.model.base import base_parameters
+    from ident_service.model.base_parameters import base_parameters
 
     estimate = replace(good.estimate, model=model, base=base_parameters(model.chain, model.layout))
     assert FrictionSeen(estimate).found() == ()

@@ -13,8 +13,15 @@ from report.conftest import Made
 
 from ident_service.errors import ParameterError, UsageError
 from ident_service.results.evidence.evidence import Evidence
-from ident_service.results.evidence.file import evidence_document, read_evidence, write_evidence
-from ident_service.results.evidence.packing import packed, packed_mask, unpacked, unpacked_mask
+from ident_service.results.evidence.file import (
+    evidence_document,
+    packed,
+    packed_mask,
+    read_evidence,
+    unpacked,
+    unpacked_mask,
+    write_evidence,
+)
 from ident_service.results.report_files import read_evidence_of
 from ident_service.results.run_folder import read_results, write_manifest
 

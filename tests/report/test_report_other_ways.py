@@ -13,11 +13,10 @@ from helpers.random_arms import model_around, random_chain, random_delta
 from report.conftest import Made, made, recording
 from report.pages import sections
 
-from ident_service.config.schema import Identification
+from ident_service.config.arm import Identification
 from ident_service.estimation.identify import identify
 from ident_service.model.regressor import joint_regressor
-from ident_service.results.evidence.making import gather_evidence
-from ident_service.results.evidence.timing import timing
+from ident_service.results.evidence.gathering import gather_evidence, timing
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_results
 

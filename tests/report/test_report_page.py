@@ -17,8 +17,7 @@ from results.svg import Svg
 
 from ident_service.config.recording import RecordingFormat
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.results.drawing import Axes, Canvas
-from ident_service.results.drawing_chart import draw_frame, range_around
+from ident_service.results.plots import Axes, Canvas, draw_frame, range_around
 from ident_service.results.report.figures import figures
 from ident_service.results.report.page import report_html
 

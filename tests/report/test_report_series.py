@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ident_service.results.evidence.series import Envelope, Scatter, Welch, spread
+from ident_service.results.evidence.gathering import Envelope, Scatter, Welch, spread
 
 RATE = 500.0
 

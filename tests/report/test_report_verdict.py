@@ -10,8 +10,7 @@ from report.conftest import Made
 
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.report.reservations import reservations, unidentified
-from ident_service.results.report.verdict import verdict
+from ident_service.results.report.verdict import reservations, unidentified, verdict
 
 CERTIFIED = "has a certificate of that: `ident verify --arm` checks it in exact arithmetic"
 

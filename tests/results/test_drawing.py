@@ -11,16 +11,17 @@ from hypothesis import strategies as st
 from results.svg import Svg
 
 from ident_service.errors import UsageError
-from ident_service.results.drawing import (
+from ident_service.results.plots import (
+    STEPS,
     Axes,
     Canvas,
     number,
     plain,
     require_drawable,
     round_values,
+    style,
     visible,
 )
-from ident_service.results.drawing_style import STEPS, style
 
 
 @given(

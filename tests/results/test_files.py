@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.errors import UsageError
-from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.manifest import appearing_folder, write_atomically
 
 
 def everything_in(folder: Path) -> list[str]:

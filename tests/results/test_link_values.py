@@ -10,10 +10,8 @@ import pytest
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.plausibility import reasons_against
 from ident_service.model.likely_bodies import likely_bodies
-from ident_service.results.link_values import implausible_links
-from ident_service.results.parameter_file import parameters_document
-from ident_service.results.schemas import require_schema
-from ident_service.results.summary import summary
+from ident_service.results.parameter_file import parameters_document, require_schema
+from ident_service.results.summary import implausible_links, summary
 
 LAST = 1
 

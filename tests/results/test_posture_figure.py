@@ -12,9 +12,7 @@ from hypothesis import strategies as st
 from results.svg import Svg
 
 from ident_service.errors import UsageError
-from ident_service.results.posture_figure import stick_figure
-from ident_service.results.postures import Box, Closest, Plane, Postures, Rod
-from ident_service.results.surroundings import _hull
+from ident_service.results.posture_figure import Box, Closest, Plane, Postures, Rod, _hull, stick_figure
 
 
 def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> Box:

@@ -10,8 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from ident_service.errors import UsageError
-from ident_service.results.manifest import named_files, write_manifest
-from ident_service.results.replacing import replacing_folder, require_replaceable
+from ident_service.results.manifest import named_files, replacing_folder, require_replaceable, write_manifest
 
 
 def result(folder: Path, **files: str) -> Path:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from ident_service.cli import main
-from ident_service.config.schema import Identification
+from ident_service.config.arm import Identification
 from ident_service.results.report.markup import prose
-from ident_service.results.rows_and_filter import rows_and_filter, wrapped
+from ident_service.results.summary import rows_and_filter, wrapped
 
 PLAIN: dict[str, Any] = {
     "method": "ols",

@@ -14,8 +14,8 @@ from helpers.random_arms import bodies_of, reference_model
 
 from ident_service.errors import ConfigError, ModelError, ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
-from ident_service.results.export import urdf_file
-from ident_service.results.export.urdf_file import write_urdf
+from ident_service.results.export import urdf as urdf_file
+from ident_service.results.export.urdf import write_urdf
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.run_folder import read_results, write_manifest, write_results
 from ident_service.results.summary import parameter_table, summary

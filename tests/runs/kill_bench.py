@@ -22,9 +22,9 @@ import pytest
 from ident_service.cli import main
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import DriverError, RecordingError
-from ident_service.operations.arm_state import fault_file
-from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
+from ident_service.registry.state_folder import fault_file
 from sim_backend.plant_status import PlantStatus, read_status
 
 PATIENCE = 90.0  # s of the machine's time; nothing is judged by it but what never happens

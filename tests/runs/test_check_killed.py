@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ident_service.operations.arm_state import control_path
+from ident_service.registry.state_folder import control_path
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.errors import DriverError, UsageError
-from ident_service.motion.control_file import ControlFile
+from ident_service.motion.command_channel import ControlFile
 
 
 class Time:
@@ -96,7 +96,8 @@ def test_nobody_is_reached_when_nobody_moves_the_arm(tmp_path: Path) -> None:
 
 def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     code = (
-        "import sys, os, signal; from pathlib import Path; from ident_service.motion.control_file import ControlFile\n"
+        "import sys, os, signal; from pathlib import Path\n"
+        "from ident_service.motion.command_channel import ControlFile\n"
         "ControlFile.take(Path(sys.argv[1]), None).ask_stop(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     subprocess.run([sys.executable, "-c", code, str(loop_path(tmp_path))], check=False)
@@ -163,7 +164,7 @@ def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Pa
 RENEWER = """
 import sys
 from pathlib import Path
-from ident_service.motion.control_file import ControlFile
+from ident_service.motion.command_channel import ControlFile
 with ControlFile.reach(Path(sys.argv[1])) as controls:
     print("renewing", flush=True)
     while True:

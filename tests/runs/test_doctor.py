@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from drivers.arm import Watchdog
+from ident_service.config.arm import ArmConfig
 from ident_service.config.control import Realtime
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.motion.doctor import (
     Finding,
     State,

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.fault_file import CONTROLS, FaultFile
+from ident_service.motion.command_channel import ControlFile
+from ident_service.motion.fault_store import CONTROLS, FaultFile
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.fault_file import CONTROLS, FaultFile
+from ident_service.motion.command_channel import ControlFile
+from ident_service.motion.fault_store import CONTROLS, FaultFile
 folder = Path(sys.argv[1])
 ControlFile.take(folder / CONTROLS, None)
 FaultFile(folder).began(Path("runs/7"))

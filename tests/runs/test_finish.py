@@ -15,18 +15,18 @@ from helpers.tickets import write_checked_ticket
 from runs.conftest import written
 
 from ident_service.cli import main
-from ident_service.cli.moving import _report_text
+from ident_service.cli.motion_commands import _report_text
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
-from ident_service.estimation.doubt import shares
-from ident_service.estimation.growing import Doubt
+from ident_service.estimation.online import Doubt
 from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
-from ident_service.excitation.plan import excitation
+from ident_service.estimation.uncertainty import shares
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.base import base_parameters
-from ident_service.operations.reaching import Reaching, least_seconds, require_target
+from ident_service.model.base_parameters import base_parameters
+from ident_service.operations.motion_run import Reaching, least_seconds, require_target
 from ident_service.operations.target_process import missed as not_known
-from ident_service.recordings.mcap_file import McapRecording
+from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
 
 PERIOD = 10.0  # s, of the shipped planar arm's motion

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.config.control import Realtime
-from ident_service.motion.histogram import Histogram
+from ident_service.motion.cycle_timing import Histogram
 from ident_service.motion.realtime import LATENCY, STACK, asked, core_numbers
 
 CORES = sorted(os.sched_getaffinity(0))

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.lifeline import Lifeline
+from ident_service.motion.command_channel import ControlFile, Lifeline
 
 LEASE = 2_000_000_000
 

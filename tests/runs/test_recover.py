@@ -14,12 +14,12 @@ import pytest
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.cli import main
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import ArmConfig
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.factory import make_arm
-from ident_service.operations.arm_state import control_path, fault_file
-from ident_service.operations.recover import Recovery, recover
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.command_channel import ControlFile
+from ident_service.operations.recovery import Recovery, recover
+from ident_service.registry.state_folder import control_path, fault_file
 from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 

@@ -11,12 +11,12 @@ import yaml
 
 from drivers.arm import StopKind
 from drivers.axis_status import TRIPPED
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import UsageError
-from ident_service.motion.factory import make_arm
-from ident_service.operations.arm_state import fault_file
-from ident_service.operations.recover import let_go, recover
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.recovery import let_go, recover
+from ident_service.registry.state_folder import fault_file
 from sim_backend.emulator.faults import PuckFault
 from sim_backend.emulator.lock_step import LockStepArm, standing
 

@@ -21,10 +21,10 @@ from runs.conftest import written
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, ArmFault, MotionRefused
-from ident_service.motion.control_file import ControlFile, in_use
-from ident_service.motion.loop import LOWERS, WAITS
-from ident_service.operations.arm_state import control_path, fault_file, ticket_path
-from ident_service.operations.watching import Ending
+from ident_service.motion.command_channel import ControlFile, in_use
+from ident_service.motion.control_loop import LOWERS, WAITS
+from ident_service.operations.motion_run import Ending
+from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 
 Capture = pytest.CaptureFixture[str]
 
@@ -53,7 +53,7 @@ def when(monkeypatch: pytest.MonkeyPatch, then: dict[str, Callable[[], None]]) -
         said.append(line)
         then.get(line, lambda: None)()
 
-    monkeypatch.setattr("ident_service.cli.moving.tell", told)
+    monkeypatch.setattr("ident_service.cli.motion_commands.tell", told)
     return said
 
 
@@ -199,7 +199,7 @@ def test_a_state_that_cannot_be_written_is_found_before_anything_moves(
     words: list[str], arm: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "state" / "arms" / load_arm(arm).name
-    monkeypatch.setattr("ident_service.operations.run.arm_folder", lambda *_: folder / "ticket.json" / "below")
+    monkeypatch.setattr("ident_service.operations.motion_run.arm_folder", lambda *_: folder / "ticket.json" / "below")
     capsys.readouterr()
     assert main(words) == 2
     out, err = capsys.readouterr()

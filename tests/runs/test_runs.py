@@ -22,13 +22,13 @@ from kill_bench import TRIES
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.errors import MotionRefused
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.ticket import read_ticket
-from ident_service.operations.arm_state import fault_file, ticket_path
-from ident_service.operations.run import run_motion
-from ident_service.recordings.mcap_file import McapRecording
+from ident_service.operations.motion_run import run_motion
+from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
+from ident_service.registry.state_folder import fault_file, ticket_path
 
 Command = "subprocess.Popen[str]"
 

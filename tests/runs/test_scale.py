@@ -15,8 +15,8 @@ from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.cli import main
 from ident_service.config.load import load_arm
 from ident_service.errors import UsageError
-from ident_service.motion.factory import make_arm
-from ident_service.operations.scale import FILE, check_scale
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.arm_checks import FILE, check_scale
 
 CONFIG = load_arm("planar2")
 

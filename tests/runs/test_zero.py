@@ -13,18 +13,16 @@ import pytest
 import yaml
 
 from ident_service.cli import main
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import ConfigError, DriverError, MotionRefused, PositionUnknown, UsageError
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.control_file import ControlFile
-from ident_service.motion.factory import make_arm
-from ident_service.motion.preflight_check import Verdict
-from ident_service.motion.ticket import Ticket, subject_of
-from ident_service.operations.arm_state import control_path, fault_file, ticket_path
-from ident_service.operations.recover import recover
-from ident_service.operations.zeroing import home_posture, take_home
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.command_channel import ControlFile
+from ident_service.motion.ticket import Ticket, Verdict, subject_of
+from ident_service.operations.recovery import home_posture, recover, take_home
 from ident_service.preflight.preflight import preflight
+from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 from sim_backend.emulator.faults import PuckFault
 from sim_backend.emulator.lock_step import LockStepArm, standing
 

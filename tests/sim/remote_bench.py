@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from ident_service.config.schema import ArmConfig
 from ident_service.errors import DriverError
 from sim_backend.plant_status import PlantStatus, read_status
 
@@ -73,7 +73,7 @@ def ended(path: Path) -> PlantStatus:
 CLIENT = """
 import sys
 import numpy as np
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from sim_backend.arm import from_config
 arm = from_config(ArmConfig.model_validate_json(sys.stdin.read()))
 arm.open()

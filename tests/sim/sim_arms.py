@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.model.arm_model import arm_model
 from sim_backend.plant import Plant
 

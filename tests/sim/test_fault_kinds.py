@@ -11,8 +11,8 @@ from drivers.axis_status import AxisStatus
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import DriverError
 from sim_backend.arm import from_config
-from sim_backend.drives import RAMP
 from sim_backend.faults import Fault, FaultKind
+from sim_backend.machine import RAMP
 
 MS = 1e-3
 AT = 5

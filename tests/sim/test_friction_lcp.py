@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_backend import friction
-from sim_backend.friction import stick_slip_velocity
+from sim_backend import plant as friction
+from sim_backend.plant import stick_slip_velocity
 
 
 def assert_solves(A, b, bound, v, tolerance=1e-11):

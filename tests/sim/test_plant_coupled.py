@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from sim_arms import random_arm
 
 from ident_service.model.arm_model import arm_model
+from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import InverseDynamics
 from sim_backend.plant import Plant
 
 Array = np.ndarray

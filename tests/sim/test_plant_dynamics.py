@@ -7,8 +7,8 @@ from sim_arms import arm_config, pendulum, plant_of, random_arm, slider
 
 from ident_service.errors import DriverError, ModelError
 from ident_service.model.arm_model import arm_model
+from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.rigid_body import InverseDynamics
 from sim_backend.plant import Plant
 
 

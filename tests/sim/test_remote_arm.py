@@ -18,16 +18,15 @@ from remote_bench import listening, remote_config, wait_for
 from drivers.arm import StopKind
 from drivers.axis_status import AxisStatus
 from drivers.clock import RealClock, VirtualClock
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.errors import DriverError
-from ident_service.motion.factory import make_arm
+from ident_service.motion.arm_factory import make_arm
 from sim_backend import wire
 from sim_backend.arm import SimulatedArm, from_config
 from sim_backend.faults import Fault, FaultKind
-from sim_backend.plant_launch import address_of, connect
 from sim_backend.plant_status import PlantState
-from sim_backend.remote_arm import RemoteArm
+from sim_backend.remote_arm import RemoteArm, address_of, connect
 
 LIMIT = np.array([40.0, 15.0])
 
@@ -161,7 +160,7 @@ def test_mistakes_are_found_before_anything_starts():
 
 SECOND = """
 import sys
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from sim_backend.arm import from_config
 arm = from_config(ArmConfig.model_validate_json(sys.stdin.read()))

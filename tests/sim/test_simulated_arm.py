@@ -6,12 +6,12 @@ from sim_arms import arm_config, pendulum, slider
 
 from drivers.arm import StopKind
 from drivers.clock import VirtualClock
+from ident_service.config.arm import Joint
 from ident_service.config.load import load_arm
-from ident_service.config.schema import Joint
 from ident_service.errors import DriverError, ParameterError
 from sim_backend.arm import SimulatedArm, from_config
 from sim_backend.faults import Fault, FaultKind
-from sim_backend.imperfections import Imperfections
+from sim_backend.plant import Imperfections
 
 MS = 1_000_000
 

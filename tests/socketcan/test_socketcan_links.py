@@ -10,10 +10,9 @@ import pytest
 from can_links.link_bench import arm_on_bus, soon
 from socketcan_bench import ERROR, EXTENDED, REMOTE, Neighbour, command, content
 
-from drivers.can.bus_errors import BUS_OFF, CONTROLLER, PASSIVE_TX, RESTARTED, RX_OVERFLOW, BusError
-from drivers.can.can_frame import Frame
+from drivers.can.bus_state import BUS_OFF, CONTROLLER, PASSIVE_TX, RESTARTED, RX_OVERFLOW, BusError
+from drivers.can.can_frame import HEARD, Frame
 from drivers.can.can_link import Link, open_links
-from drivers.can.receive_filter import HEARD
 from ident_service.errors import DriverError
 
 Open = Callable[..., Link]

@@ -22,11 +22,11 @@ import pytest
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.estimation.identify import identify
-from ident_service.excitation.plan import excitation
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.factory import make_arm
-from ident_service.motion.states import State
-from ident_service.operations.commission import record_motion
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.state_machine import State
+from ident_service.operations.commissioning import record_motion
 from ident_service.recordings.open import open_recording
 
 pytestmark = pytest.mark.timeout(900)

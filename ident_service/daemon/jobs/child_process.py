@@ -1,7 +1,7 @@
 """Start a job's process, talk to it over its standard input, and find it again after a crash of the service.
 
 The output goes into files of the job's folder, not through the service, so that nothing of it is lost when the service
-dies. The end of its standard input tells a motion that whoever asked for it is gone (`cli/lease.py`).
+dies. The end of its standard input tells a motion that whoever asked for it is gone (`cli/operator_input.py`).
 
 A motion may be given to a unit of its own instead (`configs/systemd/`): then the process is the service manager's
 child, behind a local socket, and not ours; whatever becomes of our unit, it has the time to stop its arm.
@@ -111,7 +111,7 @@ class OwnChild:
 
 
 class UnitChild:
-    """Implement `Child` with a process of the service manager, at the other end of a local socket (`socket_activation.py`)."""
+    """Implement `Child` with a process of the service manager, at the other end of a local socket."""
 
     def __init__(self, words: tuple[str, ...], folder: Path, door: Path) -> None:
         """Have `ident WORDS` started by the unit that listens at `door`.

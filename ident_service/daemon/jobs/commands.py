@@ -40,7 +40,7 @@ from ident_service.daemon.jobs.requests import (
     Zero,
 )
 from ident_service.errors import UsageError
-from ident_service.motion.controls import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
 from ident_service.operations.acceptance import ARM, PARAMETERS, accepted_set
 from ident_service.registry.arms import KnownArm, known_arm, resources
 from ident_service.registry.database import Database

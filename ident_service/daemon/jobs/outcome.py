@@ -1,16 +1,29 @@
-"""Determine the outcome of a job from the files that its process left, also after a crash of the service."""
+"""Tell what became of a job from the files it left, and enter what it made in the registry.
+
+A restart begins no motion: a person asked for it at another moment. Queued computations stay queued.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.daemon.jobs.child_process import ANSWER, LOG
+from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, alive, end_orphan
+from ident_service.daemon.jobs.commands import FOLDERS, JOBS
+from ident_service.errors import IdentError
+from ident_service.motion.command_channel import in_use
 from ident_service.motion.ending import ENDED
-from ident_service.results.manifest import MANIFEST
+from ident_service.registry import jobs as rows
+from ident_service.registry.database import Database, Row, note
+from ident_service.registry.motions import MOTION_FILE, MOTIONS, index_motion
+from ident_service.registry.runs import EXPORTS, RUNS, index_run
+from ident_service.registry.state_folder import control_path
+from ident_service.results.manifest import MANIFEST, write_manifest
 
 _MOST = 32 * 2**20
 _LAST = 64 * 1024
@@ -19,7 +32,7 @@ STOPPED: Final = "stopped"
 _REFUSING: Final = (
     "failed",
     "needs_person",
-)  # verdicts of a preflight's check (`ident_service/motion/preflight_check.py`)
+)  # verdicts of a preflight's check (`ident_service/motion/ticket.py`)
 
 
 @dataclass(frozen=True)
@@ -123,7 +136,7 @@ def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
 
 
 def lateness_of(folder: Path) -> Any:
-    """Return the lateness histogram of a run's cycles (`motion/histogram.py`); None where it is not known."""
+    """Return the lateness histogram of a run's cycles (`motion/cycle_timing.py`); None where it is not known."""
     try:
         return json.loads((folder / ENDED).read_text(encoding="utf-8"))["lateness"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -154,3 +167,103 @@ def _objections(answer: dict[str, Any]) -> Iterator[str]:
 def _report(answer: dict[str, Any]) -> dict[str, Any]:
     report = answer.get("report")
     return report if isinstance(report, dict) else {}
+
+
+_MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", "simulate", "judge"})
+
+_ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
+
+
+def keep(db: Database, state: Path, row: Row, by: str) -> None:
+    """Enter the folder that a job's process has left, if any.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        row: of the job.
+        by: who asked for it.
+
+    Raises:
+        IdentError: the folder is not what its manifest names, or not one of a run.
+    """
+    made = row["run"]
+    if made is None:
+        return
+    if row["kind"] in _MAKES_A_RUN and (folder := state / RUNS / made).is_dir():
+        # A killed process leaves no manifest. Nothing writes there any more, so the present files are final.
+        if not (folder / MANIFEST).is_file():
+            write_manifest(folder)
+        index_run(db, state, made)
+    elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
+        index_motion(db, state, made, row["arm"], by)
+    elif row["kind"] == "correct":
+        with suppress(OSError):  # not empty, or removed already
+            (state / EXPORTS / made).rmdir()
+
+
+def folder_of(state: Path, row: Row) -> Path | None:
+    """Return the folder that a job makes, whether it exists or not; None for a job that makes none."""
+    if row["run"] is None or row["kind"] in _ABOUT_A_RUN:
+        return None
+    return state / FOLDERS.get(row["kind"], RUNS) / str(row["run"])
+
+
+UNTOLD = "the service died while it ran; its process is being looked for"
+_WAIT = 40.0  # s for a process of the previous service: a controlled stop and its recording take less
+
+
+def mark_interrupted(db: Database, state: Path) -> None:
+    """Mark running jobs and waiting motions as interrupted; quick, before any request is answered."""
+    with db.transaction():
+        for row in rows.jobs(db, states=rows.LIVE, most=1_000_000):
+            if row["state"] == "running":
+                detail = UNTOLD
+            elif row["motion"]:
+                detail = "the service ended before it began; nothing has moved, ask for it again"
+            else:
+                continue
+            rows.ended(db, row["id"], "interrupted", detail)
+            note(db, "service", "job interrupted", row["id"])
+
+
+def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool] = lambda: False) -> None:
+    """Wait until processes of the previous service have ended, and enter what their files show."""
+    for row in rows.jobs(db, states=("interrupted",), most=1_000_000):
+        if row["detail"] != UNTOLD or cut_short():
+            continue
+        process = _process(state, row)
+        # A motion has seen the end of its input and stops its arm; a computation is of no use to anybody.
+        if not end_orphan(process, _WAIT):
+            rows.explain(db, row["id"], f"the service died while it ran; its process lives on ({process.split()[0]})")
+            continue
+        if row["motion"]:
+            _wait_for_rest(control_path(state, row["arm"]))
+        folder = folder_of(state, row)
+        detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
+        try:
+            keep(db, state, row, row["created_by"])
+        except (IdentError, OSError) as error:
+            detail = f"{detail}; its folder could not be entered: {error}"
+        rows.explain(db, row["id"], detail)
+
+
+def orphans(db: Database, state: Path) -> list[str]:
+    """Return the ids of interrupted jobs whose process is still alive."""
+    found = rows.jobs(db, states=("interrupted",), most=1000)
+    return [row["id"] for row in found if alive(_process(state, row))]
+
+
+def _wait_for_rest(controls: Path) -> None:
+    """Wait for the motion process, which may outlive its parent for as long as its stop takes."""
+    until = time.monotonic() + _WAIT
+    while in_use(controls) and time.monotonic() < until:
+        time.sleep(0.05)
+
+
+def _process(state: Path, row: Row) -> str:
+    if row["process"]:
+        return str(row["process"])
+    try:
+        return (state / JOBS / str(row["id"]) / PROCESS).read_text(encoding="ascii").strip()
+    except (OSError, ValueError):
+        return ""

@@ -19,21 +19,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json
-from ident_service.config.schema import ArmConfig
 from ident_service.daemon.jobs.commands import JOBS, accepted_description
-from ident_service.daemon.jobs.outcome import said
+from ident_service.daemon.jobs.outcome import UNTOLD, said
 from ident_service.daemon.jobs.queue import Engine
-from ident_service.daemon.jobs.recovery import UNTOLD
 from ident_service.daemon.jobs.requests import Asked, Check, Identify, Judge, RecordingOf, Run
 from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
 from ident_service.operations.acceptance import ARM, accepted_set
-from ident_service.operations.drift_alarms import raise_alarm
-from ident_service.operations.drift_verdict import Verdict, verdict_of
+from ident_service.operations.drift_alarms import Verdict, raise_alarm, verdict_of
 from ident_service.operations.maintenance_schedule import close_dues
 from ident_service.registry.arms import known_arm
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 from ident_service.registry.jobs import LIVE, known_job
 from ident_service.registry.motions import new_id
 

@@ -19,14 +19,13 @@ from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.maintenance.reidentification import SERVICE, Reidentifications, Wanted
 from ident_service.daemon.maintenance.webhook import Webhook
 from ident_service.errors import IdentError
-from ident_service.motion.control_file import in_use
-from ident_service.operations.arm_state import control_path, fault_file
+from ident_service.motion.command_channel import in_use
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import LATE, dues, fall_due, schedules
 from ident_service.registry.arms import known_arm
-from ident_service.registry.audit import note
-from ident_service.registry.database import Row
+from ident_service.registry.database import Row, note
 from ident_service.registry.jobs import LIVE, jobs
+from ident_service.registry.state_folder import control_path, fault_file
 
 _TICK = 0.5  # s between passes
 LOG = logging.getLogger("ident.maintenance")

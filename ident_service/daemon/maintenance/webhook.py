@@ -31,8 +31,7 @@ from urllib.parse import urlsplit
 from standardwebhooks.webhooks import Webhook as Signer
 
 from ident_service.errors import UsageError
-from ident_service.registry.audit import note
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 
 WAITS: Final = (5.0, 300.0, 1800.0, 7200.0, 18_000.0, 36_000.0, 50_400.0, 72_000.0, 86_400.0)
 """After each attempt that failed [s]: the schedule that the convention recommends, about three days in all."""

@@ -13,13 +13,12 @@ from ident_service import __version__
 from ident_service.daemon.authentication import SESSION_SECONDS, Throttled
 from ident_service.daemon.dependencies import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
 from ident_service.daemon.errors import failures, failures_of_files
-from ident_service.daemon.paging import PAGES, BeforeNumber, Most, Page
-from ident_service.daemon.responses import AuditLine, HealthAnswer, WhoAnswer
+from ident_service.daemon.responses import PAGES, AuditLine, BeforeNumber, HealthAnswer, Most, Page, WhoAnswer
 from ident_service.errors import IdentError
-from ident_service.operations.arm_state import fault_file
 from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import dues
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
+from ident_service.registry.state_folder import fault_file
 
 router = APIRouter(tags=["service"], responses=failures())
 AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines

@@ -9,31 +9,34 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.config.source import MOST_BYTES
+from ident_service.config.yaml_source import MOST_BYTES
 from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import failures
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
-from ident_service.daemon.paging import PAGES, BeforeId, Most, Page
 from ident_service.daemon.responses import (
+    PAGES,
     AcceptanceAnswer,
     ArmAnswer,
     ArmLine,
     AskedAnswer,
+    BeforeId,
     ChallengeAnswer,
     FaultAnswer,
+    Most,
     MotionAnswer,
+    Page,
 )
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.control_file import mover
+from ident_service.motion.command_channel import mover
 from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
-from ident_service.operations.arm_state import control_path, fault_file
 from ident_service.operations.description_process import judge_apart
 from ident_service.registry import arms as known
 from ident_service.registry import motions
-from ident_service.registry.audit import note
+from ident_service.registry.database import note
 from ident_service.registry.runs import run_folder
+from ident_service.registry.state_folder import control_path, fault_file
 
 router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
 Text = Annotated[str, Field(max_length=known.MOST_BYTES)]

@@ -55,6 +55,6 @@ def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer
 @router.get("/arms/{arm}/home")
 def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
     """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
-    from ident_service.operations.zeroing import home_posture
+    from ident_service.operations.recovery import home_posture
 
     return [HomeJoint(**asdict(one)) for one in home_posture(known_arm(service.db, service.state, arm).config)]

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from ident_service.daemon.dependencies import Serving, Viewer
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.jobs.requests import FileName, Id
-from ident_service.registry import exports
+from ident_service.registry import runs
 
 router = APIRouter(prefix="/api/v1", tags=["exports"], responses=failures(404))
 _BINARY: dict[int | str, dict[str, Any]] = {
@@ -35,7 +35,7 @@ class ExportAnswer(BaseModel):
 @router.get("/exports/{export}")
 def get_export(service: Serving, _: Viewer, export: Id) -> ExportAnswer:
     """Show an export and its files, by the id that its job names as its run."""
-    row = exports.known_export(service.db, export)
+    row = runs.known_export(service.db, export)
     return ExportAnswer(
         id=row["run"],
         kind=row["kind"],
@@ -43,12 +43,12 @@ def get_export(service: Serving, _: Viewer, export: Id) -> ExportAnswer:
         job=row["id"],
         made=row["ended"],
         made_by=row["created_by"],
-        files=exports.export_files(service.db, service.state, export),
+        files=runs.export_files(service.db, service.state, export),
     )
 
 
 @router.get("/exports/{export}/files/{name}", response_class=FileResponse, responses=_BINARY)
 def get_exported_file(service: Serving, _: Viewer, export: Id, name: FileName) -> FileResponse:
     """Download a file of an export; as something to be kept, never as a page."""
-    path = exports.export_file(service.db, service.state, export, name)
+    path = runs.export_file(service.db, service.state, export, name)
     return FileResponse(path, media_type="application/octet-stream", filename=name)

@@ -21,11 +21,19 @@ from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Servi
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import said
-from ident_service.daemon.jobs.reach import held_arm
 from ident_service.daemon.jobs.requests import MOVES, ArmName, Asked, Id
-from ident_service.daemon.paging import PAGES, BeforeNumber, Most, Page
-from ident_service.daemon.responses import JobAnswer, JobResult, LeaseAnswer, StopAnswer
+from ident_service.daemon.responses import (
+    PAGES,
+    BeforeNumber,
+    JobAnswer,
+    JobResult,
+    LeaseAnswer,
+    Most,
+    Page,
+    StopAnswer,
+)
 from ident_service.errors import MotionRefused, UsageError
+from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Row
 from ident_service.registry.tokens import Access

@@ -1,9 +1,9 @@
-"""Serve the routes about schedules, maintenance, due re-identifications, re-identifications and drift alarms."""
+"""Route requests about re-identification: schedules, maintenance, what is due, alarms."""
 
 from __future__ import annotations
 
 import time
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, HTTPException, Path
 from fastapi.concurrency import run_in_threadpool
@@ -14,22 +14,109 @@ from ident_service.daemon.errors import failures
 from ident_service.daemon.jobs.requests import ArmName, Id
 from ident_service.daemon.maintenance.reidentification import Wanted, known_reidentification, reidentifications
 from ident_service.daemon.maintenance.webhook import deliveries
-from ident_service.daemon.paging import PAGES, BeforeId, BeforeNumber, Most, Page
-from ident_service.daemon.responses import LeaseAnswer
+from ident_service.daemon.responses import PAGES, BeforeId, BeforeNumber, LeaseAnswer, Most, Page
 from ident_service.daemon.routes.jobs import Confirmation, require_confirmed, without_paths
-from ident_service.daemon.routes.maintenance_answers import (
-    AlarmAnswer,
-    DeliveryAnswer,
-    DueAnswer,
-    EventAnswer,
-    ReidentificationAnswer,
-    ScheduleAnswer,
-)
-from ident_service.motion.controls import LEASE_SECONDS
+from ident_service.motion.command_channel import LEASE_SECONDS
 from ident_service.operations import drift_alarms as raised
 from ident_service.operations import maintenance_schedule as planned
 from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Row
+
+
+class ScheduleAnswer(BaseModel):
+    """Schedule of re-identifications.
+
+    One of `cron` (five fields, UTC) and `trigger` (`hours:NUMBER` or `maintenance`) is set. `next` is when it is due
+    by cron; `motion` null is the description's own.
+    """
+
+    id: int
+    arm: str
+    cron: str | None
+    trigger: str | None
+    motion: str | None
+    enabled: bool
+    last: float | None
+    next: float | None
+    created: float
+    created_by: str
+
+
+class DeliveryAnswer(BaseModel):
+    """Notice to the webhook.
+
+    `next` is when it is tried; without it and without `delivered` it was given up. `why` is the last error.
+    """
+
+    number: int
+    id: str
+    arm: str
+    created: float
+    tries: int
+    next: float | None
+    delivered: float | None
+    why: str
+
+
+class EventAnswer(BaseModel):
+    """Maintenance that was done."""
+
+    id: int
+    arm: str
+    what: str
+    note: str
+    at: float
+    who: str
+
+
+class DueAnswer(BaseModel):
+    """Re-identification that is due; it waits for a person unless it has begun by itself."""
+
+    id: int
+    arm: str
+    schedule: int
+    cause: str
+    at: float
+
+
+class ReidentificationAnswer(BaseModel):
+    """Re-identification and its outcome.
+
+    `against` is the number of the acceptance; `job` that of the step; `recorded` the run with the recording and `run`
+    the one with the parameters and the comparison. `detail` says what has changed, or why there is no verdict.
+    """
+
+    id: str
+    arm: str
+    step: Literal["check", "run", "identify", "judge"]
+    state: Literal[
+        "running", "unchanged", "changed", "impossible", "refused", "failed", "faulted", "cancelled", "interrupted"
+    ]
+    motion: str | None
+    against: int
+    unattended: bool
+    job: str | None
+    recorded: str | None
+    run: str | None
+    detail: str
+    begun: float
+    begun_by: str
+    ended: float | None
+
+
+class AlarmAnswer(BaseModel):
+    """Drift alarm: what has changed, in words; it stands while `closed` is null, `how` says how it ended."""
+
+    id: int
+    arm: str
+    reidentification: str
+    run: str
+    what: str
+    at: float
+    closed: float | None
+    closed_by: str | None
+    how: str
+
 
 router = APIRouter(prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409))
 Number = Annotated[int, Path(ge=1, lt=2**62)]

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ident_service.daemon.dependencies import Operator, Serving
 from ident_service.daemon.errors import failures
 from ident_service.daemon.routes.jobs import without_paths
-from ident_service.operations import retention
+from ident_service.operations import run_archive
 from ident_service.registry.runs import rebuild_runs
 
 router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures())
@@ -46,9 +46,9 @@ def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
     """Delete old recordings of runs that nobody accepted and no job needs."""
     untold = rebuild_runs(service.db, service.state)
     gone = (
-        retention.let_go(service.db, service.state, body.keep, who.name)
+        run_archive.let_go(service.db, service.state, body.keep, who.name)
         if body.yes
-        else retention.expendable(service.db, service.state, body.keep)
+        else run_archive.expendable(service.db, service.state, body.keep)
     )
     return PruningAnswer(
         deleted=body.yes,

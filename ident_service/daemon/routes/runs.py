@@ -10,8 +10,16 @@ from fastapi.responses import FileResponse
 from ident_service.daemon.dependencies import Serving, Viewer
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
-from ident_service.daemon.paging import PAGES, BeforeId, Most, Page
-from ident_service.daemon.responses import ParametersAnswer, RecordingAnswer, RunAnswer, RunLine
+from ident_service.daemon.responses import (
+    PAGES,
+    BeforeId,
+    Most,
+    Page,
+    ParametersAnswer,
+    RecordingAnswer,
+    RunAnswer,
+    RunLine,
+)
 from ident_service.errors import UnknownId
 from ident_service.registry import runs
 from ident_service.registry.runs import REPORTS

@@ -26,7 +26,7 @@ _MOST_FIELDS = 64
 
 
 async def form_of(request: Request) -> dict[str, str]:
-    """Return the fields of a form, the last of each name; its size is bounded by the middleware (`daemon/request_guard.py`).
+    """Return the fields of a form, the last of each name; its size is bounded by the middleware.
 
     Raises:
         HTTPException: 403 where it does not say which page it comes from, 400 where it is none.

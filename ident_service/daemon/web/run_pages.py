@@ -9,14 +9,14 @@ from fastapi.responses import HTMLResponse
 
 from ident_service.daemon.dependencies import Serving, Viewer
 from ident_service.daemon.jobs.requests import ArmName, Id
-from ident_service.daemon.paging import BeforeId
+from ident_service.daemon.responses import BeforeId
 from ident_service.daemon.routes import runs
 from ident_service.daemon.routes.about import AUDIT_SECONDS
 from ident_service.daemon.web.forms import PageRoute
 from ident_service.daemon.web.render import page
 from ident_service.errors import UsageError
 from ident_service.registry import runs as known
-from ident_service.registry.audit import trail
+from ident_service.registry.database import trail
 from ident_service.registry.runs import REPORTS
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
@@ -52,8 +52,8 @@ def show_run(service: Serving, who: Viewer, run: Id) -> Response:
 def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response:
     """Show the comparison of two runs' parameters, as `ident compare` writes it."""
     # Imported only when a comparison is asked for, so that the service starts without these modules.
-    from ident_service.operations.comparison import compare_files
-    from ident_service.results.comparison.page import comparison_html
+    from ident_service.operations.parameter_files import compare_files
+    from ident_service.results.comparison.presentation import comparison_html
 
     if reference == other:
         raise UsageError("choose two different runs to compare")

@@ -6,11 +6,11 @@ its path, so on rounding and on the processor. The answer here does not: it mini
     f(delta) = sum_blocks -logdet(D_b(delta) - t 1) + sum_links tr(S_b^-1 D_b(delta))
     over all delta with K delta = beta and E delta + e = 0
 
-with S_b what D_b is of a likely body where one is known, else the reference scales of `blocks.py`, and t half of the
-paper's margin (eq. 21), so that where data press against the set no more than the other half is given up. The first sum
-is the barrier whose minimiser is the analytic centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with the
-second, f is per link the entropic divergence from the likely body, or from one of 1 kg and 0.1 m (Lee, Wensing and Park
-2020), so that nothing is drawn to infinity where nothing bounds a mass. f is strictly convex and self-concordant;
+with S_b what D_b is of a likely body where one is known, else the reference scales of `feasible_set.py`, and t half of
+the paper's margin (eq. 21), so that where data press against the set no more than the other half is given up. The first
+sum is the barrier whose minimiser is the analytic centre (Boyd and Vandenberghe, *Convex Optimization*, 8.5.3); with
+the second, f is per link the entropic divergence from the likely body, or from one of 1 kg and 0.1 m (Lee, Wensing and
+Park 2020), so that nothing is drawn to infinity where nothing bounds a mass. f is strictly convex and self-concordant;
 Newton's method finds its minimiser to the last digits.
 
 Where data press against the set, the only bodies with exactly these base parameters are nearly points and rods. So an
@@ -27,10 +27,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ident_service.estimation.feasible.blocks import Block, symmetric
-from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.posing import EPSILON, Lift
-from ident_service.model.base import BaseParameters
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, symmetric
+from ident_service.estimation.feasible.formulation import EPSILON, Lift
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.likely_bodies import LikelyBodies
 

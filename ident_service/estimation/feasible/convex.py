@@ -2,7 +2,7 @@
 
 The problem is that of `nearest.py` and `priors.py`: the same blocks with the same inset, the same equalities, the same
 bound of each link's tr(P) = m + tr(L)/2, the same residual and prior. The formulation is another one: the variable is
-delta itself in reference scales (`blocks.py`), and cvxpy makes the cones.
+delta itself in reference scales (`feasible_set.py`), and cvxpy makes the cones.
 
 With a penalty p(delta), what is minimised is |R_1 beta - rho_1|^2 / sigma^2 + p (+ the prior's term): p is measured in
 residual variances, as -2 log of a prior density would be. cvxpy is loaded when a problem is posed, not before.
@@ -19,15 +19,23 @@ import numpy as np
 
 from ident_service.errors import SolverError, UsageError
 from ident_service.estimation.custom import CustomError, CustomFunction
-from ident_service.estimation.feasible.blocks import Block, reference
 from ident_service.estimation.feasible.conic import triangle_entries
-from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
-from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, reference
+from ident_service.estimation.feasible.formulation import (
+    MULTIPLIER,
+    OF_ESTIMATES,
+    ConditionsError,
+    check,
+    contradiction,
+    insets,
+    largest,
+    project,
+    traces,
+)
 from ident_service.estimation.feasible.nearest import FeasibleEstimate
-from ident_service.estimation.feasible.posing import MULTIPLIER, OF_ESTIMATES, check, insets, largest, project, traces
 from ident_service.estimation.feasible.priors import Prior, residual_deviation
 from ident_service.estimation.least_squares import LeastSquares, unit_columns
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 
 if TYPE_CHECKING:
     import cvxpy as cp
@@ -109,7 +117,7 @@ def convex_least_squares(
         prior: what the estimate is drawn to.
         custom: further knowledge.
         solver: any that `available_solvers` names.
-        bound: of each link's tr(P) [kg]; those of `posing.py` in turn when None, none with a prior.
+        bound: of each link's tr(P) [kg]; those of `formulation.py` in turn when None, none with a prior.
         inside: whether the parameters must have a positive margin; a solver of first order may miss the inset of 1e-6.
 
     Raises:

@@ -1,36 +1,296 @@
-"""Define the set of parameters that a real body could have, as a list of named blocks (3.1 to 3.3).
+"""Describe the set of parameters that a real body could have as named conditions: affine maps of delta into cones.
+
+Margins in SI units mix kg, kg m^2 and N m. Dividing each row by the reference of its unit makes them comparable; the
+references are those of a body of 1 kg and 0.1 m and of a small joint:
+
+    | row                                  | reference    |
+    |--------------------------------------|--------------|
+    | second moments, inertias, `Ia`       | 0.01 kg m^2  |
+    | first moments against a box or hull  | 0.1 kg m     |
+    | masses, the bounding ellipsoid       | 1 kg         |
+    | friction terms                       | 0.1 N m, 0.1 N m s/rad |
+
+The off-diagonal entries of a matrix need none: with D the matrix and S the diagonal of references, D - t S >= 0.
+
+Beyond the paper: a convex hull around the centre of mass; an ellipsoid (x - c)^T Q^-1 (x - c) <= 1 around all mass of
+a link, which a density inside it can only satisfy if
+
+    m - tr(Q^-1 (Sigma - l c^T - c l^T + m c c^T)) >= 0,    Sigma = tr(L)/2 1 - L
+
+(Wensing, Kim and Slotine 2018); and symmetry about a coordinate plane of the link frame, whose odd moments are zero.
 
 Each block is an affine map of delta into symmetric matrices or numbers that must be positive:
 
 - `inertia`, the paper's: D_k(delta_k) of eq. 17, equivalent to m > 0 and I > 0 about the centre of mass;
 - `pseudo_inertia`, stricter: the 4x4 matrix [[tr(L)/2 1 - L, l], [l^T, m]] > 0, equivalent to a mass distribution
   that has these moments (Wensing, Kim and Slotine 2018); it adds the triangle inequalities;
-- what the arm's configuration knows besides (eqs. 25, 26, 28 and more), from `constraints.py`.
+- what the arm's configuration knows besides (eqs. 25, 26, 28 and more), from `feasible_set.py`.
 
 Equalities (symmetry planes) stand beside the blocks: they have no inside, so they take no part in a margin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ident_service.config.schema import ArmConfig, FeasibleSetName, JointTerm
-from ident_service.estimation.feasible.blocks import (
-    REFERENCE_INERTIA,
-    REFERENCE_MASS,
-    Block,
-    SetName,
-    link_of,
-    matrix_block,
-    symmetric,
-)
-from ident_service.estimation.feasible.constraints import configured, signs, symmetries
+from ident_service.config.arm import ArmConfig, Body, Box, Ellipsoid, FeasibleSetName, JointTerm
+from ident_service.config.payload import knowledge_with_payload
+from ident_service.config.quantities import Vector3
+from ident_service.errors import ParameterError
+from ident_service.estimation.feasible.conic import triangle_entries
 from ident_service.model.chain import Array
-from ident_service.model.layout import INERTIAL
+from ident_service.model.parameter_layout import INERTIAL, TERM_SYMBOLS
+
+SetName = FeasibleSetName | Literal["none"]
+Row = dict[str, float]
+
+REFERENCE_MASS = 1.0  # kg
+REFERENCE_LENGTH = 0.1  # m
+REFERENCE_MOMENT = REFERENCE_MASS * REFERENCE_LENGTH  # kg m
+REFERENCE_INERTIA = REFERENCE_MASS * REFERENCE_LENGTH**2  # kg m^2
+REFERENCE_FRICTION = 0.1  # N m, N m s/rad and what else friction is measured in
+
+
+def reference(name: str) -> float:
+    """Return the reference scale of a link parameter, by its name."""
+    symbol = name.rstrip("0123456789")
+    if symbol == "m":
+        return REFERENCE_MASS
+    if symbol in ("lx", "ly", "lz"):
+        return REFERENCE_MOMENT
+    return REFERENCE_INERTIA if symbol.startswith("L") or symbol == "Ia" else REFERENCE_FRICTION
+
+
+def link_of(name: str) -> str:
+    """Return the number of the link that a parameter belongs to, which its name ends in."""
+    return name[len(name.rstrip("0123456789")) :]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Named condition on delta: an affine map into a symmetric matrix or into numbers that must be positive.
+
+    Attributes:
+        name: of the condition, for people.
+        size: rows of the symmetric matrix; 0 for a list of numbers.
+        F: affine map, shape (entries, parameters); entries of a matrix are its upper triangle, column by column.
+        f: constant part, shape (entries,).
+        scale: reference scale per row of the matrix or per number; ones when empty.
+    """
+
+    name: str
+    size: int
+    F: Array
+    f: Array
+    scale: tuple[float, ...] = ()
+
+    def smallest(self, delta: Array) -> float:
+        """Return the smallest eigenvalue, or smallest number, of the block at `delta`."""
+        return self._smallest(delta, np.ones(self.size or len(self.f)))
+
+    def smallest_scaled(self, delta: Array) -> float:
+        """Return the largest t with the block at `delta` minus t times its reference scale still positive."""
+        return self._smallest(delta, self.references())
+
+    def largest_scaled(self, delta: Array) -> float:
+        """Return the largest of the numbers' magnitudes at `delta`, each divided by its reference scale."""
+        return float(np.max(np.abs(self.F @ delta + self.f) / self.references()))
+
+    def _smallest(self, delta: Array, scale: Array) -> float:
+        entries = self.F @ delta + self.f
+        if self.size == 0:
+            return float((entries / scale).min())
+        root = np.sqrt(scale)
+        return float(np.linalg.eigvalsh(symmetric(entries, self.size) / np.outer(root, root))[0])
+
+    def times(self, T: Array) -> Array:
+        """Return F T, shape (entries, columns of T), from the nonzero columns of F."""
+        return np.asarray(self.F[:, self.felt] @ T[self.felt])
+
+    @cached_property
+    def felt(self) -> NDArray[np.intp]:
+        """The parameters that it is about, as columns of F."""
+        return np.flatnonzero(np.any(self.F != 0.0, axis=0))
+
+    def identity(self) -> Array:
+        """Return the entries of the identity matrix (or of ones), shape (entries,)."""
+        return self._diagonal(np.ones(self.size or len(self.f)))
+
+    def references(self) -> Array:
+        """Return the reference scale per row of the matrix or per number, shape (size,) or (entries,)."""
+        return np.array(self.scale) if self.scale else np.ones(self.size or len(self.f))
+
+    def reference_identity(self) -> Array:
+        """Return the entries of S, the diagonal of the reference scales, shape (entries,)."""
+        return self._diagonal(self.references())
+
+    def _diagonal(self, values: Array) -> Array:
+        if self.size == 0:
+            return values
+        return np.array([values[i] if i == j else 0.0 for i, j in triangle_entries(self.size)])
+
+
+def symmetric(entries: Array, size: int) -> Array:
+    """Fill a symmetric matrix with the entries of its upper triangle, shape (size, size, ...) from (entries, ...)."""
+    matrix = np.zeros((size, size, *entries.shape[1:]))
+    for value, (i, j) in zip(entries, triangle_entries(size), strict=True):
+        matrix[i, j] = matrix[j, i] = value
+    return matrix
+
+
+def matrix_block(name: str, rows: list[list[Row]], scale: tuple[float, ...], index: dict[str, int]) -> Block:
+    """Return the block of a symmetric matrix whose entries are sums of link parameters."""
+    size = len(rows)
+    F = np.zeros((size * (size + 1) // 2, len(index)))
+    for entry, (i, j) in enumerate(triangle_entries(size)):
+        for parameter, coefficient in rows[i][j].items():
+            F[entry, index[parameter]] += coefficient
+    return Block(name, size, F, np.zeros(len(F)), scale)
+
+
+def linear_block(name: str, rows: Sequence[tuple[Row, float]], scale: float, index: dict[str, int]) -> Block:
+    """Return the block of numbers that are sums of link parameters and a constant, all of one unit."""
+    F = np.zeros((len(rows), len(index)))
+    for entry, (row, _) in enumerate(rows):
+        for parameter, coefficient in row.items():
+            F[entry, index[parameter]] = coefficient
+    return Block(name, 0, F, np.array([constant for _, constant in rows]), (scale,) * len(rows))
+
+
+Index = dict[str, int]
+
+_ODD = {"xy": ("lz", "Lxz", "Lyz"), "yz": ("lx", "Lxy", "Lxz"), "xz": ("ly", "Lxy", "Lyz")}
+
+
+def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+    """Return every block of the configuration that must be positive.
+
+    Args:
+        config: of the arm.
+        links: numbers of the links, from 1, as in the parameters' names.
+        index: column of each link parameter.
+
+    Raises:
+        ParameterError: a hull whose points lie in one plane.
+    """
+    config = knowledge_with_payload(config)
+    blocks = _masses(config, links, index)
+    for link, body in _bodies(config, links):
+        if body.center_of_mass is not None:
+            blocks.append(_box(link, body.center_of_mass, index))
+        if body.hull is not None:
+            blocks.append(_hull(link, body.hull, index))
+        if body.ellipsoid is not None:
+            blocks.append(_ellipsoid(link, body.ellipsoid, index))
+    return blocks + signs(config.constraints.positive, links, index)
+
+
+def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+    """Return the odd moments that symmetry planes make zero, one block per plane; none stands twice."""
+    blocks = []
+    for link, body in _bodies(knowledge_with_payload(config), links):
+        gone: set[str] = set()
+        for plane in dict.fromkeys(body.symmetry):
+            names = [f"{symbol}{link}" for symbol in _ODD[plane] if symbol not in gone]
+            gone |= set(_ODD[plane])
+            F = np.zeros((len(names), len(index)))
+            F[np.arange(len(names)), [index[name] for name in names]] = 1.0
+            scale = tuple(reference(name) for name in names)
+            blocks.append(Block(f"link {link}: symmetric about its {plane} plane", 0, F, np.zeros(len(names)), scale))
+    return blocks
+
+
+def _bodies(config: ArmConfig, links: Sequence[int]) -> Iterator[tuple[int, Body]]:
+    for link, joint in zip(links, config.joints.values(), strict=False):
+        yield link, joint.body
+
+
+def _masses(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+    blocks = []
+    for link, body in _bodies(config, links):
+        if body.mass is not None:
+            lower, upper = body.mass
+            rows = [({f"m{link}": 1.0}, -lower), ({f"m{link}": -1.0}, upper)]
+            name = f"link {link}: mass within {lower:g}..{upper:g} kg"
+            blocks.append(linear_block(name, rows, REFERENCE_MASS, index))
+    total = config.constraints.total_mass
+    if total.lower > 0.0:
+        rows = [({f"m{k}": 1.0 for k in links}, -total.lower)]
+        blocks.append(linear_block(f"total mass at least {total.lower:g} kg", rows, REFERENCE_MASS, index))
+    if total.upper is not None:
+        rows = [({f"m{k}": -1.0 for k in links}, total.upper)]
+        blocks.append(linear_block(f"total mass at most {total.upper:g} kg", rows, REFERENCE_MASS, index))
+    return blocks
+
+
+def _box(link: int, box: Box, index: Index) -> Block:
+    rows: list[tuple[Row, float]] = []
+    for axis, lower, upper in zip("xyz", box.lower, box.upper, strict=True):
+        rows.append(({f"l{axis}{link}": 1.0, f"m{link}": -lower}, 0.0))
+        rows.append(({f"l{axis}{link}": -1.0, f"m{link}": upper}, 0.0))
+    return linear_block(f"link {link}: centre of mass inside its box", rows, REFERENCE_MOMENT, index)
+
+
+def _hull(link: int, points: Sequence[Vector3], index: Index) -> Block:
+    """Return the half-spaces n . r + d <= 0 of the hull, times the mass: -(n . l) - d m > 0."""
+    from scipy.spatial import ConvexHull, QhullError  # loads for 0.1 s, and few arms have a hull
+
+    try:
+        planes = ConvexHull(np.array(points)).equations
+    except QhullError as error:
+        raise ParameterError(f"link {link}: the points of its hull enclose no volume") from error
+    # Triangles of one face give the same half-space several times.
+    planes = np.unique(np.round(planes, 12), axis=0)
+    rows = [
+        ({f"lx{link}": -x, f"ly{link}": -y, f"lz{link}": -z, f"m{link}": -d}, 0.0) for x, y, z, d in planes.tolist()
+    ]
+    return linear_block(f"link {link}: centre of mass inside its hull", rows, REFERENCE_MOMENT, index)
+
+
+def _ellipsoid(link: int, body: Ellipsoid, index: Index) -> Block:
+    # In fractions and rounded once, so that every machine has the same digits: files are compared with them.
+    axes = [[Fraction(value) for value in row] for row in (np.eye(3).tolist() if body.axes is None else body.axes)]
+    weights = [1 / Fraction(length) ** 2 for length in body.semi_axes]
+    W = [
+        [sum((w * row[i] * row[j] for w, row in zip(weights, axes, strict=True)), Fraction(0)) for j in range(3)]
+        for i in range(3)
+    ]
+    c = [Fraction(value) for value in body.center]
+    trace = W[0][0] + W[1][1] + W[2][2]
+    Wc = [sum((W[i][j] * c[j] for j in range(3)), Fraction(0)) for i in range(3)]
+    row = {f"l{axis}{link}": float(2 * Wc[i]) for i, axis in enumerate("xyz")}
+    row[f"m{link}"] = float(1 - sum((c[i] * Wc[i] for i in range(3)), Fraction(0)))
+    for i, a in enumerate("xyz"):
+        row[f"L{a}{a}{link}"] = float(W[i][i] - trace / 2)
+        for j in range(i + 1, 3):
+            row[f"L{a}{'xyz'[j]}{link}"] = float(2 * W[i][j])
+    return linear_block(f"link {link}: all mass inside its ellipsoid", [(row, 0.0)], REFERENCE_MASS, index)
+
+
+def signs(positive: Sequence[JointTerm], links: Sequence[int], index: Index) -> list[Block]:
+    """Return the blocks of joint terms that must be positive (eq. 28), where the model has them.
+
+    Args:
+        positive: the terms.
+        links: numbers of the links, from 1.
+        index: column of each link parameter.
+    """
+    blocks = []
+    for term in positive:
+        for link in links:
+            name = f"{TERM_SYMBOLS[term]}{link}"
+            if name in index:
+                title = f"joint {link}: {term.replace('_', ' ')} positive"
+                blocks.append(linear_block(title, [({name: 1.0}, 0.0)], reference(name), index))
+    return blocks
+
 
 __all__ = ["Block", "FeasibleSet", "SetName", "feasible_set", "symmetric"]
 

@@ -10,19 +10,20 @@ import numpy as np
 from ident_service.errors import SolverError
 from ident_service.estimation.feasible.central import Near, central
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
-from ident_service.estimation.feasible.consistency import ConditionsError, contradiction
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.posing import (
+from ident_service.estimation.feasible.formulation import (
     OF_ESTIMATES,
+    ConditionsError,
     Lift,
     constrain,
+    contradiction,
     minimise,
     pressing,
     project,
     with_insets,
 )
 from ident_service.estimation.least_squares import unit_columns
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.likely_bodies import LikelyBodies
 
@@ -46,7 +47,7 @@ class FeasibleEstimate:
         iterations: of the solver.
         solver_seconds: inside the solver.
         prior_distance: divergence from the prior, before its weight; 0 without one.
-        bound: of each link's tr(P) [kg] within which it was sought, see `posing.py`; infinite for none.
+        bound: of each link's tr(P) [kg] within which it was sought, see `formulation.py`; infinite for none.
         penalty: value of the penalty of `constraints.custom`; None without one.
     """
 
@@ -103,7 +104,7 @@ def solve_inside(
         conditions: the set.
         size: of the largest base parameter.
         quadratic: diagonal of the Hessian, shape (variables,).
-        reaches: bounds of links' masses to try, in turn, see `posing.py`.
+        reaches: bounds of links' masses to try, in turn, see `formulation.py`.
 
     Returns:
         Delta, with a positive margin and the equalities fulfilled to the last digit, and the solution.
@@ -153,7 +154,7 @@ def nearest(
         base: grouping of the parameters.
         conditions: the set.
         name: of the problem, for errors.
-        reaches: bounds of links' masses to try, in turn, see `posing.py`.
+        reaches: bounds of links' masses to try, in turn, see `formulation.py`.
 
     Raises:
         ConditionsError: no parameters at all fulfil the conditions.

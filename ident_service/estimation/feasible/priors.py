@@ -2,7 +2,7 @@
 
     minimise  |R_1 beta - rho_1|^2 / sigma^2 + weight * d(delta, delta0)    over the feasible set
 
-- `euclidean`: d is the sum of squared differences, each in units of its parameter's reference scale (`blocks.py`).
+- `euclidean`: d is the sum of squared differences, each in units of its parameter's reference scale.
 - `entropic`: per link the log-det Bregman divergence of the 4x4 pseudo-inertias (Lee, Wensing and Park 2020),
   `-logdet(P) + logdet(P0) + tr(P0^-1 P) - 4`, which does not depend on the choice of link frame; joint terms, which
   have no such metric, are Euclidean.
@@ -22,17 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.feasible.blocks import reference, symmetric
 from ident_service.estimation.feasible.central import Near
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
-from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
+from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set, reference, symmetric
+from ident_service.estimation.feasible.formulation import OF_TESTS, pressing, with_insets
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.feasible.posing import OF_TESTS, pressing, with_insets
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.layout import INERTIAL
 from ident_service.model.likely_bodies import LikelyBodies
+from ident_service.model.parameter_layout import INERTIAL
 
 _ROOM = 0.9  # share of the allowed change of base parameters that moving to likely bodies may use
 _TRIANGLE = [(i, j) for i in range(4) for j in range(i + 1)]  # entries of Z, row by row

@@ -15,9 +15,9 @@ import numpy as np
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import triangle_entries
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.posing import EPSILON, Lift, check
+from ident_service.estimation.feasible.formulation import EPSILON, Lift, check
 from ident_service.estimation.least_squares import LeastSquares
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 
 _LARGEST_MARGIN = 1e3  # as in the feasibility test: nothing may bound the margin, and a larger one says no more

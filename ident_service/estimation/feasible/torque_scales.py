@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ident_service.config.schema import ArmConfig
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
+from ident_service.estimation.feasible.formulation import Lift, check, insets, pressing
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
-from ident_service.estimation.feasible.posing import Lift, check, insets, pressing
-from ident_service.model.base import BaseParameters
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle
 

@@ -1,31 +1,247 @@
-"""Compare two or more parameter sets: the first is the reference that the others are compared with.
+"""Compare parameter sets with a reference: sides, the values in use, differences, findings.
+
+Nothing is judged here; `comparison.py` does that.
+
+Tests are made of unconstrained values, to which the covariances belong. Exports, models and torque errors are made of
+the values held in a feasible set, so these may differ where the arm has not changed: by another set, another method, or
+an edited file. Pure computation, no I/O.
 
 Parameters are the same where their expressions are: two runs of one arm, or two arms of one kind. What only one side
-has is listed and left out. Whether anything has changed is `estimation/drift.py`'s to say; where a side has no
-covariance, as tables in papers, there are differences and no verdict.
+has is listed and left out. Whether anything has changed is `estimation/change_detection.py`'s to say; where a side has
+no covariance, as tables in papers, there are differences and no verdict.
 
 The shape of friction (pre-sliding distance, Stribeck velocity) may be fitted to each recording. With another shape the
 same parameter is another quantity, and no covariance knows of it: friction of such a joint is not compared, and without
 it nothing is called unchanged.
+
+A body that explains the change stands for the effects on all links that it has in the base parameters; friction and
+drive inertia are base parameters of their own joint, and are findings beside it.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError, UsageError
-from ident_service.estimation.drift import Drift, Identified, drift
-from ident_service.estimation.drift_causes import Cause, causes
+from ident_service.estimation.change_detection import (
+    Cause,
+    Drift,
+    Effect,
+    Identified,
+    Motion,
+    causes,
+    drift,
+    friction_ratio,
+    meaning_of_cause,
+    meaning_of_effect,
+    relevant,
+    torque_shares,
+)
 from ident_service.estimation.least_squares import TorqueError, torque_error
+from ident_service.model.base_parameters import parse_expression
 from ident_service.model.chain import Array
-from ident_service.results.comparison.in_use import InUse, values_in_use
-from ident_service.results.comparison.sides import Side
-from ident_service.results.run_folder import ARM
+from ident_service.model.information import Information
+from ident_service.results.parameter_file import ParameterFile, information_from, read_parameters, require_consistent
+from ident_service.results.run_folder import ARM, PARAMETERS, read_results
+
+_DECIMALS = 9  # of coefficients; expressions that agree to these are the same parameter
+Key = tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True)
+class Side:
+    """Parameter set that takes part in a comparison.
+
+    Attributes:
+        path: folder or file as it was given.
+        sha256: of the parameter file.
+        file: what is in it.
+        config: the arm it was identified for; None for a file alone.
+    """
+
+    path: Path
+    sha256: str
+    file: ParameterFile
+    config: ArmConfig | None = None
+
+    @property
+    def name(self) -> str:
+        """Return a short name: of the folder, or of the file where it is not called as in a folder of results."""
+        path = self.path.absolute()
+        return path.parent.name if path.name == PARAMETERS else path.name
+
+    @property
+    def content(self) -> Mapping[str, Any]:
+        """Return everything in the parameter file."""
+        return self.file.content
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """Return each base parameter's expression in a form that does not depend on how it is written."""
+        expressions = self.content["base_parameters"]["expressions"]
+        return tuple(
+            tuple(sorted((name, round(value, _DECIMALS)) for name, value in parse_expression(expression).items()))
+            for expression in expressions
+        )
+
+    @cached_property
+    def leading(self) -> tuple[str, ...]:
+        """Return the link parameter that each base parameter is named after."""
+        return tuple(self.file.base.names[column] for column in self.file.base.base)
+
+    @cached_property
+    def joints(self) -> tuple[str, ...] | None:
+        """Return the names of the arm's joints; None where the file does not say."""
+        arm = self.content.get("arm")
+        return None if arm is None else tuple(arm["joints"])
+
+    @cached_property
+    def covariance(self) -> Array | None:
+        """Return the covariance of the unconstrained estimate, shape (base, base), infinite where unseen; None without.
+
+        Raises:
+            ParameterError: it is none.
+        """
+        rows = self.content["base_parameters"].get("covariance")
+        if rows is None:
+            return None
+        size = self.file.base.size
+        if len(rows) != size or any(len(row) != size for row in rows):
+            raise ParameterError(f"{self.path}: covariance is not {size} by {size}")
+        # Covariances with an unseen parameter are null in the file, too.
+        unseen = np.array([rows[k][k] is None for k in range(size)])
+        matrix = np.array([[0.0 if value is None else value for value in row] for row in rows], dtype=float)
+        matrix[unseen, :] = matrix[:, unseen] = 0.0
+        largest = np.sqrt(np.outer(np.diag(matrix).clip(0.0), np.diag(matrix).clip(0.0)))
+        slack = 1e-9 * np.max(largest, initial=0.0)
+        if np.any(np.diag(matrix) < 0.0) or np.any(np.abs(matrix - matrix.T) > 1e-6 * largest + slack):
+            raise ParameterError(f"{self.path}: covariance is not symmetric, or has negative variances")
+        matrix = np.asarray(0.5 * (matrix + matrix.T))
+        matrix[unseen, unseen] = np.inf
+        return matrix
+
+    @property
+    def unconstrained(self) -> Array | None:
+        """Return the values before they were held in a feasible set, shape (base,); None where the file has none."""
+        values = self.content["base_parameters"].get("unconstrained_values")
+        if values is None and self.content.get("feasible_set") == "none":
+            return self.file.values
+        return None if values is None else np.array(values, dtype=float)
+
+    @cached_property
+    def information(self) -> Information | None:
+        """Return the information of the recordings that were fitted to; None where the file has none.
+
+        Raises:
+            ParameterError: it does not fit the parameters.
+        """
+        joints = self.content.get("information")
+        if joints is None:
+            return None
+        try:
+            return information_from(joints, self.file.base.size)
+        except ParameterError as error:
+            raise ParameterError(f"{self.path}: {error}") from None
+
+    def identified(self, places: NDArray[np.intp], *, free: bool) -> Identified | None:
+        """Return the testable values of some parameters, with their covariance; None without a covariance.
+
+        Args:
+            places: which, in the order of the comparison.
+            free: whether values are those before they were held in a feasible set.
+        """
+        covariance = self.covariance
+        if covariance is None:
+            return None
+        values = self.unconstrained if free else None
+        values = self.file.values if values is None else values
+        fit = self.content.get("fit", {})
+        motion = None if self.information is None else Motion.of(self.information, values, places.tolist())
+        return Identified(
+            tuple(self.leading[place] for place in places),
+            values[places],
+            covariance[np.ix_(places, places)],
+            fit.get("blocks"),
+            motion,
+        )
+
+
+def read_side(path: Path) -> Side:
+    """Read a folder of results or a parameter file.
+
+    Raises:
+        UsageError: neither is there.
+        ParameterError: torn, changed or foreign, or values that contradict each other.
+        ConfigError: the folder's arm is not one that this version reads.
+    """
+    if path.is_dir():
+        results = read_results(path)
+        require_consistent(results.parameters, path / PARAMETERS)
+        return Side(path, results.sha256[PARAMETERS], results.parameters, results.config)
+    file = read_parameters(path)
+    require_consistent(file, path)
+    return Side(path, hashlib.sha256(path.read_bytes()).hexdigest(), file)
+
+
+@dataclass(frozen=True)
+class InUse:
+    """Values in use of the parameters that both sides have.
+
+    Attributes:
+        reference: values [SI], shape (shared,).
+        side: of the other, shape (shared,).
+        apart: whether they are other values than the tested ones, on either side.
+        shares: per joint, the root mean square by which their difference changes its torque, over that of the torque
+            and over that of the residual, each of shape (joints,); None where no motion is known.
+    """
+
+    reference: Array
+    side: Array
+    apart: bool
+    shares: tuple[Array, Array] | None
+
+    @property
+    def matters(self) -> bool:
+        """Return whether the difference of the values in use changes some joint's torque by a relevant amount."""
+        return self.shares is not None and relevant(self.shares)
+
+    def worst(self) -> tuple[int, float] | None:
+        """Return the joint, from 0, whose torque the difference changes by the largest share, and that share."""
+        if self.shares is None:
+            return None
+        joint = int(np.argmax(self.shares[0]))
+        return joint, float(self.shares[0][joint])
+
+
+def values_in_use(
+    sides: tuple[Side, Side],
+    places: Sequence[NDArray[np.intp]],
+    compared: tuple[Identified, Identified] | None,
+) -> InUse:
+    """Return the values in use of the shared parameters of two sides.
+
+    Args:
+        sides: the reference and the other.
+        places: of the shared parameters in each.
+        compared: both as they are tested; None where they are not.
+    """
+    reference, side = (one.file.values[at] for one, at in zip(sides, places, strict=True))
+    if compared is None:
+        return InUse(reference, side, False, None)
+    first, second = compared
+    seen = np.isfinite(np.diag(first.covariance) + np.diag(second.covariance))
+    apart = not (np.array_equal(first.values, reference) and np.array_equal(second.values, side))
+    return InUse(reference, side, apart, torque_shares(first, second, np.where(seen, side - reference, 0.0)))
+
 
 UNSAID = "-"
 Verdict = Literal["unchanged", "changed", "impossible"]
@@ -284,3 +500,97 @@ def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int], in
     if scales[0] != scales[1] and all(scales):
         notes.append("torques were multiplied by different factors")
     return notes
+
+
+_OF_JOINTS = ("friction", "drive inertia")
+EXPLAINS = 0.9  # of the squared change of torque; a single cause that explains less is not the whole story
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Description of one change, for a person.
+
+    Attributes:
+        what: name of the changed quantity, and of its joint or link.
+        sigma: length of the change in standard deviations.
+        joint: the one whose torque changes most for its size; empty where no motion is known.
+        torque_share: of that joint's torque, by which its prediction changes; None likewise.
+        residual_share: of what is unexplained of it; None likewise.
+        size: of the change, in words; may be empty.
+        meaning: possible meaning, in words.
+    """
+
+    what: str
+    sigma: float
+    joint: str
+    torque_share: float | None
+    residual_share: float | None
+    size: str
+    meaning: str
+
+
+def findings(pair: Pair) -> tuple[Finding, ...]:
+    """Return the changes between the reference and a side; empty where nothing has changed."""
+    found, compared = pair.drift, pair.compared
+    if found is None or compared is None or found.verdict != "changed":
+        return ()
+    links = _links(pair)
+    changes = found.changes
+    best = pair.causes[0] if pair.causes and pair.causes[0].explained >= EXPLAINS else None
+    whole: tuple[Finding, ...] = ()
+    if best is not None and best.kind == "body":
+        whole = (_whole(pair, found, best, links),)
+        changes = tuple(effect for effect in changes if effect.kind in _OF_JOINTS)
+    single = tuple(_single(pair, found, compared, effect, links) for effect in changes)
+    return (*whole, *single) or (_whole(pair, found, best, links),)
+
+
+def joint_name(pair: Pair, number: int) -> str:
+    """Return the name of a joint counted from 1, or its number where the side knows no name."""
+    names = pair.side.joints
+    return names[number - 1] if names is not None and number <= len(names) else str(number)
+
+
+def _links(pair: Pair) -> int:
+    names = pair.side.file.base.names
+    return max(int(name[1:]) for name in names if name.startswith("m") and name[1:].isdigit())
+
+
+def _whole(pair: Pair, found: Drift, cause: Cause | None, links: int) -> Finding:
+    """Return the change of all parameters together, as a finding."""
+    joint, torque, residual = "", None, None
+    if found.torque_share is not None and found.residual_share is not None:
+        worst = int(found.residual_share.argmax())
+        joint = joint_name(pair, worst + 1)
+        torque, residual = float(found.torque_share[worst]), float(found.residual_share[worst])
+    if cause is None:
+        what, size, meaning = (
+            "all parameters together",
+            "",
+            "no single joint or link; look at conditions that all share",
+        )
+    else:
+        owner = f"link {cause.number}" if cause.kind == "body" else f"joint {joint_name(pair, cause.number)}"
+        what, meaning = f"{cause.kind} of {owner}", meaning_of_cause(cause, links)
+        size = f"explains {cause.explained:.1%} of the change"
+        if (mass := cause.changes.get(f"m{cause.number}")) and cause.kind == "body" and cause.number == links:
+            size += f"; about {mass:+.3g} kg"
+    return Finding(what, found.joint.sigma, joint, torque, residual, size, meaning)
+
+
+def _single(pair: Pair, found: Drift, compared: tuple[Identified, Identified], effect: Effect, links: int) -> Finding:
+    owner = f"joint {joint_name(pair, effect.number)}" if effect.kind in _OF_JOINTS else f"link {effect.number}"
+    return Finding(
+        what=f"{effect.kind} of {owner}",
+        sigma=effect.test.sigma,
+        joint="" if effect.joint is None else joint_name(pair, effect.joint + 1),
+        torque_share=effect.torque_share,
+        residual_share=effect.residual_share,
+        size=_ratio(compared, effect.number) if effect.kind == "friction" else "",
+        meaning=meaning_of_effect(effect, found, compared[0].leading, links),
+    )
+
+
+def _ratio(compared: tuple[Identified, Identified], joint: int) -> str:
+    found = friction_ratio(*compared, joint)
+    return "" if found is None else f"{found[0] - 1.0:+.0%} at {found[1]:.2g} rad/s"

@@ -1,6 +1,6 @@
 """Represent the evidence that a person needs to believe an estimate, beyond `parameters.json`.
 
-The data are gathered in `making.py`, kept in `evidence.json` (`file.py`), and drawn by the report. The correlation of
+The data are gathered in `gathering.py`, kept in `evidence.json`, and drawn by the report. The correlation of
 the parameters is not here, because the parameter file has their covariance.
 """
 

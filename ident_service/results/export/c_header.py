@@ -1,4 +1,6 @@
-"""Write a C99 header with the arm's dynamics in base parameters: nothing but <math.h>, no memory, C++ too.
+"""Export a C99 header with the arm's dynamics in base parameters: nothing but <math.h>.
+
+The reader knows nothing of the tape: what it computes is what the text says.
 
 The state of friction with pre-sliding is the caller's.
 
@@ -10,21 +12,20 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from ident_service import __version__
-from ident_service.config.schema import JointTerm
+from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array
+from ident_service.model.friction_state import presliding_ways, turned
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
-from ident_service.model.presliding import presliding_ways, turned
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.tape import Symbol, Tape, Value
-from ident_service.results.export.arm import IdentifiedArm
-from ident_service.results.export.c_code import c_lines, run_c_lines
-from ident_service.results.export.check import (
+from ident_service.model.symbolic import Symbol, Tape, Value, needed_steps
+from ident_service.results.export.identified_arm import IdentifiedArm
+from ident_service.results.export.round_trip import (
     AGREEMENT,
     disagreement,
     presliding_left_out,
@@ -33,6 +34,103 @@ from ident_service.results.export.check import (
     with_terms,
 )
 from ident_service.results.export.words import identifier, plain, unique
+
+_OPERATORS = {"mul": "*", "add": "+", "sub": "-"}
+_FUNCTIONS = {"sin": "sin", "cos": "cos", "exp": "exp", "abs": "fabs"}
+_UNARY = {"sin": np.sin, "cos": np.cos, "exp": np.exp, "fabs": np.abs}
+_BINARY = {"*": np.multiply, "+": np.add, "-": np.subtract}
+
+_OPERAND = r"-?[a-z]+\[\d+\]|-?x\d+|-?\d[\d.e+-]*|\(-\d[\d.e+-]*\)"
+_STEP = re.compile(
+    rf"^    const double (x\d+) = (?:({_OPERAND}) ([-+*]) ({_OPERAND})|(\w+)\((.+)\)|(-x\d+|-[a-z]+\[\d+\]));$"
+)
+_SIGN = re.compile(rf"^    const double (x\d+) = \(double\)\(\(({_OPERAND}) > 0\.0\) - \(\2 < 0\.0\)\);$")
+_RESULT = re.compile(rf"^    ([a-zA-Z]+)\[(\d+)\] = ({_OPERAND});$")
+
+
+def c_lines(tape: Tape, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
+    """Return the body of a C function, indented.
+
+    Args:
+        tape: what was recorded.
+        inputs: C expressions of the tape's inputs, by index.
+        outputs: targets and their values; all of them are written after everything has been read.
+    """
+    names = dict(inputs)
+    lines: list[str] = []
+    for at in needed_steps(tape, [value.index for _, value in outputs if isinstance(value, Symbol)]):
+        operation, a, b = tape.steps[at]
+        if operation == "input":
+            continue
+        first, second = (_operand(value, names) for value in (a, b))
+        names[at] = f"x{len(lines)}"
+        if operation == "sign":
+            text = f"(double)(({first} > 0.0) - ({first} < 0.0))"
+        elif operation == "neg":
+            text = f"-{first}"
+        elif operation in _FUNCTIONS:
+            text = f"{_FUNCTIONS[operation]}({first})"
+        else:
+            text = f"{first} {_OPERATORS[operation]} {second}"
+        lines.append(f"    const double {names[at]} = {text};")
+    for target, value in outputs:
+        lines.append(f"    {target} = {_operand(value.index if isinstance(value, Symbol) else float(value), names)};")
+    return lines
+
+
+def _operand(value: int | float | None, names: Mapping[int, str]) -> str:
+    if isinstance(value, int):
+        return names[value]
+    number = repr(float(value or 0.0) + 0.0)
+    return f"({number})" if number.startswith("-") else number
+
+
+def run_c_lines(lines: Sequence[str], arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """Run lines that `c_lines` has written, from their text alone.
+
+    Args:
+        lines: the body of a function.
+        arrays: what `name[k]` stands for: arrays of shape (length, samples).
+
+    Returns:
+        By name, the arrays that were written to, shape (length, samples).
+
+    Raises:
+        ModelError: a line that is not one of these.
+    """
+    samples = max(array.shape[1] for array in arrays.values())
+    known: dict[str, Array] = {}
+    results: dict[str, dict[int, Array]] = {}
+
+    def value(text: str) -> Array:
+        text = text.strip("()")
+        if text.startswith("-") and not text[1].isdigit():
+            return np.asarray(-value(text[1:]))
+        if text in known:
+            return known[text]
+        if text.endswith("]"):
+            name, number = text[:-1].split("[")
+            return np.asarray(arrays[name][int(number)])
+        return np.full(samples, float(text))
+
+    for line in lines:
+        try:
+            if step := _STEP.match(line):
+                target, a, operator, b, function, argument, negated = step.groups()
+                if operator is not None:
+                    known[target] = _BINARY[operator](value(a), value(b))
+                else:
+                    known[target] = value(negated) if function is None else _UNARY[function](value(argument))
+            elif step := _SIGN.match(line):
+                known[step.group(1)] = np.sign(value(step.group(2)))
+            elif step := _RESULT.match(line):
+                results.setdefault(step.group(1), {})[int(step.group(2))] = value(step.group(3))
+            else:
+                raise ModelError(f"not a line of generated code: {line.strip()[:80]!r}")
+        except (KeyError, IndexError, ValueError) as error:
+            raise ModelError(f"generated code that cannot be run: {line.strip()[:80]!r} ({error})") from None
+    return {name: np.array([rows[k] for k in sorted(rows)]) for name, rows in results.items()}
+
 
 _PARAMETER = re.compile(r"^    (-?[\d.e+-]+),? /\* \d+ ")
 _DRIVES: tuple[JointTerm, ...] = ("drive_inertia",)
@@ -187,7 +285,7 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
 
 
 def _turned(tape: Tape, share: Array, step: list[Symbol], before: Symbol, way: float) -> Value:
-    """Return the friction state of one drive after one step of Dahl's law (`model/presliding.py`)."""
+    """Return the friction state of one drive after one step of Dahl's law (`model/friction_state.py`)."""
     travelled: Value = sum((float(c) * x for c, x in zip(share, step, strict=True) if c), 0.0)
     if not isinstance(travelled, Symbol):
         return before  # a drive that moves no joint

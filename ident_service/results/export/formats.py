@@ -1,24 +1,201 @@
-"""Define the export formats, and write several of them: all of them appear, or none.
+"""Export an identified arm in several formats at once: all files appear, or none; CSV and JSON are written here.
+
+Bodies and placements are as pinocchio takes them, so that a dozen lines load the file into it (`docs/exports.md`).
 
 What each format carries is said where it is written; what of this arm it did not carry comes with the answer.
 """
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from ident_service.errors import UsageError
-from ident_service.results.export.arm import IdentifiedArm, read_identified
+import numpy as np
+
+from ident_service import __version__
+from ident_service.config.arm import Joint
+from ident_service.errors import ModelError, UsageError
+from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.friction_state import presliding_ways
+from ident_service.model.parameter_layout import INERTIAL, Layout
+from ident_service.model.regressor import joint_regressor
+from ident_service.results.export.bodies import about_center, about_origin, joint_bodies
 from ident_service.results.export.bodies_said import body_notes
 from ident_service.results.export.c_header import c_header, c_prefix, turning_said
-from ident_service.results.export.json_model import json_export
+from ident_service.results.export.identified_arm import IdentifiedArm, read_identified
 from ident_service.results.export.mjcf import mjcf_export
+from ident_service.results.export.round_trip import AGREEMENT, disagreement, random_states, torque
 from ident_service.results.export.sdf import sdf_export
-from ident_service.results.export.table import csv_export
-from ident_service.results.export.urdf_file import urdf_export
-from ident_service.results.files import appearing_folder, write_atomically
+from ident_service.results.export.urdf import urdf_export
+from ident_service.results.manifest import appearing_folder, write_atomically
+
+# Standard deviations are those of the unconstrained values; both are the same where nothing was constrained.
+_HEADER = ("kind", "name", "unit", "value", "sigma", "verdict", "unconstrained_value")
+
+
+def csv_export(arm: IdentifiedArm, name: str) -> str:
+    """Return all parameters as a table; numbers read back as the same ones.
+
+    Args:
+        arm: with link parameters or without.
+        name: of the file, for errors.
+
+    Raises:
+        ModelError: the table read back differs.
+    """
+    base, layout = arm.base, arm.model.layout
+    sigma = ("" if deviation is None else repr(float(deviation)) for deviation in arm.sigma)
+    free = [""] * base.size if arm.unconstrained is None else [repr(float(value)) for value in arm.unconstrained]
+    rows = [
+        ("base", expression, unit, repr(float(value)), deviation, verdict, before)
+        for expression, unit, value, deviation, verdict, before in zip(
+            base.expressions, base.units, arm.beta, sigma, arm.verdicts, free, strict=True
+        )
+    ]
+    shape = _friction_shape(arm)
+    if arm.delta is not None:
+        table = zip(layout.names, layout.units, arm.delta, strict=True)
+        rows += [("link", parameter, unit, repr(float(value)), "", "", "") for parameter, unit, value in table]
+    rows += [("friction shape", parameter, unit, repr(value), "", "", "") for parameter, unit, value in shape]
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([_HEADER, *rows])
+    found = [row["value"] for row in csv.DictReader(io.StringIO(text.getvalue()))]
+    meant = [*arm.beta.tolist(), *([] if arm.delta is None else arm.delta.tolist()), *(value for *_, value in shape)]
+    if [float(value) for value in found] != meant:
+        raise ModelError(f"{name}: the table read back differs from the parameters; it was not written")
+    return text.getvalue()
+
+
+def _friction_shape(arm: IdentifiedArm) -> list[tuple[str, str, float]]:
+    """Return the nonlinear friction numbers, joint by joint: name, unit, value; none that the arm has not."""
+    model, layout = arm.model, arm.model.layout
+    units = ["rad" if turns else "m" for turns in model.chain.revolute]
+    ways = presliding_ways(model).tolist()
+    found = [(f"presliding{k}", unit, way) for k, (unit, way) in enumerate(zip(units, ways, strict=True), 1)]
+    found = found if any(ways) else []
+    if "stribeck" in layout.terms:
+        velocities = enumerate(zip(units, layout.stribeck_velocity, strict=True), 1)
+        found += [(f"stribeck_velocity{k}", f"{unit}/s", float(velocity)) for k, (unit, velocity) in velocities]
+    return found
+
+
+_FORMAT, _VERSION = "ident-dynamics", 1
+
+
+def json_export(arm: IdentifiedArm, name: str) -> str:
+    """Return the arm as JSON, after the same torques were computed from it.
+
+    Args:
+        arm: with link parameters or without.
+        name: of the file, for errors.
+
+    Raises:
+        ModelError: a link without positive mass, or the file does not say what it should.
+    """
+    text = json.dumps(_document(arm), indent=1, allow_nan=False) + "\n"
+    _check(arm, text, name)
+    return text
+
+
+def _document(arm: IdentifiedArm) -> dict[str, Any]:
+    model, layout = arm.model, arm.model.layout
+    chain = model.chain
+    bodies = None if arm.delta is None else joint_bodies(model, arm.delta)
+    joints = []
+    for k, name in enumerate(chain.names):
+        settings = model.config.joints.get(name, Joint())
+        joints.append(
+            {
+                "name": name,
+                "type": "revolute" if chain.revolute[k] else "prismatic",
+                "parent": chain.parents[k],
+                "placement": {"rotation": chain.rotation[k].tolist(), "translation": chain.translation[k].tolist()},
+                "axis": chain.axes[k].tolist(),
+                "limits": {
+                    "position": settings.position,
+                    "velocity": settings.velocity,
+                    "torque": settings.torque,
+                },
+                "body": None if bodies is None else _body(bodies[k]),
+            }
+        )
+    delta = arm.base_delta if arm.delta is None else arm.delta
+    drives: dict[str, list[float]] = {term: layout.term_values(term, delta).tolist() for term in layout.terms}
+    if "stribeck" in layout.terms:
+        drives["stribeck_velocity"] = list(layout.stribeck_velocity)
+    return {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "arm": model.config.name,
+        "software": f"ident-service {__version__}",
+        "parameters_sha256": arm.source,
+        "notes": [*body_notes(arm), *filter(None, (arm.sigma_said,))],
+        "units": "SI: m, rad, kg, s, N m; torque positive along the joint's axis",
+        "gravity": chain.gravity.tolist(),
+        "joints": joints,
+        "friction": {
+            "presliding": presliding_ways(model).tolist(),
+            "stribeck_velocity": list(layout.stribeck_velocity),
+        },
+        "drives": None if arm.delta is None else {"coupling": chain.coupling.tolist(), **drives},
+        "base_parameters": {
+            "expressions": list(arm.base.expressions),
+            "units": list(arm.base.units),
+            "values": arm.beta.tolist(),
+            "unconstrained_values": None if arm.unconstrained is None else arm.unconstrained.tolist(),
+            "standard_deviations": list(arm.sigma),
+            "verdicts": list(arm.verdicts),
+        },
+    }
+
+
+def _body(parameters: Array) -> dict[str, Any]:
+    mass, center, inertia = about_center(parameters)
+    return {"mass": mass, "center_of_mass": center.tolist(), "inertia": inertia.tolist()}
+
+
+def _check(arm: IdentifiedArm, text: str, name: str) -> None:
+    """Build the arm from the text, and check its values and torques."""
+    content = json.loads(text)
+    if content["base_parameters"]["values"] != arm.beta.tolist():
+        raise ModelError(f"{name}: the base parameters read back differ; it was not written")
+    if content["friction"]["presliding"] != presliding_ways(arm.model).tolist():
+        raise ModelError(f"{name}: the ways of pre-sliding read back differ; it was not written")
+    if arm.delta is None:
+        return
+    joints, drives, n = content["joints"], dict(content["drives"]), len(content["joints"])
+    revolute = tuple(joint["type"] == "revolute" for joint in joints)
+    chain = Chain(
+        names=tuple(joint["name"] for joint in joints),
+        parents=tuple(joint["parent"] for joint in joints),
+        revolute=revolute,
+        axes=np.array([joint["axis"] for joint in joints]),
+        rotation=np.array([joint["placement"]["rotation"] for joint in joints]),
+        translation=np.array([joint["placement"]["translation"] for joint in joints]),
+        link_rotation=np.tile(np.eye(3), (n, 1, 1)),
+        link_translation=np.zeros((n, 3)),
+        gravity=np.array(content["gravity"]),
+        coupling=np.array(drives.pop("coupling")),
+    )
+    layout = Layout(revolute, tuple(key for key in arm.model.layout.terms), tuple(drives.pop("stribeck_velocity", ())))
+    delta = np.zeros((n, layout.per_link))
+    for k, joint in enumerate(joints):
+        body = joint["body"]
+        inertia = np.array(body["inertia"])
+        delta[k, : len(INERTIAL)] = about_origin(body["mass"], np.array(body["center_of_mass"]), inertia)
+    for term in layout.terms:
+        delta[:, len(INERTIAL) + layout.terms.index(term)] = drives[term]
+    states = random_states(n)
+    found = np.einsum("jps,p->sj", joint_regressor(chain, layout, *states), delta.ravel())
+    if chain.names != arm.model.chain.names or min(chain.parents) < WORLD:
+        raise ModelError(f"{name}: the joints read back differ; it was not written")
+    if not disagreement(found, torque(arm.model, arm.delta, states)) <= AGREEMENT:
+        raise ModelError(f"{name}: the torques read back differ from the parameters'; it was not written")
 
 
 @dataclass(frozen=True)

@@ -6,21 +6,21 @@ drive; MuJoCo knows the armature of tendons since 3.3.1. Bodies' frames are join
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET  # only writes here; reading goes through pinocchio and `xml_places.py`
+import xml.etree.ElementTree as ET  # only writes here; reading goes through pinocchio and `urdf.py`
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.arm import Joint
 from ident_service.config.quantities import TextFile
-from ident_service.config.schema import Joint
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array
-from ident_service.model.drives import JOINT_TERMS, joint_drives
+from ident_service.model.parameter_layout import JOINT_TERMS, joint_drives
 from ident_service.results.export.bodies import about_center, joint_bodies, require_real
-from ident_service.results.export.check import Carried, carried, gravity_of, left_out, require_same_torques
+from ident_service.results.export.round_trip import Carried, carried, gravity_of, left_out, require_same_torques
+from ident_service.results.export.urdf import xml_places
 from ident_service.results.export.words import comments, unique
-from ident_service.results.export.xml_places import xml_places
 
 _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), strict=True))
 

@@ -1,18 +1,633 @@
-"""Draw all figures of a report by section, for the page and for files of their own."""
+"""Draw the figures of a report by section, each with the sentence that says what good looks like."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
-from ident_service.results.evidence.evidence import Evidence
+import numpy as np
+
+from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, WEAK_BELOW
+from ident_service.recordings.quality import MUCH_JITTER
+from ident_service.results.evidence.evidence import Body, Evidence, JointTrace, Mask, Posed, Spectrum, Timing, Traced
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.report.body_figures import body_figures
-from ident_service.results.report.doubt_figures import correlation_figure, deviation_figure
-from ident_service.results.report.figure import Figure
-from ident_service.results.report.friction_figures import friction_figures
-from ident_service.results.report.residual_figures import residual_figures
-from ident_service.results.report.timing_figures import timing_figures
-from ident_service.results.report.torque_figures import torque_figures
+from ident_service.results.plots import (
+    FONT,
+    Array,
+    Axes,
+    Canvas,
+    draw_frame,
+    draw_key,
+    number,
+    range_around,
+    round_values,
+)
+
+WIDTH = 560.0  # px; two beside each other on a wide screen, one on a narrow one
+LEFT, RIGHT = 62.0, 12.0
+
+
+@dataclass(frozen=True)
+class Zoom:
+    """Data that the page's script needs to redraw a time plot over a shorter time.
+
+    Attributes:
+        recording: number of the recording.
+        joint: number of the joint.
+        time: lowest and highest time shown [s].
+        torque: lowest and highest torque shown [N m or N].
+        residual: lowest and highest residual shown [N m or N].
+    """
+
+    recording: int
+    joint: int
+    time: tuple[float, float]
+    torque: tuple[float, float]
+    residual: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Drawing with its title, description and caption.
+
+    Attributes:
+        slug: name of its file, without an ending.
+        title: what a screen reader says first.
+        description: content of the drawing, for readers who cannot see it.
+        caption: what it says, what good looks like and what bad.
+        canvas: the drawing.
+        zoom: for time plots.
+        wide: whether it needs the whole width of a page.
+    """
+
+    slug: str
+    title: str
+    description: str
+    caption: str
+    canvas: Canvas
+    zoom: Zoom | None = None
+    wide: bool = False
+
+    def svg(self, *, inline: bool = False) -> str:
+        """Return the drawing as a file of its own, or for a page that has the style sheet."""
+        return self.canvas.svg(self.title, self.description, inline=inline)
+
+
+_TORQUE_TOP, _TORQUE, _RESIDUAL, _TORQUE_BETWEEN, _TORQUE_BOTTOM = 42.0, 150.0, 74.0, 26.0, 40.0
+_COLUMNS = 440
+_TORQUE_GOOD = (
+    "Good: both lines lie on each other and their difference is noise about zero, but for spikes where a joint turns "
+    "round. Bad: a difference that follows the motion."
+)
+
+
+def torque_figures(evidence: Evidence, recording: int) -> list[Figure]:
+    """Draw one figure per joint of a recording."""
+    return [_torque_figure(evidence, recording, joint) for joint in range(len(evidence.joints))]
+
+
+def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
+    traced = evidence.recordings[recording]
+    trace, name = traced.joints[joint], evidence.joints[joint]
+    unit = "N m" if evidence.revolute[joint] else "N"
+    torque = range_around(trace.torque, trace.predicted, least=1e-6)
+    residual = range_around(trace.residual, least=1e-6, zero=True)
+    time = (float(traced.time[0] - 0.5 * traced.width), float(traced.time[-1] + 0.5 * traced.width))
+    below = _TORQUE_TOP + _TORQUE + _TORQUE_BETWEEN
+    canvas = Canvas(WIDTH, below + _RESIDUAL + _TORQUE_BOTTOM)
+    above = Axes(LEFT, _TORQUE_TOP, WIDTH - LEFT - RIGHT, _TORQUE, *time, *torque)
+    under = Axes(LEFT, below, WIDTH - LEFT - RIGHT, _RESIDUAL, *time, *residual)
+    key = [("area", "measured", "measured"), ("area", "predicted", "predicted"), ("area", "residual", "difference")]
+    if trace.standstill.any():
+        key.insert(0, ("area", "ramp", "not fitted"))
+    draw_key(canvas, WIDTH - RIGHT, 16, key)
+    shown = _Columns(traced, trace)
+    _still(canvas, above, shown.edges, shown.standstill)
+    draw_frame(canvas, above, x="", y=f"torque [{unit}]")
+    draw_frame(canvas, under, x="time [s]", y=f"measured less predicted [{unit}]")
+    for axes, kind, values in (
+        (above, "measured", shown.torque),
+        (above, "predicted", shown.predicted),
+        (under, "residual", shown.residual),
+    ):
+        canvas.clip(axes)
+        for part in shown.runs:
+            _band(canvas, axes, kind, shown.time[part], values[:, part])
+        canvas.clip(None)
+    largest = float(np.abs(trace.residual).max())
+    size = float(np.abs(trace.torque).max())
+    words = f"{name}: torque up to {number(size)} {unit}, difference up to {number(largest)} {unit}."
+    return Figure(
+        slug=f"torque-{recording + 1}-{traced.role}-{joint + 1}",
+        title=f"{name}: measured and predicted torque, {traced.name}",
+        description=f"Over {number(time[1] - time[0])} s. {words}",
+        caption=f"{words} {_TORQUE_GOOD}",
+        canvas=canvas,
+        zoom=Zoom(recording, joint, time, torque, residual),
+    )
+
+
+class _Columns:
+    """Trace reduced to as many columns as can be seen, without a lost extreme."""
+
+    def __init__(self, traced: Traced, trace: JointTrace) -> None:
+        step = max(1, -(-len(traced.time) // _COLUMNS))
+        number_of = np.round(traced.time / traced.width - 0.5).astype(int)
+        place = number_of // step
+        begins = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
+        self.time = (place[begins] + 0.5) * step * traced.width
+        half = 0.5 * step * traced.width
+        self.edges = (self.time - half, self.time + half)
+
+        def reduced(values: Array) -> Array:
+            low = np.minimum.reduceat(values[0], begins)
+            return np.stack([low, np.maximum.reduceat(values[1], begins)])
+
+        self.torque, self.predicted, self.residual = map(reduced, (trace.torque, trace.predicted, trace.residual))
+        self.standstill: Mask = np.logical_or.reduceat(trace.standstill, begins)
+        breaks = [0, *(np.flatnonzero(np.diff(place[begins]) > 1) + 1).tolist(), len(begins)]
+        self.runs = [slice(a, b) for a, b in pairwise(breaks)]
+
+
+def _still(canvas: Canvas, axes: Axes, edges: tuple[Array, Array], standstill: Mask) -> None:
+    """Draw where rows were left out of the fit."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[False], standstill, [False]]).astype(int)))
+    canvas.clip(axes)
+    for begin, end in zip(turns[::2], turns[1::2], strict=True):
+        left, right = float(axes.x(edges[0][begin])), float(axes.x(edges[1][end - 1]))
+        canvas.rectangle("ramp still", left, axes.top, right - left, axes.height)
+    canvas.clip(None)
+
+
+def _band(canvas: Canvas, axes: Axes, kind: str, time: Array, values: Array) -> None:
+    x = axes.x(time)
+    low, high = axes.y(values[0]), axes.y(values[1])
+    canvas.polygon(kind, np.concatenate([x, x[::-1]]), np.concatenate([high, low[::-1]]))
+
+
+_FRICTION_TOP, _FRICTION_HEIGHT, _FRICTION_BOTTOM = 42.0, 200.0, 40.0
+_FRICTION_GOOD = (
+    "Good: the points lie about the curve in a band of noise. Bad: a bow or a hook that the curve does not have, which "
+    "asks for another friction term, or points in loops, which are elasticity or pre-sliding."
+)
+
+
+def friction_figures(evidence: Evidence) -> list[Figure]:
+    """Draw one figure per drive; none where the model has no friction."""
+    figures = []
+    for drive, friction in enumerate(evidence.friction):
+        name = evidence.joints[drive]
+        torque, speed = ("N m", "rad/s") if evidence.revolute[drive] else ("N", "m/s")
+        canvas = Canvas(WIDTH, _FRICTION_TOP + _FRICTION_HEIGHT + _FRICTION_BOTTOM)
+        across = range_around(friction.velocity, friction.curve_velocity, least=1e-6)
+        upright = range_around(friction.torque, friction.curve_torque, least=1e-6)
+        axes = Axes(LEFT, _FRICTION_TOP, WIDTH - LEFT - RIGHT, _FRICTION_HEIGHT, *across, *upright)
+        draw_key(canvas, WIDTH - RIGHT, 16, [("dot", "cloud", "recorded"), ("line", "second", "model")])
+        draw_frame(canvas, axes, x=f"velocity [{speed}]", y=f"torque less rigid bodies [{torque}]")
+        for x, y in zip(axes.x(friction.velocity), axes.y(friction.torque), strict=True):
+            canvas.circle("cloud", float(x), float(y), 2.2)
+        # The two branches are not joined: at standstill friction is no function of the velocity.
+        for branch in (friction.curve_velocity < 0.0, friction.curve_velocity > 0.0):
+            if branch.any():
+                x, y = friction.curve_velocity[branch], friction.curve_torque[branch]
+                canvas.polyline("second", axes.x(x), axes.y(y))
+        terms = ", ".join(friction.terms) if friction.terms else "none"
+        words = f"{name}: {len(friction.velocity)} points; the curve's parameters: {terms}."
+        figures.append(
+            Figure(
+                slug=f"friction-{drive + 1}",
+                title=f"{name}: friction against velocity",
+                description=f"{words} Scatter about the curve: {_scatter(evidence, drive)}.",
+                caption=f"{words} {_FRICTION_GOOD}",
+                canvas=canvas,
+            )
+        )
+    return figures
+
+
+def _scatter(evidence: Evidence, drive: int) -> str:
+    friction = evidence.friction[drive]
+    off = friction.torque - np.interp(friction.velocity, friction.curve_velocity, friction.curve_torque)
+    return f"{float(np.sqrt(np.mean(off**2))):.3g} {'N m' if evidence.revolute[drive] else 'N'} rms"
+
+
+_RESIDUAL_TOP, _RESIDUAL_HEIGHT, _RESIDUAL_BETWEEN, _RESIDUAL_BOTTOM = 42.0, 120.0, 66.0, 40.0
+_RESIDUAL_GOOD = (
+    "Good: a spectrum that is flat up to where a filter cuts it off, and an autocorrelation that falls at once and "
+    "stays about the dashed lines. Bad: peaks at frequencies of the motion or of a gear, and one that swings slowly."
+)
+
+
+def residual_figures(evidence: Evidence) -> list[Figure]:
+    """Draw one figure per joint: the first recording that was fitted to, and the first that was not."""
+    shown = []
+    for role in ("identification", "validation"):
+        shown += [one for one in evidence.recordings if one.role == role and one.spectra][:1]
+    return [_residual_figure(evidence, joint, shown) for joint in range(len(evidence.joints))] if shown else []
+
+
+def _residual_figure(evidence: Evidence, joint: int, shown: list[Traced]) -> Figure:
+    name = evidence.joints[joint]
+    unit = "(N m)\u00b2/Hz" if evidence.revolute[joint] else "N\u00b2/Hz"
+    spectra = [one.spectra[joint] for one in shown]
+    canvas = Canvas(WIDTH, _RESIDUAL_TOP + 2 * _RESIDUAL_HEIGHT + _RESIDUAL_BETWEEN + _RESIDUAL_BOTTOM)
+    wide = WIDTH - LEFT - RIGHT
+    kinds = ["first" if one.role == "identification" else "second" for one in shown]
+    key = [("line", kind, one.role) for kind, one in zip(kinds, shown, strict=True)]
+    draw_key(canvas, WIDTH - RIGHT, 16, key)
+    low, high = (extreme(float(extreme(s.frequency)) for s in spectra) for extreme in (min, max))
+    densities = [_log(spectrum) for spectrum in spectra]
+    above = Axes(
+        LEFT, _RESIDUAL_TOP, wide, _RESIDUAL_HEIGHT, np.log10(low), np.log10(high), *range_around(*densities, least=1.0)
+    )
+    draw_frame(canvas, above, x="frequency [Hz]", y=f"density of what is left [{unit}]", x_log=True, y_log=True)
+    for kind, spectrum, density in zip(kinds, spectra, densities, strict=True):
+        canvas.polyline(kind, above.x(np.log10(spectrum.frequency)), above.y(density))
+    longest = max(float(spectrum.lag[-1]) for spectrum in spectra)
+    below = Axes(
+        LEFT, _RESIDUAL_TOP + _RESIDUAL_HEIGHT + _RESIDUAL_BETWEEN, wide, _RESIDUAL_HEIGHT, 0.0, longest, -1.05, 1.05
+    )
+    draw_frame(canvas, below, x="lag [s]", y="autocorrelation of what is left")
+    white = max(spectrum.white for spectrum in spectra)
+    for level in (-white, white):
+        canvas.line("limit", LEFT, float(below.y(level)), LEFT + wide, float(below.y(level)))
+    for kind, spectrum in zip(kinds, spectra, strict=True):
+        canvas.polyline(kind, below.x(spectrum.lag), below.y(np.clip(spectrum.correlation, -1.05, 1.05)))
+    words = f"{name}, all rows: {_strongest(spectra[0])}, {_memory(spectra[0])}."
+    return Figure(
+        slug=f"residual-{joint + 1}",
+        title=f"{name}: spectrum and autocorrelation of the residual",
+        description=words,
+        caption=f"{words} {_RESIDUAL_GOOD}",
+        canvas=canvas,
+    )
+
+
+def _log(spectrum: Spectrum) -> Array:
+    # A joint that is predicted exactly has no spectrum; it is drawn twelve powers of ten down at most.
+    top = max(float(spectrum.density.max()), 1e-30)
+    return np.log10(np.maximum(spectrum.density, 1e-12 * top))
+
+
+def _strongest(spectrum: Spectrum) -> str:
+    at = spectrum.frequency[int(np.argmax(spectrum.density))]
+    return f"most is left at {number(float(at))} Hz"
+
+
+def _memory(spectrum: Spectrum) -> str:
+    """Describe the correlation time of the residual, where its autocorrelation falls below 1/e."""
+    small = np.flatnonzero(np.abs(spectrum.correlation) < np.exp(-1.0))
+    if not len(small):
+        return f"and it resembles itself for more than {number(float(spectrum.lag[-1]))} s"
+    return f"and it resembles itself for {number(1e3 * float(spectrum.lag[small[0]]))} ms"
+
+
+_TIMING_TOP, _TIMING_HEIGHT, _TIMING_BOTTOM = 28.0, 150.0, 40.0
+
+
+def timing_figures(evidence: Evidence, parameters: ParameterFile) -> list[Figure]:
+    """Draw one figure per recording; the parameter file may know the standard deviation of its steps."""
+    found = parameters.content.get("recording_quality", [])
+    known = {one["recording"]: float(one["jitter_seconds"]["standard_deviation"]) for one in found}
+    return [
+        _timing_figure(place, timing, known.get(timing.recording)) for place, timing in enumerate(evidence.timing, 1)
+    ]
+
+
+def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figure:
+    scale, unit = (1e3, "ms") if timing.edges[-1] >= 1e-3 else (1e6, "\u00b5s")
+    canvas = Canvas(WIDTH, _TIMING_TOP + _TIMING_HEIGHT + _TIMING_BOTTOM)
+    low, high = scale * float(timing.edges[0]), scale * float(timing.edges[-1])
+    logs = np.log10(np.maximum(timing.counts, 0.5))
+    axes = Axes(
+        LEFT,
+        _TIMING_TOP,
+        WIDTH - LEFT - RIGHT,
+        _TIMING_HEIGHT,
+        low,
+        high,
+        np.log10(0.5),
+        max(float(logs.max()), 1.0) + 0.1,
+    )
+    late = timing.source == "cycle"
+    what = "how late a cycle began" if late else "how far a step is from the usual one"
+    draw_frame(canvas, axes, x=f"{what} [{unit}]", y="cycles" if late else "steps", y_log=True)
+    bottom = _TIMING_TOP + _TIMING_HEIGHT
+    for count, log, begin, end in zip(timing.counts, logs, timing.edges[:-1], timing.edges[1:], strict=True):
+        if count:
+            x, right, y = float(axes.x(scale * begin)), float(axes.x(scale * end)), float(axes.y(log))
+            canvas.rectangle("good", x + 0.5, y, max(right - x - 1.0, 1.0), bottom - y)
+    words = timing_words(timing, deviation)
+    within = "a few percent"
+    if not late:
+        within = f"{100 * MUCH_JITTER:g} % (standard deviation; beyond, the warnings name it)"
+    return Figure(
+        slug=f"timing-{place}",
+        title=f"Timing of {timing.recording}",
+        description=words,
+        caption=(
+            f"{words} Good: one narrow heap at the left, within {within} of the period "
+            f"({number(scale / timing.rate)} {unit}). Bad: a tail as long as the period, or a second heap."
+        ),
+        canvas=canvas,
+    )
+
+
+def timing_words(timing: Timing, deviation: float | None = None) -> str:
+    """Summarise a recording's timing in words.
+
+    Args:
+        timing: of the recording.
+        deviation: standard deviation of its steps from the usual one [s]; None where it is not known.
+    """
+    worst = f"{number(1e3 * timing.largest)} ms"
+    words = f"{timing.recording}: {timing.samples} samples at {number(timing.rate, 5)} Hz; "
+    if timing.source == "cycle":
+        words += f"the latest cycle began {worst} late"
+        words += f", the longest computed {number(1e3 * timing.compute)} ms." if timing.compute is not None else "."
+    else:
+        words += (
+            f"the most uneven step is {worst} off ({number(100 * timing.largest * timing.rate, 2)} % of a period)"
+            f"{_typical(timing, deviation)}. The recording has no account of its cycles, so this is from its "
+        )
+        words += "stamps, and what was lost on the bus or did not answer is not known."
+    if timing.gap_count:
+        start, length = timing.gaps[0]
+        count = "one gap" if timing.gap_count == 1 else f"{timing.gap_count} gaps"
+        words += (
+            f" {count[0].upper()}{count[1:]}, the longest {number(length)} s, {number(start, 4)} s after the start."
+        )
+    else:
+        words += " No gaps."
+    if timing.lost is not None:
+        words += f" Frames lost: {timing.lost}."
+    if timing.invalid and not any(timing.invalid):
+        words += " Every axis answered in every cycle."
+    return words
+
+
+def _typical(timing: Timing, deviation: float | None) -> str:
+    if deviation is None:
+        return ""
+    return f"; their standard deviation is {number(100 * deviation * timing.rate, 2)} % of a period"
+
+
+_UNCERTAINTY_TOP, _UNCERTAINTY_HEIGHT, _UNCERTAINTY_BOTTOM = 42.0, 220.0, 40.0
+_KINDS = {"identified": "good", "weak": "doubt", "unidentified": "bad"}
+_LEAST_SHOWN = 0.2  # correlations below are not drawn
+_PAIRS = 5
+
+
+def relative_deviations(parameters: ParameterFile) -> Array:
+    """Return each standard deviation over the larger of the parameter's size and a negligible one; NaN if unknown."""
+    table = parameters.content["base_parameters"]
+    deviations = np.array([np.nan if one is None else one for one in table.get("standard_deviations", [])], float)
+    if len(deviations) != len(parameters.values):
+        return np.full(len(parameters.values), np.nan)
+    as_zero = np.array([0.0 if one is None else one for one in table.get("negligible", [0.0] * len(deviations))])
+    return np.asarray(deviations / np.maximum(np.maximum(np.abs(parameters.values), as_zero), np.finfo(float).tiny))
+
+
+def correlations(parameters: ParameterFile) -> Array | None:
+    """Return the correlation of the base parameters, (base, base), NaN where unseen; None without covariance."""
+    rows = parameters.content["base_parameters"].get("covariance")
+    if rows is None or any(len(row) != len(rows) for row in rows):
+        return None
+    covariance = np.array([[np.nan if value is None else value for value in row] for row in rows], float)
+    deviations = np.sqrt(np.where(np.diag(covariance) > 0.0, np.diag(covariance), np.nan))
+    return np.asarray(np.clip(covariance / np.outer(deviations, deviations), -1.0, 1.0))
+
+
+def strongest_pairs(correlation: Array) -> list[tuple[int, int, float]]:
+    """Return the pairs of parameters that are hardest to tell apart, the hardest first."""
+    rows, columns = np.tril_indices(len(correlation), -1)
+    values = np.nan_to_num(correlation[rows, columns])
+    order = np.argsort(-np.abs(values), kind="stable")[:_PAIRS]
+    return [(int(columns[k]), int(rows[k]), float(values[k])) for k in order]
+
+
+def deviation_figure(parameters: ParameterFile) -> Figure | None:
+    """Draw every parameter's relative standard deviation; None where the file has no deviations."""
+    shares = relative_deviations(parameters)
+    if not np.isfinite(shares).any():
+        return None
+    verdicts = parameters.content["base_parameters"].get("verdicts", [])
+    low, high = 1e-4, 10.0
+    shown = np.log10(np.clip(np.where(np.isnan(shares), high, shares), low, high))
+    canvas = Canvas(WIDTH, _UNCERTAINTY_TOP + _UNCERTAINTY_HEIGHT + _UNCERTAINTY_BOTTOM)
+    size = len(shares)
+    axes = Axes(
+        LEFT,
+        _UNCERTAINTY_TOP,
+        WIDTH - LEFT - RIGHT,
+        _UNCERTAINTY_HEIGHT,
+        0.0,
+        size + 1.0,
+        np.log10(low) - 0.1,
+        np.log10(high) + 0.1,
+    )
+    draw_key(
+        canvas, WIDTH - RIGHT, 16, [("dot" if kind == "good" else "area", kind, word) for word, kind in _KINDS.items()]
+    )
+    draw_frame(canvas, axes, x="number of the base parameter, as in the table", y="relative deviation", y_log=True)
+    for level in (IDENTIFIED_BELOW, WEAK_BELOW):
+        y = float(axes.y(np.log10(level)))
+        canvas.line("limit", LEFT, y, WIDTH - RIGHT, y)
+        canvas.text("soft halo", LEFT + 4, y - 3, f"{100 * level:g} %", size=FONT)
+    for place in range(size):
+        kind = _KINDS.get(verdicts[place] if place < len(verdicts) else "", "good")
+        # Shape repeats what colour shows: a ring would not be seen at this size, but a square is.
+        x, y = float(axes.x(place + 1)), float(axes.y(shown[place]))
+        if kind == "good":
+            canvas.circle(kind, x, y, 3.4)
+        else:
+            canvas.rectangle(kind, x - 3.6, y - 3.6, 7.2, 7.2)
+    counts = ", ".join(f"{verdicts.count(word)} {word}" for word in _KINDS)
+    blind = int(np.isnan(shares).sum())
+    words = f"Of {size} base parameters: {counts}." + (f" The recordings are blind to {blind}." if blind else "")
+    return Figure(
+        slug="deviations",
+        title="Relative standard deviation of every base parameter",
+        description=words,
+        caption=(
+            f"{words} Good: round dots below the lower line, where it is below {100 * IDENTIFIED_BELOW:g} % of "
+            "the parameter or of what is as good as zero. Bad: squares above the upper line; their values mean nothing."
+        ),
+        canvas=canvas,
+    )
+
+
+def correlation_figure(parameters: ParameterFile) -> Figure | None:
+    """Draw the lower half of the correlation matrix as a map; None where the file has no covariance."""
+    correlation = correlations(parameters)
+    if correlation is None:
+        return None
+    size = len(correlation)
+    side = WIDTH - LEFT - RIGHT
+    canvas = Canvas(WIDTH, _UNCERTAINTY_TOP + side + _UNCERTAINTY_BOTTOM)
+    axes = Axes(LEFT, _UNCERTAINTY_TOP, side, side, 0.5, size + 0.5, size + 0.5, 0.5)
+    draw_frame(canvas, axes, x="number of the base parameter", y="number of the base parameter")
+    draw_key(canvas, WIDTH - RIGHT, 16, [("area", "plus", "together"), ("area", "minus", "against each other")])
+    cell = side / size
+    levels = np.ceil(np.abs(np.nan_to_num(correlation)) * 5.0) * np.sign(np.nan_to_num(correlation))
+    levels[np.abs(np.nan_to_num(correlation)) < _LEAST_SHOWN] = 0
+    for row in range(size):
+        for begin, end, level in _runs(levels[row, :row]):
+            if level:
+                # Size of the mark, not only its colour, tells how strong.
+                high = cell * abs(level) / 5.0
+                top = _UNCERTAINTY_TOP + row * cell + 0.5 * (cell - high)
+                kind = "plus" if level > 0 else "minus"
+                canvas.rectangle(kind, LEFT + begin * cell, top, (end - begin) * cell, high)
+    canvas.line("frame", LEFT, _UNCERTAINTY_TOP, LEFT + side, _UNCERTAINTY_TOP + side)
+    pairs = strongest_pairs(correlation)
+    words = "Strongest: " + ", ".join(f"{i + 1} with {j + 1}: {number(value, 2)}" for i, j, value in pairs) + "."
+    return Figure(
+        slug="correlation",
+        title="Correlation of the base parameters",
+        description=words,
+        caption=(
+            f"{words if pairs else ''} Fuller marks are stronger, below {_LEAST_SHOWN:g} is none. Good: little but "
+            "specks. Bad: marks that fill their place (beyond 0.9), parameters that this motion cannot tell apart."
+        ).strip(),
+        canvas=canvas,
+    )
+
+
+def _runs(values: Array) -> Sequence[tuple[int, int, float]]:
+    """Return begin, end and value of every run of equal values."""
+    if not len(values):
+        return []
+    begins = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    ends = np.append(begins[1:], len(values))
+    return [(int(b), int(e), float(values[b])) for b, e in zip(begins, ends, strict=True)]
+
+
+_BODIES_TOP, _BODIES_BOTTOM = 42.0, 40.0
+_VIEWS = (("side", (0, 2)), ("above", (0, 1)))
+_AROUND = 0.35  # how much is shown around the arm, as a share of its extent
+_OUTLINE = 72  # corners of an ellipse
+_NAMES = "xyz"
+_SMALLEST = 0.01  # share of the picture below which nothing is seen beside the dot of the centre
+_BODIES_GOOD = (
+    "Each ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on. "
+    "Bad: flat, huge or far from their link, which means that the motion says little of how the mass is spread."
+)
+
+
+def body_figures(evidence: Evidence) -> list[Figure]:
+    """Return the arm from the side and from above; none where there are no link parameters."""
+    if evidence.posed is None:
+        return []
+    return [_bodies_figure(evidence.joints, evidence.posed, name, view) for name, view in _VIEWS]
+
+
+def ellipse(axes: Array, view: tuple[int, int]) -> Array:
+    """Return the outline of an ellipsoid seen along a base axis, about its centre [m], shape (corners, 2).
+
+    Args:
+        axes: half axes as rows [m], shape (3, 3).
+        view: the two axes of the base frame that are seen.
+    """
+    shadow = axes[:, list(view)]
+    values, vectors = np.linalg.eigh(shadow.T @ shadow)
+    angle = np.linspace(0.0, 2.0 * np.pi, _OUTLINE, endpoint=False)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray((circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def _bodies_figure(joints: tuple[str, ...], posed: Posed, name: str, view: tuple[int, int]) -> Figure:
+    low, high = posed.points.min(axis=0), posed.points.max(axis=0)
+    around = _AROUND * max(float((high - low).max()), 0.1)
+    side = WIDTH - LEFT - RIGHT
+    i, j = view
+    span = np.array([high[i] - low[i], high[j] - low[j]]) + 2.0 * around
+    scale = min(side / span[0], side / span[1])
+    height = float(np.clip(span[1] * scale, 0.5 * side, side))
+    half = 0.5 / scale * np.array([side, height])
+    middle = 0.5 * (low + high)[[i, j]]
+    canvas = Canvas(WIDTH, _BODIES_TOP + height + _BODIES_BOTTOM)
+    axes = Axes(LEFT, _BODIES_TOP, side, height, *(middle[0] + [-half[0], half[0]]), *(middle[1] + [-half[1], half[1]]))
+    _frame(canvas, axes, view)
+    draw_key(canvas, WIDTH - RIGHT, 16, [("area", "body", "link's body"), ("dot", "dot", "centre of mass")])
+    canvas.clip(axes)
+    longest = 2.0 * float(np.hypot(*half))
+    outside = [_draw(canvas, axes, view, body, longest) for body in posed.bodies]
+    for branch in posed.branches:
+        points = posed.points[list(branch)]
+        canvas.polyline("posture step7", axes.x(points[:, i]), axes.y(points[:, j]))
+    for body in posed.bodies:
+        if body.mass > 0.0:
+            canvas.circle("dot", float(axes.x(body.center[i])), float(axes.y(body.center[j])), 4.0)
+    base = posed.points[0]
+    canvas.rectangle("base", float(axes.x(base[i])) - 5, float(axes.y(base[j])) - 5, 10, 10)
+    for link, body in enumerate(posed.bodies):
+        if body.mass > 0.0 and not outside[link]:
+            x, y = float(axes.x(body.center[i])), float(axes.y(body.center[j]))
+            canvas.text("ink halo", x + 7, y - 6, joints[link][:20], size=FONT, hint=f"{body.mass:.3g} kg")
+    canvas.clip(None)
+    words = _words(joints, posed, outside, longest)
+    return Figure(
+        slug=f"bodies-{name}",
+        title=f"The arm and the ellipsoids of its links, from {'the side' if name == 'side' else name}",
+        description=words,
+        caption=f"{words} {_BODIES_GOOD}",
+        canvas=canvas,
+    )
+
+
+def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
+    """Draw round coordinates [m], equally far apart both ways."""
+    values = round_values(axes.low_x, axes.high_x, 6)
+    step = values[1] - values[0]
+    for value in values:
+        at = float(axes.x(value))
+        canvas.line("grid", at, axes.top, at, axes.top + axes.height)
+        canvas.text("soft", at, axes.top + axes.height + 15, number(value, 6), size=FONT, anchor="middle")
+    for value in step * np.arange(np.ceil(axes.low_y / step), np.floor(axes.high_y / step) + 1):
+        at = float(axes.y(value))
+        canvas.line("grid", axes.left, at, axes.left + axes.width, at)
+        canvas.text("soft", axes.left - 5, at + 4, number(float(value), 6), size=FONT, anchor="end")
+    canvas.rectangle("frame", axes.left, axes.top, axes.width, axes.height)
+    across, up = (f"{_NAMES[axis]} [m]" for axis in view)
+    middle = axes.left + axes.width / 2
+    canvas.text("soft", middle, axes.top + axes.height + 33, across, size=FONT, anchor="middle")
+    canvas.text("ink", axes.left, axes.top - 6, up, size=FONT)
+
+
+def _draw(canvas: Canvas, axes: Axes, view: tuple[int, int], body: Body, longest: float) -> bool:
+    """Draw a body's outline unless it is larger than the view; return whether its centre lies outside of the view."""
+    center = body.center[list(view)]
+    if body.axes is not None and _length(body.axes) <= longest:
+        outline = center + ellipse(body.axes, view)
+        canvas.polygon("body", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
+    inside = axes.low_x < center[0] < axes.high_x and axes.low_y < center[1] < axes.high_y
+    return not inside
+
+
+def _length(axes: Array) -> float:
+    """Return the largest diameter of an ellipsoid [m]."""
+    return 2.0 * float(np.linalg.norm(axes, axis=1).max())
+
+
+def _words(joints: tuple[str, ...], posed: Posed, outside: list[bool], longest: float) -> str:
+    masses = ", ".join(f"{name} {number(body.mass)} kg" for name, body in zip(joints, posed.bodies, strict=True))
+    words = f"One posture of the recordings. Masses, one feasible choice of many: {masses}."
+    if gone := [name for name, body in zip(joints, posed.bodies, strict=True) if body.axes is None]:
+        words += f" No mass distribution has the inertia of {', '.join(gone)}; only the centre is drawn."
+    lengths = [0.0 if body.axes is None else _length(body.axes) for body in posed.bodies]
+    if large := [f"{name} ({number(size)} m)" for name, size in zip(joints, lengths, strict=True) if size > longest]:
+        words += (
+            f" Longer than the picture ({number(longest)} m) and not drawn: the ellipsoid of {', '.join(large)}. "
+            "It is one body of many that move alike; --prior draws the choice to bodies that are known."
+        )
+    tiny = _SMALLEST * longest
+    if small := [name for name, size in zip(joints, lengths, strict=True) if 0.0 < size < tiny]:
+        words += f" Too small to be seen (shorter than {number(tiny)} m): the ellipsoid of {', '.join(small)}."
+    if far := [name for name, away in zip(joints, outside, strict=True) if away]:
+        words += f" The centre of {', '.join(far)} lies outside of the picture."
+    return words
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from ident_service.results.drawing import plain
+from ident_service.results.plots import plain
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,225 @@
+"""Register and run the verbs that keep results: `accept`, `rollback`, `import`, `prune`, `backup`, `restore`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pwd
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ident_service.cli.arguments import Parser, Verbs, count
+from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
+from ident_service.errors import IdentError, UsageError
+
+_LONGEST_NAME = 80
+_PATIENCE = 1.0  # s to wait for a locked registry when an act that is done is entered in the audit trail
+
+
+def add_by(sub: Parser) -> None:
+    """Add the option `--by`, the name of the person who acts, to a verb."""
+    sub.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in with)")
+
+
+def at_terminal(arguments: argparse.Namespace) -> str:
+    """Return the audit-trail name `terminal:NAME` of the person at the terminal; no token has such a name.
+
+    Raises:
+        UsageError: no name.
+    """
+    if getattr(arguments, "by", None) is not None:
+        name = arguments.by.strip()
+    else:
+        try:
+            name = pwd.getpwuid(os.getuid()).pw_name
+        except KeyError:
+            name = str(os.getuid())
+    if not name or len(name) > _LONGEST_NAME:
+        raise UsageError(f"--by needs a name of 1 to {_LONGEST_NAME} characters")
+    return f"terminal:{name}"
+
+
+def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
+    """Enter an act that was done at a terminal in the audit trail, where the state folder has one.
+
+    It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
+
+    Args:
+        arguments: of the verb.
+        what: one word or two that name the act, as in the daemon's own lines.
+        about: name of the arm.
+        detail: JSON values.
+    """
+    import sqlite3
+
+    from ident_service.registry.database import FILE, Database, enter_waiting, note, note_later, registry_error
+
+    state = state_folder(arguments)
+    try:
+        if not (state / FILE).is_file():
+            return
+        try:
+            with Database(state, busy=_PATIENCE) as db:
+                enter_waiting(db, state)
+                note(db, at_terminal(arguments), what, about, **detail)
+        except sqlite3.Error as error:
+            raise registry_error(state / FILE, error) from None
+    except (IdentError, OSError) as error:
+        try:
+            note_later(state, at_terminal(arguments), what, about, **detail)
+        except (IdentError, OSError) as refusal:
+            print_to_person(f"ident: done, but not entered in the audit trail: {error}; {refusal}\n")
+        else:
+            print_to_person(f"ident: done, but not entered in the audit trail yet; its line follows: {error}\n")
+
+
+def add(verbs: Verbs) -> None:
+    """Register `accept`, `rollback`, `import`, `prune`, `delete`, `backup` and `restore`."""
+    sub = verbs.add("accept", _accept, "make a run's parameters the arm's current ones; earlier sets are kept")
+    sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
+    sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
+    add_by(sub)
+    sub = verbs.add("rollback", _rollback, "make an earlier accepted set the current one again")
+    sub.add_argument("arm", metavar="NAME", help="of the arm")
+    sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
+    sub.add_argument("--to", type=count, metavar="NUMBER", help="acceptance (default: before the current set's)")
+    add_by(sub)
+    sub = verbs.add("import", _import, "a run folder from another machine: verified, copied below the state folder")
+    sub.add_argument("run", type=Path, metavar="RUNFOLDER")
+    add_by(sub)
+    sub = verbs.add("prune", _prune, "let recordings go of runs that nobody accepted; deletes only with --yes")
+    sub.add_argument("--keep", type=count, required=True, metavar="N", help="newest runs of each arm keep theirs")
+    sub.add_argument("--yes", action="store_true", help="DELETE them")
+    add_by(sub)
+    delete = verbs.group("delete", "a run, a motion or an arm of the registry; what refers to it is named first")
+    for kind in ("run", "motion", "arm"):
+        sub = delete.add(kind, _delete, f"delete one {kind} and its files")
+        sub.add_argument("name", metavar="NAME" if kind == "arm" else "ID")
+        sub.add_argument("--anyway", action="store_true", help="although something refers to it")
+        add_by(sub)
+    sub = verbs.add("backup", _backup, "the state folder as one file: registry, documents, recordings, hashes")
+    sub.add_argument("file", type=Path, metavar="FILE", help="which must not exist; a daemon may serve meanwhile")
+    sub.add_argument("--without-recordings", action="store_true", help="the copy's registry calls them deleted")
+    add_by(sub)
+    sub = verbs.add("restore", _restore, "a backup into the state folder, checked first; no daemon may serve it")
+    sub.add_argument("file", type=Path, metavar="FILE")
+    sub.add_argument("--replace", action="store_true", help="move what is there into a folder replaced-... in it")
+    add_by(sub)
+
+
+def _accept(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.acceptance import CURRENT, PARAMETERS, accept
+    from ident_service.registry.database import Database
+    from ident_service.registry.state_folder import arm_folder
+
+    state = own_state_folder(arguments)
+    with Database(state) as db:
+        act = accept(db, state, arguments.run.resolve(), arguments.note, at_terminal(arguments))
+    path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
+    return DONE, f"{act.arm}: acceptance {act.number}; current: {path}\n", {**asdict(act), "current": str(path)}
+
+
+def _rollback(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.acceptance import CURRENT, PARAMETERS, rollback
+    from ident_service.registry.database import Database
+    from ident_service.registry.state_folder import arm_folder
+
+    state = own_state_folder(arguments)
+    with Database(state) as db:
+        act = rollback(db, state, arguments.arm, arguments.note, at_terminal(arguments), arguments.to)
+    path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
+    text = f"{act.arm}: acceptance {act.number} is the set of {act.origin} ({act.run}); current: {path}\n"
+    return DONE, text, {**asdict(act), "current": str(path)}
+
+
+def _import(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.run_archive import import_run
+    from ident_service.registry.database import Database
+    from ident_service.registry.runs import RUNS
+
+    state = own_state_folder(arguments)
+    with Database(state) as db:
+        row = import_run(db, state, arguments.run, at_terminal(arguments))
+    folder = state / RUNS / row["id"]
+    return (
+        DONE,
+        f"{row['id']}: every file is what its manifest names\nfiles: {folder}\n",
+        {
+            **row,
+            "folder": str(folder),
+        },
+    )
+
+
+def _prune(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.run_archive import expendable, let_go
+    from ident_service.registry.database import Database
+    from ident_service.registry.runs import rebuild_runs
+
+    state = own_state_folder(arguments)
+    with Database(state) as db:
+        untold = rebuild_runs(db, state)
+        gone = (
+            let_go(db, state, arguments.keep, at_terminal(arguments))
+            if arguments.yes
+            else expendable(db, state, arguments.keep)
+        )
+    document = {
+        "deleted": arguments.yes,
+        "bytes": sum(one.bytes for one in gone),
+        "recordings": [asdict(one) for one in gone],
+        "left_alone": untold,
+    }
+    return DONE, pruned_text(document), document
+
+
+def _delete(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations import deletion
+    from ident_service.registry.database import Database
+
+    kind, state = arguments.word.rpartition(" ")[2], own_state_folder(arguments)
+    delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
+    with Database(state) as db:
+        found = delete(db, state, arguments.name, at_terminal(arguments), anyway=arguments.anyway)
+    document = {"deleted": arguments.name, "dependents": [asdict(one) for one in found]}
+    return DONE, deleted_text(document), document
+
+
+def _backup(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.backup import back_up
+
+    made = back_up(own_state_folder(arguments), arguments.file, recordings=not arguments.without_recordings)
+    note_act(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
+    return DONE, f"{made.file}: {made.files} files, {made.bytes / 2**20:.1f} MiB\n", asdict(made)
+
+
+def _restore(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.backup import restore
+
+    state = own_state_folder(arguments)
+    done = restore(arguments.file, state, at_terminal(arguments), replace=arguments.replace)
+    when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
+    text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
+    text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"
+    text += (
+        "tokens that were revoked since then count again (ident token list), the owner's does not: the daemon writes "
+    )
+    text += "a new one; each arm needs a new preflight\n"
+    return DONE, text, {**asdict(done), "state": str(state)}
+
+
+def deleted_text(document: Mapping[str, Any]) -> str:
+    """Format the answer of `delete`: what was deleted, and what becomes of the entries that referred to it."""
+    lines = "".join(f"  {one['kind']} {one['id']}: {one['becomes']}\n" for one in document["dependents"])
+    return f"{document['deleted']}: deleted\n{lines}"
+
+
+def pruned_text(document: Mapping[str, Any]) -> str:
+    """Format the answer of `prune`: the recordings that were deleted, or would be."""
+    gone, verb = document["recordings"], "deleted" if document["deleted"] else "would be deleted; say --yes"
+    text = "".join(f"{one['run']}/{one['name']}  {one['bytes'] / 2**20:.1f} MiB\n" for one in gone)
+    text += "".join(f"left alone: {line}\n" for line in document["left_alone"])
+    return f"{text}{len(gone)} recordings, {document['bytes'] / 2**20:.1f} MiB, {verb}\n"

@@ -1,0 +1,105 @@
+"""Register and run the verbs about the daemon: `serve`, and `token` for its access tokens."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ident_service.cli.archive_commands import add_by, at_terminal
+from ident_service.cli.arguments import Verbs
+from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
+
+_PORT = 8470
+
+
+def add(verbs: Verbs) -> None:
+    """Register `serve`, `token add`, `token list` and `token revoke`."""
+    sub = verbs.add("serve", _serve, "the daemon: API, jobs and registry of the state folder")
+    sub.add_argument("--host", default="127.0.0.1", help="address to listen on; any but a loopback one needs TLS")
+    sub.add_argument("--port", type=_port, default=_PORT, help=f"default {_PORT}; 0 for any that is free")
+    sub.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
+    sub.add_argument("--tls-key", type=Path, metavar="FILE", help="its key, PEM")
+    sub.add_argument("--name", action="append", default=[], metavar="HOST", help="host name that clients use, too")
+    sub.add_argument("--motion-door", type=Path, metavar="SOCKET", help="of the unit that motions run in")
+
+    sub.add_argument(
+        "--webhook", metavar="URL", help="is told what is due, and of drift; https, or http to this machine"
+    )
+    sub.add_argument("--webhook-secret", type=Path, metavar="FILE", help="which notices are signed with; chmod 600")
+
+    token = verbs.group("token", "who may talk to the daemon")
+    sub = token.add("add", _add, "make a token and print it; nothing can print it again")
+    sub.add_argument("name", metavar="NAME", help="which the audit trail will show")
+    sub.add_argument("--role", choices=["viewer", "operator"], required=True)
+    add_by(sub)
+    token.add("list", _list, "names and roles")
+    sub = token.add("revoke", _revoke, "let a token, and the sessions that it began, count no more")
+    sub.add_argument("name", metavar="NAME")
+    add_by(sub)
+
+
+def _serve(arguments: argparse.Namespace) -> Answer:
+    from ident_service.daemon.serve import log_as_json, serve
+    from ident_service.daemon.settings import Settings
+
+    state = state_folder(arguments).absolute()
+    settings = Settings(
+        state,
+        host=arguments.host,
+        port=arguments.port,
+        tls_cert=arguments.tls_cert,
+        tls_key=arguments.tls_key,
+        names=tuple(arguments.name),
+        motion_door=arguments.motion_door,
+        webhook=arguments.webhook,
+        webhook_secret=arguments.webhook_secret,
+    )
+    log_as_json()
+    serve(settings, lambda url: print_to_person(f"ident: {url}, state {state}, token in {state / 'token'}\n"))
+    return DONE, "", {"state": str(state)}
+
+
+def _add(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.database import Database
+    from ident_service.registry.tokens import add_token
+
+    with Database(own_state_folder(arguments)) as db:
+        secret = add_token(db, arguments.name, arguments.role, at_terminal(arguments))
+    return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
+
+
+def _list(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.database import Database
+    from ident_service.registry.tokens import tokens
+
+    with Database(own_state_folder(arguments)) as db:
+        rows = tokens(db)
+    return (
+        DONE,
+        "".join(map(token_line, rows)) or "no tokens yet; `ident serve` makes the first\n",
+        {"tokens": [dict(r) for r in rows]},
+    )
+
+
+def token_line(row: Mapping[str, Any]) -> str:
+    """Format one access token as a line of the list."""
+    since = datetime.fromtimestamp(row["created"], UTC).strftime("%Y-%m-%d")
+    return f"{row['name']:<24} {row['role']:<9} since {since}{', revoked' if row['revoked'] else ''}\n"
+
+
+def _revoke(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.database import Database
+    from ident_service.registry.tokens import revoke_token
+
+    with Database(own_state_folder(arguments)) as db:
+        revoke_token(db, arguments.name, at_terminal(arguments))
+    return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
+
+
+def _port(text: str) -> int:
+    if not text.isdigit() or int(text) > 65535:
+        raise argparse.ArgumentTypeError("a port is a number from 0 to 65535")
+    return int(text)

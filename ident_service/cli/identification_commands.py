@@ -1,0 +1,427 @@
+"""Commands that make or judge parameters, from `simulate` and `identify` to `compare`, `export` and `report`."""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import gc
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.arguments import FEASIBLE_SETS, Verbs, columns_files, delay, replicates, seed, weight
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
+from ident_service.errors import ParameterError, UsageError
+from ident_service.model.notation import NOTATIONS
+
+if TYPE_CHECKING:
+    from ident_service.estimation.identify import Estimate
+
+
+_COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
+
+
+def _add_commission(verbs: Verbs) -> None:
+    """Register `simulate` and `identify`."""
+    sub = verbs.add("simulate", _simulate, "the whole job on a simulated arm, scored against the known truth")
+    sub.add_argument("arm", nargs="?", default="wam7_sim", metavar="ARM", help="description with a simulated driver")
+    sub.add_argument("--out", type=Path, help="run folder; must not exist (default: below the state folder)")
+    sub.add_argument("--motion", type=Path, metavar="MOTION", help="motion.json to identify from (default: the arm's)")
+    sub.add_argument("--seed", type=seed, help="seed of the simulated arm's noise (default: the description's)")
+    sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"])
+
+    sub = verbs.add("identify", _identify, "recordings to parameters.json, URDF and report")
+    sub.add_argument(
+        "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@41:60 reads 41 s to 60 s of it"
+    )
+    sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument(
+        "--validate", action="append", default=[], type=Path, metavar="RECORDING", help="judge on this one too"
+    )
+    sub.add_argument(
+        "--columns",
+        action="append",
+        default=[],
+        metavar="[RECORDING=]FILE",
+        help="YAML that says how the recordings are laid out, or RECORDING alone; may be repeated",
+    )
+    sub.add_argument(
+        "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
+    )
+    sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
+    sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
+    sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
+    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, 'estimate' or 'choose'")
+    sub.add_argument(
+        "--bootstrap", type=replicates, default=0, metavar="N", help="replicates of the constrained estimate"
+    )
+    sub.add_argument("--essential", action="store_true", help="also the smallest model that predicts as well")
+    sub.add_argument("--sdpa", action="store_true", help="also the problems in SDPA format, for other solvers")
+    sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"], help="default: the arm's; none: unconstrained")
+    sub.add_argument(
+        "--second-opinion", action="store_true", help="solve the constrained problem again, in cvxpy, and compare"
+    )
+    sub.add_argument(
+        "--solver", metavar="NAME", help="of cvxpy, for constraints.custom and the second opinion (default: clarabel)"
+    )
+    sub.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where results go, in the place of an earlier result (default: a new folder below the state folder)",
+    )
+
+
+def _simulate(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.excitation.motion_file import read_excitation
+    from ident_service.operations.commissioning import score_document, simulate
+    from ident_service.operations.identification import custom_of
+    from ident_service.registry.state_folder import new_run_folder
+    from ident_service.results.summary import summary
+
+    config = described = load_arm(arguments.arm)
+    if arguments.seed is not None and config.driver is not None:
+        config = config.model_copy(update={"driver": config.driver.model_copy(update={"seed": arguments.seed})})
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), config.name)
+    stopping = StopOnSignal()
+    with stopping:
+        result = simulate(
+            config,
+            folder,
+            motion=None if arguments.motion is None else read_excitation(arguments.motion),
+            set_name=arguments.feasible_set,
+            described=described,
+            custom=custom_of(arguments.arm, described),
+            tell=lambda line: tell(arguments, line),
+            stop_requested=stopping.requested,
+        )
+    scored, estimate = result.score, result.estimate
+    lines = [
+        "",
+        summary(estimate, result.unusable),
+        "score against the truth, which the estimate never saw",
+        f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
+        f"  validation residual over what the true parameters leave: {scored.residual_ratio:.4f}",
+        f"  worst identified parameter: {scored.worst_identified:.2f} deviations off, {scored.worst_expression}",
+        "",
+        f"files: {result.folder}",
+        *(f"  {path.name}" for path in sorted(result.folder.iterdir())),
+        "",
+    ]
+    document = {"folder": str(result.folder), "score": score_document(scored)}
+    document |= _estimate_document(estimate, result.unusable)
+    return _exit_code(estimate, result.unusable), "\n".join(lines), document
+
+
+@contextmanager
+def _few_collections() -> Iterator[None]:
+    """Look for garbage hardly ever: modules make objects that stay, and looks at them are a twentieth of the time."""
+    atexit.register(gc.freeze)  # nor when the process ends
+    usual = gc.get_threshold()
+    gc.set_threshold(_COLLECT_AFTER, *usual[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*usual)
+
+
+@_few_collections()
+def _identify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.operations.identification import Request, identify_files
+    from ident_service.registry.state_folder import new_run_folder
+    from ident_service.results.summary import summary
+
+    columns, columns_of = columns_files(arguments.columns)
+    request = Request(
+        arm=arguments.arm,
+        recordings=tuple(arguments.recordings),
+        validation=tuple(arguments.validate),
+        columns=columns,
+        columns_of=columns_of,
+        cut_standstill=arguments.cut_standstill,
+        method=arguments.method,
+        set_name=arguments.feasible_set,
+        prior=arguments.prior,
+        prior_weight=arguments.prior_weight,
+        delay=arguments.delay,
+        replicates=arguments.bootstrap,
+        essential=arguments.essential,
+        sdpa=arguments.sdpa,
+        solver=arguments.solver,
+        second_opinion=arguments.second_opinion,
+    )
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name)
+    result = identify_files(request, folder, lambda line: tell(arguments, line))
+    estimate = result.estimate
+    sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
+    text = summary(estimate, result.unusable, result.torque)
+    text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
+    document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
+    document["torque"] = result.torque
+    document |= _estimate_document(estimate, result.unusable)
+    return _exit_code(estimate, result.unusable), text, document
+
+
+def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
+    return DONE if estimate.feasible and not unusable else VERDICT_NO
+
+
+def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.parameter_file import convex_document
+    from ident_service.results.summary import how_fitted, implausible_links
+
+    own = estimate.candidates[estimate.chosen]
+    return {
+        "arm": estimate.model.config.name,
+        "usable": estimate.feasible and not unusable,
+        "unusable": list(unusable),
+        "feasible": estimate.feasible,
+        "margin": estimate.margin,
+        "relative_error_percent": own.identification.relative_percent,
+        "implausible_links": list(implausible_links(estimate)),
+        "rows_and_filter": list(how_fitted(estimate)),
+        "validation": [
+            {"recording": score.recording, "relative_error_percent": score.error.relative_percent}
+            for score in own.validation
+        ],
+        "candidates": [
+            {
+                "name": candidate.name,
+                "feasible": candidate.margin > 0.0,
+                "margin": candidate.margin,
+                "relative_error_percent": candidate.identification.relative_percent,
+            }
+            for candidate in estimate.candidates
+        ],
+        "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+        **convex_document(estimate),
+    }
+
+
+def _add_comparing(verbs: Verbs) -> None:
+    """Register `compare` and `payload`."""
+    sub = verbs.add("compare", _compare, "has the arm changed? (exit code 3: yes, or it cannot be said)")
+    sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
+    sub.add_argument("others", type=Path, nargs="+", metavar="B", help="what is compared with it")
+    out = sub.add_mutually_exclusive_group()
+    out.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON, text and page")
+    out.add_argument("--keep", action="store_true", help="in the folder B itself, named by its manifest; one B")
+
+    sub = verbs.add("payload", _payload, "what does an identified arm carry? (exit code 3: nothing, or no real body)")
+    sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")
+    sub.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help="with the load; or FILE@41:60")
+    sub.add_argument("--refit-offsets", action="store_true", help="torque offsets may differ from the arm's")
+    sub.add_argument(
+        "--out", type=Path, metavar="DIR", help="where results go (default: a new folder below the state folder)"
+    )
+
+
+def _compare(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.parameter_files import KEPT, compare_files, compare_into
+    from ident_service.results.comparison.presentation import comparison_document, comparison_text
+
+    if arguments.keep:
+        if len(arguments.others) != 1 or not arguments.others[0].is_dir():
+            raise UsageError("--keep is for one folder of results that is compared with the reference")
+        folder = arguments.others[0]
+        comparison, files = compare_into(arguments.reference, folder), tuple(folder / name for name in KEPT)
+    else:
+        comparison, files = compare_files([arguments.reference, *arguments.others], arguments.out)
+    text = comparison_text(comparison) + "".join(f"file: {path}\n" for path in files)
+    document = comparison_document(comparison) | {"files": [str(path) for path in files]}
+    return (DONE if comparison.verdict == "unchanged" else VERDICT_NO), text, document
+
+
+def _payload(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.parameter_files import payload_files
+    from ident_service.registry.state_folder import new_run_folder
+    from ident_service.results.comparison.presentation import comparison_text
+
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "payloads")
+    found = payload_files(arguments.run, arguments.recordings, folder, refit_offsets=arguments.refit_offsets)
+    text = found.text
+    if found.comparison is not None:
+        text += "\n" + comparison_text(found.comparison)
+    text += f"files: {folder}\n" + "".join(f"  {name}\n" for name in found.files)
+    code = DONE if found.payload.verdict in ("added", "removed") else VERDICT_NO
+    return code, text, found.document | {"folder": str(folder), "files": list(found.files)}
+
+
+def _add_parameters(verbs: Verbs) -> None:
+    """Register `base`, `feasible`, `correct` and `verify`."""
+    sub = verbs.add("base", _base, "base parameters and their expressions")
+    sub.add_argument("arm", metavar="ARM")
+
+    sub = verbs.add("feasible", _feasible, "could a real body have these parameters? (exit code 3: no)")
+    sub.add_argument("file", type=Path, metavar="FILE")
+    sub.add_argument("--feasible-set", choices=FEASIBLE_SETS)
+    sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
+    sub.add_argument("--notation", choices=NOTATIONS, help="of the file's names, where it is not ours")
+
+    sub = verbs.add("correct", _correct, "the nearest feasible parameters")
+    sub.add_argument("file", type=Path, metavar="FILE")
+    sub.add_argument("--metric", choices=["euclidean", "covariance"], default="euclidean", help="what nearest means")
+    sub.add_argument("--out", type=Path, required=True, metavar="FILE")
+    sub.add_argument("--feasible-set", choices=FEASIBLE_SETS)
+    sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
+    sub.add_argument("--notation", choices=NOTATIONS, help="of the file's names, where it is not ours")
+
+    sub = verbs.add(
+        "verify", _verify, "check a certificate in exact arithmetic (exit code 3: infeasible, or not valid)"
+    )
+    sub.add_argument("file", type=Path, metavar="FILE", help="parameters.json, or the folder that holds it")
+    sub.add_argument(
+        "--arm",
+        metavar="ARM",
+        help="description that the conditions must come from; without it, a file is held against its own conditions",
+    )
+
+
+def _base(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.model.arm_model import arm_model
+    from ident_service.model.base_parameters import base_parameters, remarks_on_angles
+
+    model = arm_model(load_arm(arguments.arm))
+    base = base_parameters(model.chain, model.layout)
+    warnings = remarks_on_angles(base)
+    text = "".join(f"{number:4d}  {expression}\n" for number, expression in enumerate(base.expressions, 1))
+    text += f"{base.size} base parameters of {len(base.names)} link parameters\n"
+    text += "".join(f"WARNING: {line}\n" for line in warnings)
+    return (
+        DONE,
+        text,
+        {
+            "arm": model.config.name,
+            "warnings": list(warnings),
+            "link_parameters": list(base.names),
+            "base_parameters": {"expressions": list(base.expressions), "units": list(base.units)},
+        },
+    )
+
+
+def _feasible(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.parameter_files import check_file
+
+    tested = check_file(arguments.file, arguments.feasible_set, arguments.arm, arguments.notation)
+    result = tested.result
+    word = "feasible" if result.feasible else "INFEASIBLE"
+    text = f"{arguments.file}: {word} ({tested.kind}), margin {result.margin:.6g}\n"
+    if not result.feasible:
+        text += "contradicted by:\n" + "".join(f"  {name}\n" for name in result.tight)
+    text += "".join(f"note: {note}\n" for note in tested.notes)
+    document = {
+        "file": str(arguments.file),
+        "feasible_set": tested.kind,
+        "feasible": result.feasible,
+        "margin": result.margin,
+        "tight": list(result.tight),
+        "notes": list(tested.notes),
+    }
+    return (DONE if result.feasible else VERDICT_NO), text, document
+
+
+def _correct(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.parameter_files import correct_file
+
+    corrected = correct_file(
+        arguments.file, arguments.out, arguments.feasible_set, arguments.arm, arguments.metric, arguments.notation
+    )
+    result = corrected.result
+    text = (
+        f"{arguments.out}: feasible ({corrected.kind}), margin {result.margin:.3g}, "
+        f"{result.objective:.6g} away from {arguments.file} in the {arguments.metric} metric\n"
+    )
+    text += "".join(f"note: {note}\n" for note in corrected.notes)
+    document = {
+        "file": str(arguments.out),
+        "feasible_set": corrected.kind,
+        "distance": result.objective,
+        "margin": result.margin,
+        "values": result.beta.tolist(),
+        "notes": list(corrected.notes),
+    }
+    return DONE, text, document
+
+
+def _verify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.certificate_verifier import answer_text
+    from ident_service.operations.verify import verify_file
+
+    result = verify_file(arguments.file, arguments.arm)
+    if result.verdict == "failed" and result.message.startswith("not a parameter file"):
+        raise ParameterError(f"{arguments.file}: {result.message}")
+    document = {
+        "file": str(arguments.file),
+        "arm": result.arm,
+        "verdict": result.verdict,
+        "message": result.message,
+        "checked": list(result.checked),
+    }
+    return (DONE if result.verdict == "feasible" else VERDICT_NO), answer_text(arguments.file, result), document
+
+
+_FORMATS = "urdf,mjcf,sdf,json,csv,c"
+
+
+def _add_exports(verbs: Verbs) -> None:
+    """Register `export`."""
+    sub = verbs.add("export", _export, "identified parameters for other tools, each file read back and checked")
+    sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of `identify` or `simulate`")
+    sub.add_argument("--format", default=_FORMATS, metavar="LIST", help=f"with commas between (default: {_FORMATS})")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
+
+
+def _export(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.state_folder import new_run_folder
+    from ident_service.results.export.formats import export_run, known_formats
+
+    formats = known_formats(arguments.format)
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "exports")
+    made = export_run(arguments.run, formats, folder)
+    lines, files = [f"files: {folder}"], []
+    for export in made:
+        lines.append(f"  {export.name} ({export.format})")
+        lines += [f"    has no place for: {what}" for what in export.not_carried]
+        lines += [f"    {note}" for note in export.notes]
+        entry: dict[str, Any] = {"format": export.format, "file": export.name}
+        files.append({**entry, "not_carried": list(export.not_carried), "notes": list(export.notes)})
+    return DONE, "\n".join(lines) + "\n", {"folder": str(folder), "files": files}
+
+
+def _add_results(verbs: Verbs) -> None:
+    """Register `report` and `figures`."""
+    sub = verbs.add("report", _report, "the report of a folder of results, as one page without network")
+    sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
+    sub.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the folder")
+
+    sub = verbs.add("figures", _figures, "the drawings of a report as files, for papers and tickets")
+    sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
+    sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
+
+
+def _report(arguments: argparse.Namespace) -> Answer:
+    from ident_service.results.report_files import make_report
+
+    page = make_report(arguments.run, arguments.out)
+    size = page.stat().st_size
+    return DONE, f"{page}: {size / 1e6:.2f} MB\n", {"file": str(page), "bytes": size}
+
+
+def _figures(arguments: argparse.Namespace) -> Answer:
+    from ident_service.results.report_files import write_figures
+
+    names = write_figures(arguments.run, arguments.out, arguments.format)
+    text = f"files: {arguments.out}\n" + "".join(f"  {name}\n" for name in names)
+    return DONE, text, {"folder": str(arguments.out), "files": names}
+
+
+def add(verbs: Verbs) -> None:
+    """Register the verbs of this module."""
+    for register in (_add_commission, _add_comparing, _add_parameters, _add_exports, _add_results):
+        register(verbs)

@@ -1,0 +1,199 @@
+"""Register and run the verbs about scheduled re-identification: `schedule`, `maintenance`, `due`, `alarm`.
+
+They work on the registry of the state folder; a daemon that serves it sees what they wrote within a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.archive_commands import add_by, at_terminal
+from ident_service.cli.arguments import Parser, Verbs, count
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, own_state_folder, state_folder
+
+if TYPE_CHECKING:
+    from ident_service.registry.database import Database, Row
+
+
+def add(verbs: Verbs) -> None:
+    """Register `schedule`, `maintenance`, `due` and `alarm`."""
+    group = verbs.group("schedule", "when an arm is to be re-identified")
+    sub = group.add("add", _add, "add a time or a trigger; what is due asks for a person")
+    _arm(sub)
+    when = sub.add_mutually_exclusive_group(required=True)
+    when.add_argument("--cron", metavar="FIELDS", help="five fields, UTC: '0 6 * * mon'")
+    when.add_argument("--hours", type=float, metavar="H", help="of operation, as runs of this registry count them")
+    when.add_argument("--maintenance", action="store_true", help="after each `ident maintenance`")
+    sub.add_argument("--motion", metavar="ID", help="of a motion of the registry; default: the description's")
+    add_by(sub)
+    sub = group.add("list", _list, "schedules, and when they are due")
+    sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
+    for name, verb, text in (
+        ("remove", _remove, "take one away"),
+        ("enable", _enable, "let one count again from now"),
+        ("disable", _disable, "let one count no more"),
+    ):
+        sub = group.add(name, verb, text)
+        sub.add_argument("number", type=count, metavar="NUMBER")
+        add_by(sub)
+    sub = verbs.add("maintenance", _maintenance, "enter that maintenance was done")
+    _arm(sub)
+    sub.add_argument("--what", required=True, help='a few words: "gear oil changed"')
+    sub.add_argument("--note", default="", help="more of it")
+    add_by(sub)
+    group = verbs.group("due", "what is due")
+    sub = group.add("list", _due, "what asks for a person")
+    sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
+    _remark(group.add("dismiss", _dismiss, "it is not to be done"))
+    group = verbs.group("alarm", "drift alarms")
+    sub = group.add("list", _alarms, "alarms that stand (exit code 3: there are some)")
+    sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
+    _remark(group.add("ack", _ack, "a person knows of it; the accepted set stays as it is"))
+
+
+def registry(arguments: argparse.Namespace) -> Database:
+    """Open the registry of the state folder, with the shipped arms entered."""
+    from ident_service.registry.arms import know_shipped
+    from ident_service.registry.database import Database
+
+    db = Database(own_state_folder(arguments))
+    know_shipped(db)
+    return db
+
+
+def _arm(sub: Parser) -> None:
+    sub.add_argument("arm", metavar="NAME", help="of an arm that the registry knows: shipped, or uploaded to a daemon")
+
+
+def _remark(sub: Parser) -> None:
+    sub.add_argument("number", type=count, metavar="NUMBER")
+    sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
+    add_by(sub)
+
+
+def _known(db: Database, arguments: argparse.Namespace) -> str:
+    from ident_service.registry.arms import known_arm
+
+    return known_arm(db, state_folder(arguments), arguments.arm).name
+
+
+def _add(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.maintenance_schedule import When, add_schedule
+
+    when = When(arguments.cron, arguments.hours, arguments.maintenance)
+    with registry(arguments) as db:
+        name = _known(db, arguments)
+        row = add_schedule(db, name, when, at_terminal(arguments), time.time(), arguments.motion)
+    return DONE, schedule_line(row), _shown(row)
+
+
+def _list(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.maintenance_schedule import schedules
+
+    with registry(arguments) as db:
+        rows = schedules(db, arguments.arm)
+    return (
+        DONE,
+        "".join(map(schedule_line, rows)) or "nothing is scheduled\n",
+        {"schedules": [_shown(row) for row in rows]},
+    )
+
+
+def _remove(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.maintenance_schedule import remove_schedule
+
+    with registry(arguments) as db:
+        remove_schedule(db, arguments.number, at_terminal(arguments))
+    return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
+
+
+def _enable(arguments: argparse.Namespace) -> Answer:
+    return _enabled(arguments, enabled=True)
+
+
+def _disable(arguments: argparse.Namespace) -> Answer:
+    return _enabled(arguments, enabled=False)
+
+
+def _enabled(arguments: argparse.Namespace, *, enabled: bool) -> Answer:
+    from ident_service.operations.maintenance_schedule import enable_schedule
+
+    with registry(arguments) as db:
+        row = enable_schedule(db, arguments.number, at_terminal(arguments), time.time(), enabled=enabled)
+    return DONE, schedule_line(row), _shown(row)
+
+
+def _maintenance(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.maintenance_schedule import add_event, dues
+
+    with registry(arguments) as db:
+        name = _known(db, arguments)
+        row = add_event(db, name, arguments.what, arguments.note, at_terminal(arguments), time.time())
+        due = dues(db, name)
+    text = f"{name}: entered: {row['what']}\n" + "".join(due_line(one) for one in due)
+    if not due:
+        text += f"nothing is due by it; `ident schedule add {name} --maintenance` would make it so\n"
+    return DONE, text, {**row, "due": [dict(one) for one in due]}
+
+
+def _due(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.maintenance_schedule import dues
+
+    with registry(arguments) as db:
+        rows = dues(db, arguments.arm)
+    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": [dict(row) for row in rows]}
+
+
+def _dismiss(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.maintenance_schedule import dismiss
+
+    with registry(arguments) as db:
+        dismiss(db, arguments.number, arguments.note, at_terminal(arguments), time.time())
+    return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
+
+
+def _alarms(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.drift_alarms import alarms
+
+    with registry(arguments) as db:
+        rows = alarms(db, arguments.arm)
+    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": [dict(row) for row in rows]}
+
+
+def _ack(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.drift_alarms import acknowledge_alarm
+
+    with registry(arguments) as db:
+        row = acknowledge_alarm(db, arguments.number, arguments.note, at_terminal(arguments), time.time())
+    return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", dict(row)
+
+
+def _shown(row: Row) -> dict[str, Any]:
+    hidden = {"request", "counted"}
+    return {key: value for key, value in row.items() if key not in hidden} | {"enabled": bool(row["enabled"])}
+
+
+def schedule_line(row: Row) -> str:
+    """Format one schedule as a line for a person."""
+    when = f"cron {row['cron']} (UTC)" if row["cron"] else str(row["trigger"])
+    coming = f", next {_day(row['next'])}" if row["cron"] and row["enabled"] else ""
+    return f"{row['id']:>4}  {row['arm']:<16} {when}{coming}{'' if row['enabled'] else ', disabled'}\n"
+
+
+def due_line(row: Row) -> str:
+    """Format one re-identification that is due as a line for a person."""
+    return f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}; `ident reidentify {row['arm']}`\n"
+
+
+def alarm_lines(rows: Sequence[Row]) -> str:
+    """Format drift alarms as lines for a person."""
+    lines = [f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows]
+    return "".join(lines) or "no alarm stands\n"
+
+
+def _day(at: float) -> str:
+    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -1,0 +1,626 @@
+"""Commands at an arm: `watch`, `check`, `rehearse`, `run`, and what all that move one share.
+
+`stop` needs no lease, no ticket and no confirmation, and waits for no other process. Running motions is
+`operations/motion_run.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import select
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.archive_commands import add_by, note_act
+from ident_service.cli.arguments import Parser, Verbs, seconds, share, speed
+from ident_service.cli.operator_input import add_lease, asked_lease, until
+from ident_service.cli.output import (
+    DONE,
+    FAILED,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    interrupting,
+    own_state_folder,
+    state_folder,
+    tell,
+)
+from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ident_service.config.arm import ArmConfig
+    from ident_service.estimation.target import Target
+    from ident_service.excitation.motion_file import Excitation
+    from ident_service.motion.run_plan import Destination
+
+
+# A terminal tells of keys that are pressed, never of keys that are released: a held key is one that repeats. Keyboards
+# begin to repeat after 0.2 to 0.7 s, then every 25 to 95 ms (the Linux console by default 92 ms, desktops 30 to 40 ms).
+RELEASED = 0.15  # s without the key, after which it counts as released
+REPEATS = 4  # in a row, each in time, before it counts as held
+KEY = b" "
+_MOST_MISSED = 10  # parameters that are printed
+
+
+class HeldKey:
+    """Hold-to-run key: the space bar of a terminal, which must be held while the arm moves.
+
+    The first press begins nothing; repeats do. Released, it stays so: a key that is touched again by accident must not
+    move an arm that somebody may have stepped up to. So it is a new rehearsal that moves it again, and not a pause.
+
+    From the last repeat to the beginning of the stop it takes at most `RELEASED`, a quarter of the lease (how often it
+    is looked at) and a cycle: 0.22 s. A keyboard or a network that repeats more slowly stops the arm by itself.
+    """
+
+    def __init__(self, fd: int, now: Callable[[], float] = time.monotonic) -> None:
+        """Take the file descriptor of a terminal, and a clock [s] that is used for differences only."""
+        self._fd, self._now = fd, now
+        self._last = self._looked = -1.0  # times of the last key and of the last look
+        self._row = 0
+        self._held = self._released = False
+
+    def __enter__(self) -> HeldKey:
+        """Read keys one by one without echo; Ctrl-C goes on working."""
+        self._before = termios.tcgetattr(self._fd)
+        tty.setcbreak(self._fd)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Restore the terminal's settings, and drop the keys that nobody has read."""
+        with suppress(termios.error):  # a terminal that is gone needs nothing
+            termios.tcsetattr(self._fd, termios.TCSAFLUSH, self._before)
+
+    def held(self) -> bool:
+        """Return whether the key has begun to repeat, and has not been released since."""
+        self._look()
+        return self._held and not self._released
+
+    def released(self) -> bool:
+        """Return whether the key was held and then released, or the terminal is gone."""
+        self._look()
+        return self._released
+
+    def wait(self, given_up: Callable[[], bool], seconds: float = 0.02) -> bool:
+        """Wait until the key is held; False when it never will be, or `given_up` says so. Looks every `seconds`."""
+        while not self.held():
+            if self._released or given_up():
+                return False
+            select.select([self._fd], [], [], seconds)
+        return True
+
+    def _look(self) -> None:
+        if self._released:
+            return
+        now = self._now()
+        gap, unwatched, self._looked = now - self._last, now - self._looked > RELEASED, now
+        keys = self._keys()
+        if keys is None:
+            self._released = True
+        elif KEY in keys:
+            self._row = self._row + 1 if gap <= RELEASED else 1
+            # Keys that queued up while this program was busy count as fresh: that costs at most one
+            # more `RELEASED`, and while the arm moves, the lease lapses if this program stays busy.
+            self._released = self._held and gap > RELEASED and not unwatched
+            self._held = self._held or self._row >= REPEATS
+            self._last = now
+        else:
+            self._released = self._held and gap > RELEASED
+
+    def _keys(self) -> bytes | None:
+        """Return the bytes typed since the last call; None where the terminal is gone."""
+        if not select.select([self._fd], [], [], 0.0)[0]:
+            return b""
+        try:
+            return os.read(self._fd, 4096) or None
+        except OSError:
+            return None
+
+
+def moved(
+    arguments: argparse.Namespace,
+    config: ArmConfig,
+    motion: Excitation | Destination,
+    sentence: str,
+    *,
+    speed: float = 1.0,
+    lease: float | None = None,
+    stop_requested: Callable[[], bool],
+    until: Target | None = None,
+) -> Answer:
+    """Move the arm along a motion or to a destination, and return the answer of the verb.
+
+    Args:
+        arguments: with `out`, `state` and `can_log`.
+        config: of the arm.
+        motion: or destination.
+        sentence: description of the motion, printed with the folder before it begins.
+        speed: share of the motion's own.
+        lease: how long the arm moves on when this process is gone [s]; None for the ordinary one.
+        stop_requested: asked several times per lease.
+        until: accuracy target at which the run is finished early.
+
+    Raises:
+        As `service.run.run_motion`; MotionRefused without a ticket.
+    """
+    from ident_service.motion.command_channel import LEASE_SECONDS
+    from ident_service.motion.ticket import read_ticket
+    from ident_service.operations.motion_run import run_motion
+    from ident_service.registry.state_folder import new_run_folder, ticket_path
+
+    state = own_state_folder(arguments)
+    path = ticket_path(state, config.name)
+    if not path.exists():
+        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
+    folder = arguments.out or new_run_folder(state, config.name)
+    begun = False
+
+    def begin() -> None:
+        nonlocal begun
+        begun = True
+        tell(arguments, f"{config.name}: {sentence}, into {folder}")
+
+    try:
+        ran = run_motion(
+            config,
+            motion,
+            folder,
+            state,
+            read_ticket(path),
+            speed=speed,
+            lease=LEASE_SECONDS if lease is None else lease,
+            log_frames=arguments.can_log,
+            begin=begin,
+            asked_ns=arguments.asked_ns,
+            tell=lambda word: tell(arguments, word),
+            stop_requested=stop_requested,
+            until=until,
+        )
+    except IdentError as error:
+        if begun and folder.exists():
+            _add_facts(error, folder, state, config.name)
+        raise
+    files = _files(folder)
+    text = _report_text(ran.report) + f"files: {folder}\n" + "".join(f"  {name}\n" for name in files)
+    # A requested stop is no fault, but the motion was not completed.
+    code = DONE if ran.report["state"] == "done" else FAILED
+    return code, text, {"folder": str(folder), "files": files, "report": ran.report}
+
+
+def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
+    """Add to an error the faults, recording and files that the run has left."""
+    from ident_service.registry.state_folder import fault_file
+
+    faults = [{"code": code, "cause": cause} for code, cause in fault_file(state, arm).latched().items()]
+    files = _files(folder)
+    recorded = next((str(folder / name) for name in ("run.mcap", "run.mcap.partial") if name in files), None)
+    if recorded is not None:
+        error.add_note(f"recorded until then: {recorded}")
+    error.add_note("\n".join([f"files: {folder}", *(f"  {name}" for name in files)]))
+    error.facts = {"folder": str(folder), "faults": faults, "recording": recorded, "files": files}
+
+
+def _files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def add_can_log(sub: Parser) -> None:
+    """Add the option `--can-log` to a verb that moves an arm."""
+    sub.add_argument(
+        "--can-log", action="store_true", help="keep every frame of the fieldbus in can.log, beside the recording"
+    )
+
+
+def require_terminal(arguments: argparse.Namespace) -> int:
+    """Return the file descriptor of the terminal whose key is to be held.
+
+    Raises:
+        UsageError: a program is asking, or standard input is no terminal.
+    """
+    if arguments.json or not sys.stdin.isatty():
+        raise UsageError(
+            "a rehearsal moves only while a key is held, and there is no terminal to hold one at; give --no-key to "
+            "rehearse without, and have `ident stop` ready in another terminal"
+        )
+    return sys.stdin.fileno()
+
+
+def _target_text(until: dict[str, Any]) -> str:
+    """Format whether the accuracy target of a run was reached, and which parameters missed it."""
+    if (missed := until["missed"]) is None:
+        return ""
+    if not missed:
+        return f"target of {until['share']:.2%}: reached\n"
+    lines = [
+        f"  {one['parameter']}: " + ("not seen" if one["share"] is None else f"known to {one['share']:.2%}")
+        for one in missed
+    ]
+    head = f"target of {until['share']:.2%}: missed by {len(missed)} parameters (deviation over the larger of size and"
+    return "\n".join([f"{head} reference)", *lines[:_MOST_MISSED], *_further(len(lines))]) + "\n"
+
+
+def _further(count: int) -> list[str]:
+    return [f"  and {count - _MOST_MISSED} more, in --json"] if count > _MOST_MISSED else []
+
+
+def _in_time(lateness: dict[str, Any]) -> str:
+    late = int(lateness["late_or_lost"])
+    return f"{100.0 * (1.0 - late / max(1, lateness['count'] + late)):.2f} % of the cycles in time, {late} late or lost"
+
+
+def _report_text(report: dict[str, Any]) -> str:
+    frames = f"can.log: {report['frames_logged']}\n" if "frames_logged" in report else ""
+    warnings = ", ".join(f"{code} {count} times" for code, count in report["warnings"].items()) or "none"
+    lateness, compute = report["lateness"], report["compute"]
+    early = f"finished early, after {report['motion_seconds']:.1f} s of the motion\n" if "finished" in report else ""
+    early += f"not finished early: {report['not_finished']}\n" if "not_finished" in report else ""
+    early += _target_text(report["until"]) if "until" in report else ""
+    ended = f"{early}{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
+    if lateness is None or compute is None:
+        return f"{ended}: nothing was timed\n{frames}"
+    return (
+        f"{ended}\n"
+        f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
+        f"at worst {lateness['worst_us']:.0f} us; {_in_time(lateness)}\n"
+        f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
+        f"at worst {compute['worst_us']:.0f} us\n"
+        f"{frames}"
+    )
+
+
+_REHEARSAL = 0.2
+_PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
+_HELP_ARM = "description file, or the name of a shipped one"
+
+
+def add(verbs: Verbs) -> None:
+    """Register `watch`, `check`, `run`, `rehearse`, `stop`, `pause`, `resume`, `finish`, `supported` and `ack`."""
+    sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--seconds", type=seconds, default=2.0)
+    sub = verbs.add("check", _check, "preflight: what must be true before the arm moves (exit code 3: it is not)")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
+    sub.add_argument(
+        "--rate-seconds", type=seconds, metavar="S", help="hold the arm for so long to measure the rate (60 when new)"
+    )
+    sub.add_argument(
+        "--scale", action="store_true", help="move nothing: a person turns each joint by hand by an angle that is typed"
+    )
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    add_lease(sub, confirm=False)
+    sub = verbs.add("run", _run, "move the arm along a motion and record it")
+    _motion(sub)
+    sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
+    sub.add_argument(
+        "--until",
+        type=share,
+        metavar="SHARE",
+        help="end early, in order, once every deviation is at most this share of its parameter (0.05)",
+    )
+    sub.add_argument(
+        "--parameter",
+        dest="chosen",
+        action="append",
+        metavar="EXPRESSION",
+        help="with --until: only this base parameter counts, as `ident base` prints it; may be repeated",
+    )
+    sub = verbs.add("rehearse", _rehearse, "the run at a fifth of its speed, while the space bar is held")
+    _motion(sub)
+    sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
+    sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
+    for name, text in (
+        ("stop", "bring the arm, or every arm, to a controlled stop; needs no lease and always works"),
+        ("pause", "let the arm stand"),
+        ("resume", "let it go on"),
+        ("finish", "leave out the rest of the motion: the arm goes back to where it stood, and the run is done"),
+        ("supported", "confirm that an arm that is held after a stop is supported or home: it is let down"),
+    ):
+        sub = verbs.add(name, _stop if name == "stop" else _ask, text)
+        sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
+        if name == "supported":
+            sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees it")
+        sub.set_defaults(asks=name)
+    sub = verbs.add("ack", _ack, "acknowledge a latched fault by its name")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("fault", metavar="FAULT")
+    add_by(sub)
+
+
+def _motion(sub: Parser) -> None:
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument(
+        "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
+    )
+    add_can_log(sub)
+    add_lease(sub)
+
+
+def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
+    from ident_service.excitation.described_motion import excitation
+    from ident_service.excitation.motion_file import read_excitation
+    from ident_service.model.arm_model import arm_model
+
+    return excitation(arm_model(config), "identification") if motion is None else read_excitation(motion)
+
+
+def _watch(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.motion.arm_factory import make_arm
+    from ident_service.motion.command_channel import mover
+    from ident_service.motion.read_only_monitor import watch
+    from ident_service.operations.arm_checks import watch_document, watch_text
+    from ident_service.registry.state_folder import control_path
+
+    config = load_arm(arguments.arm)
+    if (pid := mover(control_path(state_folder(arguments), config.name))) is not None:
+        raise DriverError(f"{config.name}: process {pid} moves the arm; its recording shows what it does")
+    stopping = StopOnSignal()
+    with stopping:
+        seen = watch(make_arm(config), arguments.seconds, stop_requested=stopping.requested)
+    return DONE, watch_text(seen), watch_document(seen)
+
+
+def _check(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.model.arm_model import arm_model
+    from ident_service.motion.arm_factory import make_arm
+    from ident_service.motion.command_channel import ControlFile, StoppableArm
+    from ident_service.motion.last_position import PositionFile
+    from ident_service.motion.realtime import asked
+    from ident_service.motion.ticket import Verdict
+    from ident_service.operations.arm_checks import ticket_document, ticket_text, write_ticket
+    from ident_service.preflight.preflight import preflight
+    from ident_service.recordings.files import require_writable
+    from ident_service.registry.state_folder import arm_folder, control_path, fault_file, ticket_path
+
+    config = load_arm(arguments.arm)
+
+    def confirm(question: str) -> str:
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+
+    if arguments.scale:
+        return _scale(arguments, config)
+    if arguments.home and arguments.motion is not None:
+        raise UsageError("give a motion or --home, not both")
+    motion = None if arguments.home else _chosen(config, arguments.motion)
+    state = own_state_folder(arguments)
+    path, faults = ticket_path(state, config.name), fault_file(state, config.name)
+    faults.require_none(faults.latched())
+    require_writable(path.parent)
+    if arguments.confirm not in (None, config.name):
+        raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
+    arm, model = make_arm(config), arm_model(config)
+    lease, stopping = asked_lease(arguments, config), StopOnSignal()
+    # `ident stop` finds this process as the one that moves the arm, and ends the preflight. A person's Ctrl-C
+    # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
+    with (
+        interrupting() if lease is None else stopping,
+        ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
+    ):
+        stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
+        positions = PositionFile(arm_folder(state, config.name), config)
+        closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
+        # The rate is measured with what a run gets of the kernel.
+        with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
+            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds, closed=closed)
+        if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
+            positions.keep(arm)
+    write_ticket(path, ticket)
+    code = DONE if ticket.verdict is Verdict.PASSED else VERDICT_NO
+    return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}
+
+
+def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
+    """Check the position scale of each joint that a person turns by hand; nothing is energised."""
+    from ident_service.operations.arm_checks import FILE, check_scale
+
+    if arguments.json or not sys.stdin.isatty():
+        raise UsageError("--scale asks a person at a terminal, who turns each joint by hand")
+    found = check_scale(config, own_state_folder(arguments), lambda question: input(f"{question} "))
+    lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]
+    lines.append(f"kept in {FILE} of the arm's folder" if found else "no joint was turned")
+    good = bool(found) and all(one.good for one in found)
+    return (DONE if good else VERDICT_NO), "\n".join([*lines, ""]), {"joints": [asdict(one) for one in found]}
+
+
+def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
+    """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
+    from ident_service.config.load import load_arm
+
+    config = load_arm(arguments.arm)
+    lease = asked_lease(arguments, config, seconds)
+    motion = _chosen(config, arguments.motion)
+    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
+    stopping = StopOnSignal()
+    with stopping:
+        return moved(
+            arguments,
+            config,
+            motion,
+            sentence,
+            speed=arguments.speed,
+            lease=seconds,
+            stop_requested=until(stopping.requested, lease),
+            until=_target(arguments),
+        )
+
+
+def _target(arguments: argparse.Namespace) -> Target | None:
+    """Return the parameter accuracy at which the run may end early; None if the verb asks for none."""
+    if getattr(arguments, "until", None) is None:
+        if getattr(arguments, "chosen", None):
+            raise UsageError("--parameter is what --until SHARE is about; give both")
+        return None
+    from ident_service.estimation.target import Target
+
+    return Target(arguments.until, tuple(arguments.chosen or ()))
+
+
+def _rehearse(arguments: argparse.Namespace) -> Answer:
+    if arguments.no_key:
+        return _run(arguments)
+    if arguments.lease_from_stdin:
+        from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
+
+        return _run(arguments, HOLD_TO_RUN_SECONDS)
+    terminal = require_terminal(arguments)
+    from ident_service.config.load import load_arm
+    from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
+
+    config = load_arm(arguments.arm)
+    motion = _chosen(config, arguments.motion)
+    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s while the space bar is held"
+    stopping = StopOnSignal()
+    with stopping, HeldKey(terminal) as key:
+        tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
+        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+        if not key.wait(stopping.requested):
+            raise MotionRefused("nobody held the key; nothing has moved")
+        return moved(
+            arguments,
+            config,
+            motion,
+            sentence,
+            speed=arguments.speed,
+            lease=HOLD_TO_RUN_SECONDS,
+            stop_requested=lambda: stopping.requested() or key.released(),
+        )
+
+
+def _stop(arguments: argparse.Namespace) -> Answer:
+    """Stop an arm, or all arms; print and note it in the audit trail only afterwards."""
+    from ident_service.registry.state_folder import shut_out
+
+    os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's
+    try:
+        return _stopped(arguments, state_folder(arguments))
+    except (UsageError, PermissionError):
+        if (refusal := shut_out(state_folder(arguments))) is None:
+            raise
+        raise UsageError(f"nothing was stopped: {refusal}; or stop by its daemon: ident stop --server URL") from None
+
+
+def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
+    from ident_service.motion.command_channel import ControlFile
+    from ident_service.operations.moving_arms import stop_arms
+    from ident_service.registry.state_folder import control_path, known_arms, leave_to_owner
+
+    if arguments.arm is None:
+        reached = stop_arms(state, None)
+        for name in known_arms(state):  # a file was made where there was none
+            leave_to_owner(state, control_path(state, name))
+        note_act(arguments, "stop", "all arms", reached=reached)
+        text = f"stop asked of {', '.join(reached)}" if reached else "nobody moves an arm"
+        text += "; no motion will begin that was asked for before now\n"
+        return DONE, text, {"arms": reached, "asked": "stop"}
+    name, path = _control(arguments)
+    pid = ControlFile.stop_all(path)
+    leave_to_owner(state, path)
+    note_act(arguments, "stop", name, reached=[] if pid is None else [name])
+    text = f"{name}: stop asked of process {pid}" if pid is not None else f"nobody moves {name}"
+    text += "" if pid is not None else "; no motion will begin that was asked for before now"
+    return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
+
+
+def _ask(arguments: argparse.Namespace) -> Answer:
+    from ident_service.motion.command_channel import ControlFile, in_use
+
+    os.umask(0o077)
+    name, path = _control(arguments)
+    if arguments.asks == "supported":
+        held = in_use(path)
+        _require_typed(
+            arguments, name, "is lowered slowly" if held else "is let go by its drives AT ONCE, if they hold it"
+        )
+        if not held:
+            return _let_go(arguments)
+    with ControlFile.reach(path) as controls:
+        if arguments.asks == "supported":
+            controls.confirm_support()
+        else:
+            if arguments.asks == "finish":
+                controls.ask_finish()
+            controls.ask_pause(arguments.asks == "pause")
+        pid = controls.pid
+    note_act(arguments, arguments.asks, name, reached=[name])
+    document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
+    return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
+
+
+def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
+    """Require a person's confirmation that an arm is supported: its name, typed now or as `--confirm`.
+
+    Raises:
+        UsageError: another word, or nobody to ask.
+    """
+    typed = arguments.confirm
+    if typed is None and sys.stdin.isatty() and not arguments.json:
+        typed = input(f"{name} {follows}. If it is supported and nobody is under it, type its name: ").strip()
+    if typed != name:
+        raise UsageError(
+            f"that an arm is supported is confirmed by its name, typed: --confirm {name}; nothing is let go"
+        )
+
+
+def _let_go(arguments: argparse.Namespace) -> Answer:
+    """Switch off the drives that still hold an arm after the motion process has ended."""
+    from ident_service.config.load import load_arm
+    from ident_service.operations.recovery import let_go
+
+    config = load_arm(arguments.arm)
+    held = let_go(config, own_state_folder(arguments))
+    note_act(arguments, "supported", config.name, reached=[config.name])
+    document = {"arm": config.name, "asked": "supported", "let_go": list(held)}
+    return DONE, f"{config.name}: drives have let go of {', '.join(held)}\n", document
+
+
+def _ack(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.state_folder import fault_file
+
+    name = _name(arguments)
+    cause = fault_file(own_state_folder(arguments), name).acknowledge(arguments.fault)
+    note_act(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
+    return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
+
+
+def _control(arguments: argparse.Namespace) -> tuple[str, Path]:
+    from ident_service.registry.state_folder import control_path
+
+    name = _name(arguments)
+    return name, control_path(state_folder(arguments), name)
+
+
+def _name(arguments: argparse.Namespace) -> str:
+    """Return an arm's name: the word itself where the state folder remembers such an arm, which may be a daemon's.
+
+    Raises:
+        UsageError: there is none, among those of the state folder or elsewhere; both are listed.
+        ConfigError: its description has mistakes.
+    """
+    from ident_service.config.load import load_arm
+    from ident_service.registry.state_folder import arm_folder, known_arms
+
+    word = str(arguments.arm)
+    state = state_folder(arguments)
+    if _PLAIN.fullmatch(word) and not Path(word).is_file() and arm_folder(state, word).is_dir():
+        return word
+    try:
+        return load_arm(word).name
+    except UsageError as error:
+        known = ", ".join(known_arms(state)) or "none"
+        raise UsageError(f"{error}; arms that {state} remembers: {known}") from None

@@ -1,0 +1,224 @@
+"""Print a verb's answer or error, name where it may write, and hear interrupts.
+
+Exit codes: 0 done and good; 1 failed; 2 usage or configuration; 3 done, but the verdict is no; 4 stopped by a fault; 5
+nothing was judged, because a person is needed first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from ident_service.errors import IdentError, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.client import IdentClient
+
+
+DONE, FAILED, USAGE, VERDICT_NO, FAULTED, PERSON_NEEDED = 0, 1, 2, 3, 4, 5
+
+Answer = tuple[int, str, dict[str, Any]]
+"""Exit code; text for a person, with its last line break; JSON values for a program."""
+
+
+def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:
+    """Print a verb's answer as text, or with `--json` as one JSON object."""
+    if arguments.json:
+        _print_json({**document, "exit_code": code})
+    else:
+        write(sys.stdout, text)
+
+
+def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
+    """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`."""
+    _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
+
+
+def print_to_person(text: str) -> None:
+    """Print on stderr; a closed stderr is ignored."""
+    write(sys.stderr, text)
+
+
+def _print_json(document: dict[str, Any]) -> None:
+    write(sys.stdout, json.dumps(document, allow_nan=False) + "\n")
+
+
+def tell(arguments: argparse.Namespace, line: str) -> None:
+    """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
+    # With --json, stdout belongs to the one object.
+    with suppress(OSError):
+        write(sys.stderr if arguments.json else sys.stdout, line + "\n")
+
+
+def write(stream: TextIO | None, text: str) -> None:
+    """Write and flush text; a reader that has gone, or a closed terminal, changes neither the work nor the exit code.
+
+    Raises:
+        OSError: anything else that keeps text from its place, a full disk for example.
+    """
+    if stream is None:  # closed before we began
+        return
+    try:
+        stream.write(text)
+        stream.flush()
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.EIO):
+            raise
+        discard(stream)
+
+
+def discard(stream: TextIO) -> None:
+    """Redirect a stream to the null device, so that its unwritten buffer cannot fail at exit with exit code 120."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+def state_folder(arguments: argparse.Namespace) -> Path:
+    """Return the state folder, where results go by default: `--state`, `$IDENT_STATE`, or the user's XDG folder.
+
+    Raises:
+        UsageError: `--state` without a name.
+    """
+    if arguments.state is not None:
+        if not arguments.state:
+            raise UsageError("--state needs the name of a folder")
+        return Path(arguments.state)
+    if given := os.environ.get("IDENT_STATE"):
+        return Path(given)
+    base = os.environ.get("XDG_STATE_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "state") / "ident"
+
+
+def own_state_folder(arguments: argparse.Namespace) -> Path:
+    """Return the state folder for a verb that writes there, after checking that only its owner can enter it.
+
+    Raises:
+        UsageError: as `state_folder`; or others can enter it.
+    """
+    from ident_service.registry.state_folder import keep_private
+
+    state = state_folder(arguments)
+    keep_private(state)
+    return state
+
+
+def hear_interrupts() -> None:
+    """Make Ctrl-C interrupt this process although the shell that started it had SIGINT ignored.
+
+    A shell without job control, that of a script for example, starts `command &` with SIGINT ignored (POSIX.1-2017,
+    Shell Command Language, 2.11), and what is started inherits it. Where hangups are ignored too, `nohup` was asked for
+    and both stay ignored; `StopOnSignal` and `interrupting` hear Ctrl-C there all the same, because they guard an arm.
+    """
+    # Handlers can be set in the main thread only, and only there does an interpreter raise KeyboardInterrupt.
+    if threading.current_thread() is not threading.main_thread():
+        return
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
+def interrupting() -> Iterator[None]:
+    """Raise KeyboardInterrupt on SIGTERM and SIGHUP too, so that whoever drives an arm releases it first."""
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class StopOnSignal:
+    """Request a controlled stop on Ctrl-C, SIGTERM or a terminal that closes (SIGHUP).
+
+    A second Ctrl-C interrupts and a second kill does what it did before. A second hangup does nothing: shells send it
+    besides the kernel. Where hangups are ignored (`nohup`), they stay so; Ctrl-C is heard everywhere.
+    """
+
+    def __init__(self) -> None:
+        self._asked = False
+
+    def requested(self) -> bool:
+        """Return whether a stop has been requested."""
+        return self._asked
+
+    def __enter__(self) -> None:
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+            numbers.append(signal.SIGHUP)
+        self._before = {number: signal.signal(number, self._ask) for number in numbers}
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)
+
+    def _ask(self, number: int, _: object) -> None:
+        self._asked = True
+        if number != signal.SIGHUP:
+            before = self._before[signal.Signals(number)]
+            signal.signal(number, signal.default_int_handler if before is signal.SIG_IGN else before)
+
+
+_OURS = frozenset({"exit_code", "error"})  # keys that the job's own lines show already
+
+
+def in_words(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
+    """Return the answer with its command's JSON object appended to the text as lines."""
+    code, text, document = answer
+    said = {key: value for key, value in document["answer"].items() if key not in _OURS}
+    text += _ticket(said.pop("ticket", None))
+    return code, text + "".join(f"{line}\n" for line in lines_of(said)), document
+
+
+def _ticket(values: Any) -> str:
+    """The table of a preflight, as the command at the arm prints it; nothing where there is none that can be read."""
+    if not isinstance(values, dict):
+        return ""
+    from ident_service.motion.ticket import ticket_from_json
+    from ident_service.operations.arm_checks import ticket_text
+
+    try:
+        return "\n" + ticket_text(ticket_from_json(json.dumps(values)))
+    except IdentError:  # another version's
+        return "".join(f"{line}\n" for line in lines_of(values))
+
+
+def lines_of(value: Any, indent: str = "") -> Iterator[str]:
+    """Yield one line per value of a JSON object or list; nested values are indented by two spaces.
+
+    Lists of plain values, and plain values, stand on the line of their name.
+    """
+    pairs = value.items() if isinstance(value, dict) else enumerate(value, 1)
+    for name, part in pairs:
+        if isinstance(part, dict | list) and not _plain(part):
+            yield f"{indent}{name}:"
+            yield from lines_of(part, indent + "  ")
+        else:
+            yield f"{indent}{name}: {_word(part)}"
+
+
+def _plain(part: Any) -> bool:
+    values = part.values() if isinstance(part, dict) else part
+    return not part or (isinstance(part, list) and not any(isinstance(one, dict | list) for one in values))
+
+
+def _word(part: Any) -> str:
+    if isinstance(part, dict | list):
+        return ", ".join(map(_word, part)) or "none"
+    if isinstance(part, bool):
+        return "yes" if part else "no"
+    if isinstance(part, float):
+        return f"{part:.6g}"
+    return "none" if part is None else str(part)

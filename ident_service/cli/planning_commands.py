@@ -1,0 +1,446 @@
+"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `doctor`, `emulate`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ident_service.cli.arguments import Parser, Verbs, count, frequency, seconds, seed, share, weight, workers
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, print_to_person, tell
+from ident_service.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ident_service.excitation.search import Progress
+    from ident_service.motion.doctor import Finding, Held, Woken
+    from ident_service.operations.motion_design import Knowledge
+
+
+_UNFINISHED = "the search ended before its first start was finished; more time will find a better motion"
+_CRITERIA = ("d_optimal", "condition_number", "a_optimal")
+_FAMILY = ("motion", "base_frequency", "harmonics", "periods", "ramp", "postures")
+_MARGINS = ("criterion", "position_margin", "torque_margin")
+
+
+def _add_motions(verbs: Verbs) -> None:
+    """Register `design` and `preview`."""
+    sub = verbs.add("design", _design, "the most informative motion that the arm can safely make")
+    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument("--criterion", choices=_CRITERIA, help="default: the arm's")
+    sub.add_argument(
+        "--parameter",
+        action="append",
+        dest="chosen",
+        metavar="EXPRESSION",
+        help="a base parameter as `ident base` prints it, to be taught best (a_optimal); may be repeated",
+    )
+    sub.add_argument("--motion", choices=["fourier", "postures"], help="default: the arm's")
+    length = "of the motion, ramps included: whole periods of about the base frequency (default: the arm's)"
+    sub.add_argument("--length", type=seconds, metavar="SECONDS", help=length)
+    sub.add_argument("--base-frequency", type=frequency, metavar="HZ")
+    sub.add_argument("--harmonics", type=count, metavar="N")
+    sub.add_argument("--periods", type=count, metavar="N")
+    sub.add_argument("--ramp", type=weight, metavar="SECONDS", help="to swell from rest and to die down")
+    sub.add_argument("--postures", type=count, metavar="N", help="for postures: how many")
+    sub.add_argument("--position-margin", type=weight, metavar="RAD", help="kept free at every position limit")
+    sub.add_argument("--torque-margin", type=share, metavar="SHARE", help="of every torque limit, kept free")
+    _know(sub)
+    sub.add_argument("--seed", type=seed, default=0, help="of the random starts")
+    searched = "time for the search, not the motion's length (default: 60, or none with --starts)"
+    sub.add_argument("--search-time", type=seconds, metavar="SECONDS", help=searched)
+    sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # former name
+    sub.add_argument("--starts", type=count, metavar="N", help="random starts; the result is then the same every time")
+    sub.add_argument("--workers", type=workers, default=2, metavar="N", help="processes")
+    sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to go on from")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
+
+    sub = verbs.add("preview", _preview, "what a motion asks of the arm, and what it will teach (exit code 3: refused)")
+    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    _know(sub)
+    sub.add_argument("--out", type=Path, metavar="DIR", help="also write the text and the drawings there")
+
+
+def _know(sub: Parser) -> None:
+    sub.add_argument(
+        "--model", type=Path, metavar="FILE", help="parameters.json to predict torques with, not the prior"
+    )
+    sub.add_argument("--noise", type=Path, metavar="FILE", help="parameters.json whose residuals are the noise")
+    sub.add_argument(
+        "--after",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="RECORDING",
+        help="add to what this one taught; or FILE@41:60",
+    )
+
+
+def _knowledge(arguments: argparse.Namespace) -> Knowledge:
+    from ident_service.operations.motion_design import Knowledge
+
+    return Knowledge(arguments.model, arguments.noise, tuple(arguments.after))
+
+
+def _design(arguments: argparse.Namespace) -> Answer:
+    import numpy as np
+
+    from ident_service.config.load import load_arm
+    from ident_service.excitation.search import Budget
+    from ident_service.operations.motion_design import FILES, DesignRequest, design_files
+    from ident_service.operations.motion_preview import preview_document, preview_text
+    from ident_service.registry.state_folder import new_run_folder
+
+    keys = (*_FAMILY, *_MARGINS)
+    changes: dict[str, Any] = {key: value for key in keys if (value := getattr(arguments, key)) is not None}
+    if arguments.chosen is not None:
+        if arguments.criterion not in (None, "a_optimal"):
+            raise UsageError(f"--parameter is for a_optimal, not for {arguments.criterion}")
+        changes |= {"criterion": "a_optimal", "parameters": tuple(arguments.chosen)}
+    limit = arguments.search_time if arguments.search_time is not None or arguments.starts is not None else 60.0
+    request = DesignRequest(
+        arm=arguments.arm,
+        changes=changes,
+        knowledge=_knowledge(arguments),
+        seed=arguments.seed,
+        budget=Budget(limit, arguments.starts, arguments.workers),
+        resume=arguments.resume,
+        length=arguments.length,
+    )
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name, "motions")
+    stopping = StopOnSignal()
+    with stopping:
+        designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
+    _progress_end(arguments)
+    unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
+    if unfinished:
+        sys.stderr.write(f"ident: {unfinished}\n")
+    taught = bool(np.isfinite(seen.deviations).any())
+    binding = "".join(f"  {line}\n" for line in designed.binding)
+    binding = f"what holds the motion back\n{binding}\n" if binding else ""
+    text = preview_text(seen) + f"\n{binding}files: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
+    document: dict[str, Any] = {
+        "folder": str(folder),
+        "starts": designed.found.finished,
+        "criterion": designed.excitation.made["criterion"],
+        "criterion_value": designed.excitation.made["criterion_value"],
+    }
+    document |= preview_document(seen)
+    document["binding"] = list(designed.binding)
+    document["warnings"] = [*([unfinished] if unfinished else []), *seen.warnings]
+    return (VERDICT_NO if seen.objections or not taught else DONE), text, document
+
+
+def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
+    """Return a callback that shows search progress: one line rewritten on a terminal, else a new one every 10 s."""
+    stream = sys.stderr
+    last = [-10.0]
+
+    def show(progress: Progress) -> None:
+        best = "none yet" if progress.best is None else f"{progress.best:.4f}"
+        left = f", about {progress.remaining:.0f} s left" if progress.remaining == progress.remaining else ""
+        words = f"{progress.phase}: {progress.finished} starts, best {best}, {progress.elapsed:.0f} s{left}"
+        if stream.isatty():
+            stream.write(f"\r{words}\x1b[K")
+            stream.flush()
+        elif progress.elapsed - last[0] >= 10.0:
+            last[0] = progress.elapsed
+            tell(arguments, words)
+
+    return show
+
+
+def _progress_end(arguments: argparse.Namespace) -> None:
+    if sys.stderr.isatty():
+        sys.stderr.write("\r\x1b[K")
+
+
+def _preview(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.motion_design import preview_files
+    from ident_service.operations.motion_preview import preview_document, preview_text
+
+    seen = preview_files(arguments.arm, arguments.motion, _knowledge(arguments), arguments.out)
+    text = preview_text(seen)
+    document = preview_document(seen)
+    if arguments.out is not None:
+        text += f"\nfiles: {arguments.out}\n"
+        document["folder"] = str(arguments.out)
+    return (VERDICT_NO if seen.objections else DONE), text, document
+
+
+def _add_configs(verbs: Verbs) -> None:
+    """Register `new` and `config check`."""
+    new = verbs.add("new", _new, "write a first description of an arm from its URDF, with a simulated arm to try it")
+    new.add_argument("urdf", metavar="URDF", type=Path)
+    new.add_argument("--out", metavar="FILE", type=Path, help="where it goes (default: NAME.yaml, here)")
+    new.add_argument("--name", help="of the arm (default: the URDF's file name)")
+    new.add_argument("--base", metavar="LINK", help="that the arm stands on (default: the root)")
+    new.add_argument("--tip", metavar="LINK", help="that it ends at (default: where the gripper begins)")
+    config = verbs.group("config", "arm descriptions")
+    check = config.add(
+        "check", _check, "every mistake with file, line and column; whether the gains are stable (exit code 3: not)"
+    )
+    check.add_argument("file", metavar="FILE")
+
+
+def _new(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.new_description import new_description
+
+    def tell(line: str) -> None:
+        print_to_person(f"{line} ...\n")
+
+    words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
+    path, guessed = new_description(*words, tell)
+    lines = [f"{path}: a first description, and a simulated arm to try it with"]
+    lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
+    lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
+    return DONE, "\n".join(lines), {"description": str(path), "guessed": list(guessed)}
+
+
+def _check(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.description_check import check_description, description_document, description_text
+
+    checked = check_description(arguments.file)
+    document = {"file": arguments.file, **description_document(checked)}
+    return DONE if checked.good else VERDICT_NO, description_text(arguments.file, checked), document
+
+
+_HELP_ARM = "description file, or the name of a shipped one"
+
+
+def _add_bus(verbs: Verbs) -> None:
+    """Register `bus load`, `bus scan` and `bus probe`."""
+    bus = verbs.group("bus", "the fieldbus of an arm")
+    load = bus.add("load", _load, "what every frame costs, and whether all of them fit (exit code 3: they do not)")
+    load.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    load.add_argument("--rate", type=frequency, metavar="HZ", help="cycles per second (default: control.rate)")
+    text = "who is on the buses: state, identity, errors; sends SDO uploads only (exit code 3: not who is configured)"
+    sub = bus.add("scan", _scan, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+
+    text = (
+        "what each drive can, what it lacks, its watchdogs, torque unit and rate; writes nothing (exit code 3: refused)"
+    )
+    sub = bus.add("probe", _probe, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    help_eds = "EDS or DCF files to judge in place of the drives, without a bus"
+    sub.add_argument("--eds", nargs="+", default=[], metavar="FILE", help=help_eds)
+
+
+def _load(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.operations.fieldbus import bus_document, bus_load, bus_text
+
+    config = load_arm(arguments.arm)
+    found = bus_load(config, arguments.rate)
+    return DONE if found.fits else VERDICT_NO, bus_text(config.name, found), bus_document(config.name, found)
+
+
+def _scan(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.operations.fieldbus import bus_scan, scan_document, scan_text
+
+    config = load_arm(arguments.arm)
+    found = bus_scan(config)
+    return DONE if found.complete else VERDICT_NO, scan_text(config, found), scan_document(config, found)
+
+
+def _probe(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.operations.fieldbus import bus_probe, probe_document, probe_text
+
+    config = load_arm(arguments.arm)
+    found = bus_probe(config, [sheet_file(name) for name in arguments.eds])
+    return DONE if found.good else VERDICT_NO, probe_text(config, found), probe_document(config, found)
+
+
+_DEFAULT_RATE = 1000.0  # Hz
+_DOUBT = 3.0  # events that a Poisson process of which none came has at most, with 95 %
+
+
+def _add_doctor(verbs: Verbs) -> None:
+    """Register the verb."""
+    text = "is this computer fit to move an arm, and at which rates? (exit code 3: not at the described arm's)"
+    sub = verbs.add("doctor", _doctor, text)
+    sub.add_argument("arm", nargs="?", metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument("--seconds", type=seconds, default=60.0, help="how long lateness is measured (60)")
+
+
+def _doctor(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.control import Realtime
+    from ident_service.config.load import load_arm
+    from ident_service.motion.arm_factory import make_arm
+    from ident_service.motion.doctor import bus_findings, judge_rates, kernel_findings, measure_wake_up, measuring_rate
+
+    config = None if arguments.arm is None else load_arm(arguments.arm)
+    settings = Realtime() if config is None else config.realtime
+    rate = _DEFAULT_RATE if config is None else config.control.rate
+    watchdogs = () if config is None or config.driver is None else make_arm(config).watchdogs()
+    findings = kernel_findings(settings) + ([] if config is None else bus_findings(config))
+    tell(arguments, f"measuring for {arguments.seconds:g} s how late a loop wakes; Ctrl-C ends it early")
+    stopping = StopOnSignal()
+    with stopping:
+        woken = measure_wake_up(measuring_rate(rate), arguments.seconds, settings, stop_requested=stopping.requested)
+    held = judge_rates(woken, rate, None if config is None else config.control.longest_stall, watchdogs)
+    (own,) = [one for one in held if abs(one.rate - rate) < 1e-6 * rate]
+    name = None if config is None else config.name
+    code = DONE if config is None or own.good else VERDICT_NO
+    return code, _text(name, own, findings, woken, held), _document(name, own, findings, woken, held)
+
+
+def _text(arm: str | None, own: Held, findings: Sequence[Finding], woken: Woken, held: Sequence[Held]) -> str:
+    words = {"good": "ok", "poor": "POOR", "unknown": "unknown"}
+    lines = list[str]()
+    for one in findings:
+        lines.append(f"  {words[one.state.value]:<8} {one.what}: {one.found}")
+        lines += [f"{'':11}-> {one.remedy}"] if one.remedy else []
+    lines += ["", f"woken every {1e3 * woken.period:g} ms for {woken.seconds:.0f} s, {woken.sentence}"]
+    late = f"late by {1e3 * float(woken.late.max()):.3g} ms at worst, {1e3 * woken.share(0.999):.3g} ms at 99.9 %"
+    lines.append(f"  {late}, {1e3 * woken.share(0.5):.3g} ms at the median")
+    host = "" if woken.stolen is None else f"; {woken.stolen:.1%} of the time went to others on this machine's host"
+    lines += [f"  load {woken.load:.2f}; {woken.faults} pages had to be found{host}", ""]
+    for each in held:
+        often = _hourly(each.stalls, woken.seconds)
+        lines.append(
+            f"  {'holds' if each.good else 'FAILS':<8} {each.rate:g} Hz: {each.stalls} stalls of more than "
+            f"{1e3 * each.longest_stall:g} ms, {often}; {100.0 * each.late:.2g} % of the worst second's cycles late "
+            "(5 % are survived)"
+        )
+    if arm is not None:
+        verdict = "can be held" if own.good else "CANNOT BE HELD"
+        lines += ["", f"{arm}: {own.rate:g} Hz {verdict} by this computer as it was loaded now"]
+    return "\n".join([*lines, ""])
+
+
+def _hourly(stalls: int, seconds: float) -> str:
+    """Say how many an hour that is, or, where none came, what the time is long enough to exclude."""
+    if stalls == 0:
+        return f"so fewer than {3600.0 * _DOUBT / seconds:.0f} an hour (95 %)"
+    return f"{3600.0 * stalls / seconds:.0f} an hour"
+
+
+def _document(
+    arm: str | None, own: Held, findings: Sequence[Finding], woken: Woken, held: Sequence[Held]
+) -> dict[str, Any]:
+    return {
+        "arm": arm,
+        "rate": own.rate,
+        "can_hold": own.good,
+        "findings": [
+            {"what": one.what, "state": one.state.value, "found": one.found, "remedy": one.remedy} for one in findings
+        ],
+        "measured": {
+            "seconds": woken.seconds,
+            "period": woken.period,
+            "granted": woken.sentence,
+            "worst_late": float(woken.late.max()),
+            "p999_late": woken.share(0.999),
+            "median_late": woken.share(0.5),
+            "stolen_share": woken.stolen,
+            "page_faults": woken.faults,
+            "load": woken.load,
+        },
+        "rates": [
+            {
+                "rate": one.rate,
+                "holds": one.good,
+                "longest_stall": one.longest_stall,
+                "stalls": one.stalls,
+                "stalls_per_hour": 3600.0 * one.stalls / woken.seconds,
+                "late_share_of_worst_second": one.late,
+            }
+            for one in held
+        ],
+    }
+
+
+def _add_emulate(verbs: Verbs) -> None:
+    """Register `emulate`."""
+    sub = verbs.add(
+        "emulate",
+        _emulate,
+        "the drives of an arm, emulated on its configured bus until Ctrl-C; lines on standard input inject faults: "
+        "`drive_fault joint=j2 at=1`, `clear`, `state`, `quit`",
+    )
+    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="FAULT",
+        help="'KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]', counted from the first SYNC; repeatable",
+    )
+    sub.add_argument(
+        "--eds",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="EDS or DCF files of real drives, which the drives are emulated by, one after the other",
+    )
+    sub.add_argument("--seconds", type=seconds, metavar="S", help="stop by itself after this time")
+
+
+def _emulate(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.control import Realtime
+    from ident_service.config.load import load_arm, with_sheets
+    from ident_service.motion.realtime import asked
+    from sim_backend.emulator.process import emulate
+
+    config = with_sheets(load_arm(arguments.arm), arguments.eds)
+    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")
+    stopping = StopOnSignal()
+    # On another core than the motion process, if there is one.
+    with stopping, asked(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):
+        done = emulate(
+            config,
+            faults=arguments.fault,
+            seconds=arguments.seconds,
+            tell=lambda line: tell(arguments, line),
+            stop_requested=stopping.requested,
+            commands=_lines(),
+        )
+    rest = "at rest" if done.at_rest else "still moving"
+    text = (
+        f"emulated for {done.seconds:.1f} s: {done.heard} frames heard, {done.sent} sent, "
+        f"{done.unsent} not taken; the arm is {rest}\n"
+    )
+    document = {
+        "arm": config.name,
+        "seconds": done.seconds,
+        "heard": done.heard,
+        "sent": done.sent,
+        "unsent": done.unsent,
+        "states": list(done.states),
+        "at_rest": done.at_rest,
+    }
+    return DONE, text, document
+
+
+def _lines() -> Callable[[], str | None]:
+    """Return a function that takes the next line of standard input, None while there is none or after its end."""
+    # Polled, not read by a thread: a thread that blocks on standard input cannot be ended.
+    rest, ended = b"", sys.stdin is None or sys.stdin.closed
+
+    def take() -> str | None:
+        nonlocal rest, ended
+        while b"\n" not in rest:
+            if ended or not select.select([0], [], [], 0.0)[0]:
+                return None
+            part = os.read(0, 4096)
+            rest, ended = rest + part, not part
+        line, _, rest = rest.partition(b"\n")
+        return line.decode(errors="replace")
+
+    return take
+
+
+def add(verbs: Verbs) -> None:
+    """Register the verbs of this module."""
+    for register in (_add_motions, _add_configs, _add_bus, _add_doctor, _add_emulate):
+        register(verbs)

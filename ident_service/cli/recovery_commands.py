@@ -1,0 +1,308 @@
+"""Commands that make an arm usable again: `recover`, `home`, `ack`, `supported`; and `reidentify`.
+
+Each step runs in this process the verb that the daemon runs as a job; `service/maintenance` stores the result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from ident_service.cli.archive_commands import add_by, at_terminal
+from ident_service.cli.arguments import Verbs
+from ident_service.cli.maintenance_commands import registry
+from ident_service.cli.motion_commands import add_can_log, moved
+from ident_service.cli.operator_input import add_lease, asked_lease, until
+from ident_service.cli.output import (
+    DONE,
+    FAILED,
+    FAULTED,
+    PERSON_NEEDED,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    own_state_folder,
+    state_folder,
+    tell,
+)
+from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.config.arm import ArmConfig
+    from ident_service.motion.run_plan import Destination
+    from ident_service.operations.recovery import Recovery
+
+
+_HELP_ARM = "description file, or the name of a shipped one"
+_HELP_OUT = "run folder; must not exist (default: below the state folder)"
+
+
+def _add_recovery(verbs: Verbs) -> None:
+    """Register `home` and `recover`."""
+    sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument(
+        "--zero", action="store_true", help="move nothing: a person has led the arm home, and its encoders begin there"
+    )
+    sub.add_argument("--confirm", metavar="NAME", help="with --zero or --server: the arm's name, typed by a person")
+    sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
+    add_can_log(sub)
+    add_lease(sub, confirm=False)
+    sub = verbs.add(
+        "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
+    )
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm: slowly back inside its position limits")
+    sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
+    add_can_log(sub)
+    add_lease(sub)
+
+
+def _home(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.motion.run_plan import Destination
+
+    config = load_arm(arguments.arm)
+    if arguments.zero:
+        if arguments.out is not None or arguments.can_log:
+            raise UsageError("--out and --can-log are for a motion; with --zero nothing moves")
+        return _zero(arguments, config)
+    if arguments.confirm is not None:
+        raise UsageError("--confirm is for --zero; a motion needs the ticket of `ident check`")
+    if held := _lead_held(arguments, config):
+        return held
+    return _slowly(arguments, config, Destination.HOME)
+
+
+def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | None:
+    """Have the process that holds the arm after a stop move it home; return None where no process holds it."""
+    from ident_service.cli.archive_commands import note_act
+    from ident_service.cli.output import state_folder
+    from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile, Homing, in_use
+    from ident_service.registry.state_folder import control_path
+
+    path = control_path(state_folder(arguments), config.name)
+    if not in_use(path):
+        return None
+    with ControlFile.reach(path) as controls:
+        if not controls.waiting:
+            return None  # the arm is moving; starting another motion is refused later
+    if arguments.out is not None or arguments.can_log:
+        raise UsageError("--out and --can-log are for a motion of its own; the run that holds the arm has its folder")
+    lease, stopping = asked_lease(arguments, config), StopOnSignal()
+    with stopping, ControlFile.reach(path) as controls:
+        asked, pid, stopped = until(stopping.requested, lease), controls.pid, False
+        controls.ask_home()
+        tell(arguments, f"{config.name}: keep out of its reach; process {pid} leads it home, slowly. Ctrl-C stops.")
+        while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
+            if not stopped and asked():
+                controls.ask_stop()
+                stopped = True
+            controls.renew_home()
+            time.sleep(0.1 * LEASE_SECONDS)
+    note_act(arguments, "home", config.name, reached=[config.name])
+    document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
+    if stage is Homing.ENDED and not stopped:
+        return DONE, f"{config.name}: led home; it is held there until `ident supported {arguments.arm}`\n", document
+    why = "the story of its run says why" if stage is Homing.REFUSED else "it was stopped"
+    held = (
+        f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "nobody holds it"
+    )
+    return FAILED, f"{config.name}: not led home, {why}; {held}\n", document
+
+
+def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
+    from ident_service.config.canopen import CanopenDriver
+    from ident_service.operations.recovery import home_posture, take_home
+
+    posture, lease = home_posture(config), asked_lease(arguments, config)
+    tell(arguments, f"{config.name}: nothing will move. From now on the arm stands, by what you say, in this posture:")
+    for joint in posture:
+        tell(arguments, f"  {joint}")
+
+    def confirm(question: str) -> str:
+        if lease is not None and lease.over():
+            raise MotionRefused(f"{config.name}: not zeroed: {lease.reason}; nothing has changed")
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+
+    done = take_home(config, own_state_folder(arguments), confirm)
+    lines = [f"{done.arm}: zeroed, until its drives lose their power", *(f"  {words}" for words in done.drives)]
+    lines += [f"  latched still: {fault.code}: {fault.cause}" for fault in done.faults]
+    if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
+        lines.append(
+            "  but these drives are emulated within this command, and forget it now; over ident_wire they do not"
+        )
+    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident check {arguments.arm}`")
+    document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
+    return DONE, "\n".join([*lines, ""]), document
+
+
+def _recover(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.operations.arm_checks import watch_document
+    from ident_service.operations.recovery import recover
+
+    config = load_arm(arguments.arm)
+    if arguments.leave_limit:
+        from ident_service.motion.run_plan import Destination
+
+        return _slowly(arguments, config, Destination.INSIDE)
+    if arguments.out is not None:
+        raise UsageError("--out is for the recording of --leave-limit; without it nothing moves")
+    if arguments.lease_from_stdin:
+        raise UsageError("--lease-from-stdin is for --leave-limit; without it nothing moves")
+    if arguments.can_log:
+        raise UsageError("--can-log is for --leave-limit; without it nothing moves")
+    found = recover(config, own_state_folder(arguments), called=arguments.arm)
+    document = {
+        "arm": found.arm,
+        "usable": found.usable,
+        "faults": [asdict(one) for one in found.faults],
+        "moved_by": found.mover,
+        "seen": None if found.seen is None else watch_document(found.seen),
+        "unreachable": found.unreachable,
+        "zero_lost": found.zero_lost,
+        "reset": list(found.reset),
+        "tripped": found.tripped,
+        "outside": list(found.outside),
+        "steps": list(found.steps),
+    }
+    return DONE if found.usable else VERDICT_NO, _text(found), document
+
+
+def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
+    from ident_service.motion.faults import HOLD
+
+    ends = {
+        "hold": f"the arm is held until `ident supported {config.name}`, then lowered",
+        "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
+    }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
+    lease = asked_lease(arguments, config)
+    tell(arguments, f"{config.name}: keep out of its reach; where the way ends")
+    tell(arguments, f"{ends}. Ctrl-C stops.")
+    stopping = StopOnSignal()
+    with stopping:
+        asked = until(stopping.requested, lease)
+        return moved(arguments, config, destination, f"slowly {destination.value}", stop_requested=asked)
+
+
+def _text(found: Recovery) -> str:
+    from ident_service.operations.arm_checks import watch_text
+
+    lines = [f"{found.arm}: {'usable' if found.usable else 'NOT USABLE YET'}", ""]
+    for one in found.faults:
+        since = datetime.fromtimestamp(one.since, UTC).isoformat(sep=" ", timespec="seconds").removesuffix("+00:00")
+        lines.append(f"  latched since {since} UTC: {one.code}: {one.cause}")
+    if not found.faults:
+        lines.append("  no fault waits for anybody")
+    if found.mover is not None:
+        lines.append(f"  process {found.mover} moves the arm")
+    if found.unreachable:
+        lines.append(f"  the arm cannot be looked at: {found.unreachable}")
+    if found.zero_lost:
+        lines.append(f"  the arm does not know where it stands: {found.zero_lost}")
+    lines += [f"  {axis}: the drive has latched: {words}" for axis, words in found.tripped.items()]
+    if found.reset:
+        lines.append(f"  reset just now: {', '.join(found.reset)}")
+    lines += [f"  outside its position limits: {words}" for words in found.outside]
+    if found.seen is not None:
+        lines += ["", watch_text(found.seen).rstrip("\n")]
+    lines += ["", "next:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
+    return "\n".join(lines)
+
+
+EXIT_CODES: Final = {
+    "unchanged": DONE,
+    "changed": VERDICT_NO,
+    "faulted": FAULTED,
+    **dict.fromkeys(("impossible", "refused"), PERSON_NEEDED),
+}
+"""Exit codes by the end of a re-identification; any other end is a failure."""
+
+
+def _add_reidentify(verbs: Verbs) -> None:
+    """Register `reidentify`."""
+    sub = verbs.add(
+        "reidentify", _reidentify, "check, run, identify, compare with the accepted set (exit code 3: changed)"
+    )
+    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    add_by(sub)
+
+
+def _reidentify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.daemon.maintenance.reidentification import enter_concluded, require_comparable
+    from ident_service.operations.acceptance import ARM, PARAMETERS, accepted_set
+    from ident_service.operations.drift_alarms import verdict_of
+    from ident_service.registry.motions import new_id
+    from ident_service.registry.runs import RUNS, index_run
+
+    state, config, begun = own_state_folder(arguments), load_arm(arguments.arm), time.time()
+    who = at_terminal(arguments)
+    with registry(arguments) as db:
+        number = require_comparable(state, config)
+        accepted = accepted_set(state, config.name, number)[1]
+        motion = [] if arguments.motion is None else [str(arguments.motion)]
+        confirm = [] if arguments.confirm is None else ["--confirm", arguments.confirm]
+        code, text, _ = _step(arguments, "check", arguments.arm, *motion, *confirm)
+        if code != DONE:
+            raise PersonNeeded(f"{config.name}: preflight found reasons not to move\n{text}")
+        recorded = new_id(config.name)
+        _, _, moved = _step(arguments, "run", arguments.arm, *motion, "--out", str(state / RUNS / recorded))
+        index_run(db, state, recorded)
+        if moved["report"]["state"] != "done":
+            raise ArmError(f"{config.name}: stopped on request; the run {recorded} is kept, nothing was compared")
+        run = new_id(config.name)
+        recording, folder = state / RUNS / recorded / "run.mcap", state / RUNS / run
+        _step(arguments, "identify", str(recording), "--arm", str(accepted / ARM), "--out", str(folder))
+        _, text, document = _step(arguments, "compare", str(accepted / PARAMETERS), str(folder), "--keep")
+        index_run(db, state, run)
+        verdict = verdict_of(document)
+        name = enter_concluded(db, config.name, number, recorded, run, verdict, begun, who, time.time())
+    answer: dict[str, Any] = {
+        "id": name,
+        "arm": config.name,
+        "against": number,
+        "recorded": recorded,
+        "run": run,
+        "verdict": verdict.state,
+        "what": verdict.words,
+        "comparison": document,
+    }
+    lines = f"{text}{verdict.words}\n"
+    if verdict.state == "changed":
+        lines += "a drift alarm stands until `ident alarm ack`, or `ident accept` of another set\n"
+    return EXIT_CODES[verdict.state], lines, answer
+
+
+def _step(arguments: argparse.Namespace, *words: str) -> Answer:
+    """Run another verb as if it had been typed; a refused motion becomes `PersonNeeded`."""
+    from ident_service.cli import parser
+
+    always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
+    parsed = parser().parse_args([*words, *always])
+    parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
+    tell(arguments, f"-- {words[0]}")
+    try:
+        answer: Answer = parsed.verb(parsed)
+    except MotionRefused as error:
+        # Distinguished from the verdict that the arm has changed, whose exit code a refused motion has otherwise.
+        refused = PersonNeeded(str(error))
+        refused.facts = error.facts
+        raise refused from None
+    return answer
+
+
+def add(verbs: Verbs) -> None:
+    """Register the verbs of this module."""
+    for register in (_add_recovery, _add_reidentify):
+        register(verbs)

@@ -1,0 +1,491 @@
+"""Detect whether an arm has changed between two identifications, and find the single cause that explains most of it.
+
+With d the difference of the base parameters and S = S_1 + S_2 the sum of their covariances,
+
+    T^2 = d^T S^-1 d
+
+is chi-square distributed over rank(S) directions when nothing has changed and S is known. S comes from the blocks of
+two recordings, of which there are not many more than parameters, and T^2 then is larger than chi-square. It follows
+
+    (nu - r + 1) / (nu r) T^2  ~  F(r, nu - r + 1)
+
+with r directions and nu the degrees of freedom of a sum of two estimated covariances (Krishnamoorthy and Yu 2004, eq.
+"modified Nel and van der Merwe"; Welch's for r = 1). Directions of the correlation matrix are left out where nothing
+was seen, where no variance was estimated because blocks are fewer than parameters, and, the best known first, until
+nu - r + 1 >= r: beyond, the inverse of S is noise.
+
+The same test is made of every effect: friction of a joint, drive inertia of a joint, first moments of a link, inertia
+of a link. The joint test and all effects together are one family, controlled by Holm's method.
+
+Constrained estimates: their covariance here is that of the unconstrained fit. Projection into a convex set moves two
+estimates closer together, not apart, so such a test is on the careful side. Where a file has its unconstrained values,
+those are compared, to which the covariance belongs.
+
+`change_detection.py` explains what a change may mean.
+
+Base parameters group the parameters of neighbouring links, so a tool on the last link moves the base parameters of all
+links before it. A cause is a few link parameters (friction of a joint, drive inertia of a joint, the body of a link)
+with their columns C of K. How much of a difference d it explains is said in torque on the recorded motion, each joint
+in units of its residual:
+
+    1 - min_x |R (d - C x)|^2 / |R d|^2
+
+It describes, it does not test: whether anything has changed is for `change_detection.py` to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import scipy.special
+
+from ident_service.errors import ParameterError
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+from ident_service.model.parameter_layout import INERTIAL, TERM_SYMBOLS
+
+Kind = Literal["friction", "drive inertia", "first moments", "inertia"]
+Word = Literal["unchanged", "changed", "impossible"]
+
+# One false alarm in a hundred comparisons, over all tests of a comparison together: an arm that is compared every week
+# cries wolf once in two years. Changes that matter lie ten and more deviations away.
+ALPHA = 0.01
+# Of a joint's torque on the motion (root mean square). Drives' torque constants are seldom known to better than 1 %.
+RELEVANT_TORQUE = 0.01
+# Of what the parameters leave unexplained (root mean square). Noise averages out of parameters, and their covariance
+# says how well; model error does neither, and shows in the residual alone.
+RELEVANT_RESIDUAL = 0.25
+
+_NO_VARIANCE = 1e-10  # smallest eigenvalue of the correlation matrix, as a share of the largest
+_ROUNDING = 8.0 * np.finfo(float).eps
+_KINDS: dict[str, Kind] = {
+    **dict.fromkeys(INERTIAL[:6], "inertia"),
+    **dict.fromkeys(INERTIAL[6:], "first moments"),
+    **dict.fromkeys(TERM_SYMBOLS.values(), "friction"),
+    TERM_SYMBOLS["drive_inertia"]: "drive inertia",
+}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Torque response of a recorded motion to changes of the base parameters.
+
+    Attributes:
+        responses: per joint a matrix whose product with a difference of parameters has as its length the root mean
+            square of the change of torque [N m or N], shape (rows, base).
+        torque: root mean square of each joint's measured torque [N m or N], shape (joints,).
+        residual: and of what the identified parameters leave unexplained of it, shape (joints,).
+    """
+
+    responses: tuple[Array, ...]
+    torque: Array
+    residual: Array
+
+    @classmethod
+    def of(cls, information: Information, beta: Array, places: Sequence[int] | None = None) -> Motion:
+        """Return the torque response of a recording from its equations.
+
+        Args:
+            information: the equations.
+            beta: all base parameters that were identified from them, SI units, shape (base,).
+            places: which of them the responses are about, in their order; all when None.
+        """
+        wanted = np.arange(information.base) if places is None else np.array(places, dtype=np.intp)
+        rows = np.sqrt(np.maximum(information.rows, 1))
+        responses = []
+        for count, support, factor in zip(rows, information.supports, information.factors, strict=True):
+            full = np.zeros((len(factor), information.base))
+            full[:, support] = factor[:, :-1] / count
+            responses.append(full[:, wanted])
+        torque, residual = information.squared_torques(), information.squared_residuals(beta)
+        return cls(tuple(responses), np.sqrt(torque) / rows, np.sqrt(residual) / rows)
+
+    def change(self, difference: Array) -> Array:
+        """Return the root mean square of each joint's change of torque [N m or N], shape (joints,)."""
+        return np.array([float(np.linalg.norm(response @ difference)) for response in self.responses])
+
+
+@dataclass(frozen=True)
+class Identified:
+    """Values and covariance, from one identification, of the base parameters that two identifications share.
+
+    Attributes:
+        leading: the link parameter that each base parameter is named after, `fv2` for example.
+        values: unconstrained where known, SI units, shape (base,).
+        covariance: of them, infinite on the diagonal where nothing was seen, shape (base, base).
+        blocks: stretches of time that the covariance comes from; None where it is known exactly.
+        motion: of the recordings that were fitted to; None where it was not kept.
+    """
+
+    leading: tuple[str, ...]
+    values: Array
+    covariance: Array
+    blocks: int | None = None
+    motion: Motion | None = None
+
+    def __post_init__(self) -> None:
+        size = len(self.leading)
+        if self.values.shape != (size,) or self.covariance.shape != (size, size):
+            raise ParameterError(f"{self.values.shape=} and {self.covariance.shape=} but {size} parameters")
+        if self.blocks is not None and self.blocks < 2:
+            raise ParameterError(f"a covariance from {self.blocks} blocks says nothing")
+
+
+@dataclass(frozen=True)
+class Test:
+    """Result of a test that some parameters have not changed.
+
+    Attributes:
+        statistic: T^2, the squared length of the difference in deviations.
+        directions: r, how many independent directions it has.
+        degrees: nu of the covariances; infinite where they are known.
+        p: how often a larger statistic comes about when nothing has changed.
+        left_out: directions in which nothing could be tested.
+    """
+
+    statistic: float
+    directions: int
+    degrees: float
+    p: float
+    left_out: int
+
+    @property
+    def sigma(self) -> float:
+        """Return the length of the difference in standard deviations; |z| of a single parameter."""
+        return float(np.sqrt(self.statistic))
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Test result of one physical effect: friction or drive inertia of a joint, first moments or inertia of a link.
+
+    Attributes:
+        kind: of effect.
+        number: of the joint or link, from 1.
+        places: indices of its parameters.
+        test: that they have not changed.
+        p: of the test, after Holm.
+        joint: the one whose torque changes most for its size, from 0; None where no motion is known.
+        torque_share: of that joint's torque, by which its prediction changes (root mean squares); None likewise.
+        residual_share: of that joint's residual; None likewise.
+        changed: whether it is significant, and large enough to matter where that can be said.
+    """
+
+    kind: Kind
+    number: int
+    places: tuple[int, ...]
+    test: Test
+    p: float
+    joint: int | None
+    torque_share: float | None
+    residual_share: float | None
+    changed: bool
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Difference of two identifications, tested per parameter, per effect and as a whole.
+
+    Attributes:
+        difference: second less first, shape (base,).
+        deviations: its standard deviations, infinite where either saw nothing, shape (base,).
+        z: difference in deviations, 0 where nothing was seen, shape (base,).
+        p: of each parameter alone, after Holm over the parameters, shape (base,).
+        joint: the test of all parameters together.
+        joint_p: of that test, after Holm over it and the effects.
+        torque_share: per joint, of its torque, by which the prediction changes, shape (joints,); None without a motion.
+        residual_share: per joint, of its residual, likewise.
+        effects: all of them, in the order of the parameters.
+        verdict: in one word.
+    """
+
+    difference: Array
+    deviations: Array
+    z: Array
+    p: Array
+    joint: Test
+    joint_p: float
+    torque_share: Array | None
+    residual_share: Array | None
+    effects: tuple[Effect, ...]
+    verdict: Literal["unchanged", "changed"]
+
+    @property
+    def shares(self) -> tuple[Array, Array] | None:
+        """Return the torque changes of all differences together, as `torque_shares` does; None without a motion."""
+        if self.torque_share is None or self.residual_share is None:
+            return None
+        return self.torque_share, self.residual_share
+
+    @cached_property
+    def changes(self) -> tuple[Effect, ...]:
+        """Return the effects that have changed, the largest change of torque first."""
+        found = [effect for effect in self.effects if effect.changed]
+        return tuple(sorted(found, key=lambda effect: (-(effect.residual_share or 0.0), effect.p)))
+
+
+def drift(first: Identified, second: Identified) -> Drift:
+    """Compare two identifications of the same base parameters.
+
+    Args:
+        first: the reference, the accepted one for example.
+        second: the later one; torques are those of its motion, or of the first one's where it has none.
+
+    Raises:
+        ParameterError: the two are about different parameters, or one has other shapes than its parameters.
+    """
+    if first.leading != second.leading:
+        raise ParameterError("the two sets are about different base parameters")
+    difference = second.values - first.values
+    total = np.diag(first.covariance) + np.diag(second.covariance)
+    seen = np.isfinite(total)
+    # Values are printed with rounding, so even exactly known values are known to that rounding only.
+    rounding = _ROUNDING * (np.abs(first.values) + np.abs(second.values)) + np.finfo(float).tiny
+    deviations = np.where(seen, np.maximum(np.sqrt(np.where(seen, total, 0.0)), rounding), np.inf)
+    singles = [difference_test(first, second, (place,)) for place in range(len(difference))]
+    joint = difference_test(first, second, tuple(range(len(difference))))
+    groups = _groups(first.leading)
+    tests = [difference_test(first, second, places) for places in groups.values()]
+    corrected = holm([joint.p, *(test.p for test in tests)])
+    effects = []
+    for ((kind, number), places), test, p in zip(groups.items(), tests, corrected[1:], strict=True):
+        only = np.zeros(len(difference))
+        only[list(places)] = difference[list(places)]
+        shares = torque_shares(first, second, np.where(seen, only, 0.0))
+        worst = None if shares is None else int(np.argmax(shares[0]))
+        torque, residual = (None, None) if shares is None else (float(shares[0][worst]), float(shares[1][worst]))
+        changed = p < ALPHA and relevant(shares)
+        effects.append(Effect(kind, number, places, test, p, worst, torque, residual, changed))
+    whole = torque_shares(first, second, np.where(seen, difference, 0.0))
+    drifted = any(effect.changed for effect in effects) or (corrected[0] < ALPHA and relevant(whole))
+    return Drift(
+        difference=difference,
+        deviations=deviations,
+        z=np.where(seen, difference / deviations, 0.0),
+        p=np.array(holm([test.p for test in singles])),
+        joint=joint,
+        joint_p=corrected[0],
+        torque_share=None if whole is None else whole[0],
+        residual_share=None if whole is None else whole[1],
+        effects=tuple(effects),
+        verdict="changed" if drifted else "unchanged",
+    )
+
+
+def holm(p: Sequence[float]) -> list[float]:
+    """Return the probabilities adjusted for multiple tests (Holm 1979), in the order given."""
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty(len(p))
+    adjusted[order] = np.maximum.accumulate(np.arange(len(p), 0, -1) * np.asarray(p, dtype=float)[order])
+    return [float(value) for value in np.minimum(adjusted, 1.0)]
+
+
+def torque_shares(first: Identified, second: Identified, difference: Array) -> tuple[Array, Array] | None:
+    """Return the relative change of predicted torques for a change of parameters, on the later known motion.
+
+    Returns:
+        Per joint, root mean square of the change over that of the torque, and over that of what the parameters
+        identified from it leave unexplained; each of shape (joints,). None where no motion is known.
+    """
+    motion = second.motion or first.motion
+    if motion is None:
+        return None
+    change, tiny = motion.change(difference), np.finfo(float).tiny
+    return change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
+
+
+def relevant(shares: tuple[Array, Array] | None) -> bool:
+    """Return whether some joint's torque changes by a relevant share of both the torque and its residual."""
+    if shares is None:
+        return True
+    return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
+
+
+def _groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
+    groups: dict[tuple[Kind, int], list[int]] = {}
+    for place, name in enumerate(leading):
+        symbol = name.rstrip("0123456789")
+        groups.setdefault((_KINDS.get(symbol, "friction"), int(name[len(symbol) :])), []).append(place)
+    return {key: tuple(places) for key, places in groups.items()}
+
+
+def difference_test(first: Identified, second: Identified, places: Sequence[int]) -> Test:
+    """Test that these parameters are the same in both identifications.
+
+    Args:
+        first: one set.
+        second: the other.
+        places: which parameters, from 0.
+    """
+    chosen = np.array(places, dtype=np.intp)
+    seen = chosen[[np.isfinite(first.covariance[k, k] + second.covariance[k, k]) for k in places]]
+    d = second.values[seen] - first.values[seen]
+    parts = [one.covariance[np.ix_(seen, seen)] for one in (first, second)]
+    blocks = [one.blocks for one in (first, second)]
+    rounding = _ROUNDING * (np.abs(first.values[seen]) + np.abs(second.values[seen])) + np.finfo(float).tiny
+    if len(seen) == 0:
+        return Test(0.0, 0, np.inf, 1.0, len(places))
+    S = parts[0] + parts[1]
+    scale = np.maximum(np.sqrt(np.diag(S)), rounding)
+    exact = np.diag(S) <= rounding**2
+    correlation = S / np.outer(scale, scale)
+    correlation[exact, exact] = 1.0
+    values, vectors = np.linalg.eigh(correlation)
+    # Largest variance first: directions left out are the best known, whose variances blocks cannot tell from zero.
+    values, vectors = values[::-1], vectors[:, ::-1]
+    rank = int(np.sum(values > _NO_VARIANCE * values[0]))
+    whitening = (vectors[:, :rank] / np.sqrt(values[:rank])).T / scale
+    z = whitening @ d
+    for r in range(rank, 0, -1):
+        degrees = _degrees([whitening[:r] @ part @ whitening[:r].T for part in parts], blocks)
+        if degrees - r + 1.0 >= r or r == 1:
+            break
+    statistic = float(z[:r] @ z[:r])
+    return Test(statistic, r, degrees, probability(statistic, r, degrees), len(places) - r)
+
+
+def probability(statistic: float, directions: int, degrees: float) -> float:
+    """Return the probability of a larger T^2 by chance, with `degrees` of freedom of its covariances."""
+    if np.isinf(degrees):
+        return float(scipy.special.chdtrc(directions, statistic))
+    below = max(degrees - directions + 1.0, 1.0)
+    return float(scipy.special.fdtrc(directions, below, statistic * below / (degrees * directions)))
+
+
+def _degrees(parts: Sequence[Array], blocks: Sequence[int | None]) -> float:
+    """Return the degrees of freedom of a sum of covariances, each in the coordinates in which the sum is 1."""
+    below = 0.0
+    for part, count in zip(parts, blocks, strict=True):
+        if count is not None:
+            below += float(np.sum(part * part.T) + np.trace(part) ** 2) / (count - 1)
+    r = len(parts[0])
+    return (r + r**2) / below if below > 0.0 else float("inf")
+
+
+CauseKind = Literal["friction", "drive inertia", "body"]
+
+_AS_GOOD = 0.02  # causes that explain as much within this share; the one with fewer parameters is preferred
+_FRICTION = frozenset(TERM_SYMBOLS.values()) - {TERM_SYMBOLS["drive_inertia"]}
+_MEANINGS: Mapping[str, str] = {
+    "higher": "lubrication that ages or is cold, worn seals or bearings, a brake that drags",
+    "lower": "a warmer or freshly lubricated gear, one that has run in, a looser belt or seal",
+    "offset": "zero of the torque sensor or current, a cable package that pulls, a counterbalance",
+    "drive inertia": "another motor or gear, or a torque constant that is not what it was",
+    "last": "another tool or payload",
+    "body": "a part mounted on or taken off, or a cable package moved",
+    "first moments": "a part mounted on or taken off, another zero position of the joint, or the torque constant",
+    "inertia": "a part mounted on or taken off, or a torque constant that is not what it was",
+}
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One possible cause of a difference.
+
+    Attributes:
+        kind: what has changed.
+        number: of the joint or link, from 1.
+        explained: share of the change of torque, squared and in units of residuals, from 0 to 1.
+        changes: of the link parameters, those that the difference shows, in SI units.
+    """
+
+    kind: CauseKind
+    number: int
+    explained: float
+    changes: Mapping[str, float]
+
+
+def causes(difference: Array, K: Array, names: Sequence[str], motion: Motion) -> list[Cause]:
+    """Return every possible single cause of a difference, the best explanation first.
+
+    Args:
+        difference: of base parameters, SI units, shape (base,).
+        K: of eq. 38, shape (base, link parameters).
+        names: of the link parameters.
+        motion: on which torques are compared.
+    """
+    units = np.maximum(motion.residual, np.finfo(float).tiny)
+    R = np.vstack([response / unit for response, unit in zip(motion.responses, units, strict=True)])
+    change = R @ difference
+    total = float(change @ change)
+    found = []
+    for (kind, number), columns in _columns(names).items():
+        A = R @ K[:, columns]
+        if total == 0.0 or not np.any(A):
+            continue
+        # Columns differ by orders of magnitude in SI units.
+        size = np.linalg.norm(A, axis=0)
+        size[size == 0.0] = 1.0
+        x = np.linalg.lstsq(A / size, change, rcond=1e-9)[0]
+        rest = change - (A / size) @ x
+        changes = {names[column]: float(value) for column, value in zip(columns, x / size, strict=True)}
+        found.append((len(columns), Cause(kind, number, 1.0 - float(rest @ rest) / total, changes)))
+    if not found:
+        return []
+    best = max(cause.explained for _, cause in found)
+    found.sort(key=lambda pair: (pair[1].explained < best - _AS_GOOD, pair[0], -pair[1].explained))
+    simple = found[0][1]
+    return [simple, *sorted((cause for _, cause in found[1:]), key=lambda cause: -cause.explained)]
+
+
+def meaning_of_cause(cause: Cause, links: int) -> str:
+    """Return the possible meaning of a cause, in words for a person at the arm.
+
+    Args:
+        cause: to explain.
+        links: of the arm; the last one carries tools.
+    """
+    if cause.kind == "body":
+        return _MEANINGS["last" if cause.number == links else "body"]
+    return _MEANINGS["drive inertia"] if cause.kind == "drive inertia" else _MEANINGS[_direction(cause.changes)]
+
+
+def meaning_of_effect(effect: Effect, found: Drift, leading: Sequence[str], links: int) -> str:
+    """Return the possible meaning of an effect that no single cause explains, in words for a person at the arm."""
+    if effect.kind == "friction":
+        return _MEANINGS[_direction({leading[place]: float(found.difference[place]) for place in effect.places})]
+    return _MEANINGS["last" if effect.number == links and effect.kind != "drive inertia" else effect.kind]
+
+
+def friction_ratio(first: Identified, second: Identified, joint: int) -> tuple[float, float] | None:
+    """Return the friction of a joint, second over first, at the root mean square of its speed.
+
+    Args:
+        first: the reference.
+        second: the later one; the speed is that of its motion.
+        joint: from 1.
+
+    Returns:
+        The ratio, and the speed [rad/s or m/s]; None where no motion is known, or the first has no such friction.
+    """
+    motion, place = second.motion or first.motion, {name: k for k, name in enumerate(first.leading)}
+    viscous, coulomb = place.get(f"fv{joint}"), place.get(f"fc{joint}")
+    if motion is None or viscous is None or joint > len(motion.responses):
+        return None
+    speed = float(np.linalg.norm(motion.responses[joint - 1][:, viscous]))
+    before, after = (
+        one.values[viscous] * speed + (0.0 if coulomb is None else one.values[coulomb]) for one in (first, second)
+    )
+    return None if before <= 0.0 or speed == 0.0 else (float(after / before), speed)
+
+
+def _direction(changes: Mapping[str, float]) -> str:
+    dissipating = {name: value for name, value in changes.items() if not name.startswith("fo")}
+    offset = sum(abs(value) for name, value in changes.items() if name.startswith("fo"))
+    if offset > sum(abs(value) for value in dissipating.values()):
+        return "offset"
+    return "higher" if sum(dissipating.values()) > 0.0 else "lower"
+
+
+def _columns(names: Sequence[str]) -> dict[tuple[CauseKind, int], list[int]]:
+    columns: dict[tuple[CauseKind, int], list[int]] = {}
+    for column, name in enumerate(names):
+        symbol = name.rstrip("0123456789")
+        kind: CauseKind
+        kind = "body" if symbol in INERTIAL else "friction" if symbol in _FRICTION else "drive inertia"
+        columns.setdefault((kind, int(name[len(symbol) :])), []).append(column)
+    return columns

@@ -1,0 +1,252 @@
+"""Weigh equations by how well they fit (Huber 1964), and rows near standstill by how well their friction is modelled.
+
+The weights are found on a spread of rows that is kept, so that memory does not grow with the recording; then each row
+gets its weight in one more reading. The scale of a joint's residuals is the median of their absolute values, which bad
+rows cannot move far.
+
+Where a joint turns round or hardly moves, dry friction takes any value up to its limit, and a model of it errs in
+another way than where the joint moves. So each joint's equations are of two kinds with a deviation each, and rows near
+standstill are multiplied by the ratio of the two: an arm whose pre-sliding friction the model describes keeps them, one
+whose drives stick does without. Rows in motion never count less than they.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.estimation.equations import Equations, Rows, equation_rows, equations
+from ident_service.estimation.least_squares import LeastSquares, Moments, ordinary_least_squares, weighted_least_squares
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.blas_threads import one_blas_thread
+from ident_service.model.chain import Array
+from ident_service.model.information import Information, supports
+from ident_service.recordings.recording import Recording
+
+_TUNING = 1.345  # 95 % efficiency where the noise is normal after all
+_CONSISTENT = 1.4826  # standard deviation over median absolute deviation, for normal noise
+_SPREAD = 5_000  # samples that the weights are found on
+SETTLED = 1e-3  # white standard deviations; smaller changes count as settled
+_MOST_ROUNDS = 50
+_FOLDS = 3
+_FOLD_ROUNDS = 15
+
+
+@one_blas_thread()
+def huber(
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    start: LeastSquares,
+    torque_scales: Array | None = None,
+    shares: Array | None = None,
+) -> tuple[LeastSquares, Equations, float]:
+    """Return Huber's estimate, the reweighted equations that it solves, and the last round's change of it.
+
+    Where the weights do not settle in the rounds that there are, the one that changed least is the answer: a change
+    above `SETTLED` says so.
+
+    Args:
+        recordings: to fit to; each is read twice.
+        model: the arm.
+        base: grouping of the parameters.
+        start: an estimate to begin from.
+        torque_scales: what each joint's measured torque is multiplied by, shape (joints,); ones when None.
+        shares: what rows near standstill are multiplied by, shape (joints,); ones when None.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+    """
+    shares = np.ones(model.chain.joints) if shares is None else shares
+    times = np.ones(model.chain.joints) if torque_scales is None else torque_scales
+    spread = _spread(recordings, model, base, times, shares)
+    beta, change = spread.huber(start.beta, _MOST_ROUNDS)
+    scales = spread.scales(beta)
+
+    def weights(rows: Rows) -> Array:
+        count = np.where(rows.keep, 1.0, shares)
+        residuals = count * (rows.torque * times - np.einsum("jps,p->sj", rows.H_b, beta))
+        return np.asarray(count * _weights(residuals, scales))
+
+    gathered = equations(recordings, model, base, weights).with_torques_times(times)
+    return ordinary_least_squares(gathered.total), gathered, change
+
+
+def held_out_errors(
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    start: LeastSquares,
+    torque_scales: Array,
+    shares: Array,
+) -> dict[str, float]:
+    """Return the torque errors of each third, predicted from the other two, with and without Huber's weights.
+
+    Args:
+        recordings: to fit to; each is read once.
+        model: the arm.
+        base: grouping of the parameters.
+        start: weighted least squares of all of them; its weights make the joints' errors comparable.
+        torque_scales: what each joint's measured torque is multiplied by, shape (joints,).
+        shares: what rows near standstill are multiplied by, shape (joints,).
+
+    Returns:
+        Relative torque error [percent] of `wls` and of `huber`, the joints weighed as `start` has it.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+    """
+    spread = _spread(recordings, model, base, torque_scales, shares)
+    errors, torques = np.zeros(2), 0.0
+    for number in range(_FOLDS):
+        rest, unseen = spread.without(number), spread.only(number)
+        plain = rest.moments().solved(start.weights)
+        robust, _ = rest.huber(plain, _FOLD_ROUNDS)
+        errors += [float(np.sum(start.weights**2 * unseen.squared_residuals(beta))) for beta in (plain, robust)]
+        torques += float(np.sum(start.weights**2 * unseen.squared_residuals(np.zeros(base.size))))
+    relative = 100.0 * np.sqrt(errors / max(torques, np.finfo(float).tiny))
+    return {"wls": float(relative[0]), "huber": float(relative[1])}
+
+
+def _weights(residuals: Array, scales: Array) -> Array:
+    # Rows are multiplied by the root of Huber's weight, and divided by the scale so that joints are comparable.
+    size = np.abs(residuals) / scales
+    return np.asarray(np.sqrt(np.minimum(1.0, _TUNING / np.maximum(size, 1e-12))) / scales)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Rows spread evenly over the recordings: per joint the columns of rows that count, the torque as the last."""
+
+    supports: tuple[NDArray[np.intp], ...]
+    base: int
+    tables: tuple[Array, ...]
+
+    def huber(self, beta: Array, rounds: int) -> tuple[Array, float]:
+        """Reweight for `rounds` rounds; return the estimate that changed least, and its change in white deviations."""
+        best = (beta, np.inf)
+        for _ in range(rounds):
+            better, deviations = self._reweighted(beta).estimate()
+            change = float(np.max(np.abs(better - beta) / np.maximum(deviations, np.finfo(float).tiny)))
+            if change < best[1]:
+                best = (better, change)
+            beta = better
+            if change < SETTLED:
+                break
+        return best
+
+    def moments(self) -> Moments:
+        """Return the products of the rows, each counted once."""
+        return self._of([table.T @ table for table in self.tables])
+
+    def squared_residuals(self, beta: Array) -> Array:
+        """Return per joint the sum of squared residuals, shape (joints,)."""
+        return np.array([float(one @ one) for one in self.residuals(beta)])
+
+    def only(self, part: int) -> _Spread:
+        """Return one third of the rows."""
+        return self._with([np.array_split(table, _FOLDS)[part] for table in self.tables])
+
+    def without(self, part: int) -> _Spread:
+        """Return the other two thirds of the rows."""
+        return self._with(
+            [
+                np.concatenate([one for number, one in enumerate(np.array_split(table, _FOLDS)) if number != part])
+                for table in self.tables
+            ]
+        )
+
+    def residuals(self, beta: Array) -> list[Array]:
+        pairs = zip(self.tables, self.supports, strict=True)
+        return [table[:, -1] - table[:, :-1] @ beta[support] for table, support in pairs]
+
+    def scales(self, beta: Array) -> Array:
+        """Return the robust standard deviation of each joint's residuals [N m or N], shape (joints,)."""
+        return np.array([max(_CONSISTENT * float(np.median(np.abs(one))), 1e-9) for one in self.residuals(beta)])
+
+    def _reweighted(self, beta: Array) -> Moments:
+        # Weigh the rows by their residuals.
+        products = []
+        for table, residual, scale in zip(self.tables, self.residuals(beta), self.scales(beta), strict=True):
+            rows = table * _weights(residual, scale)[:, None]
+            products.append(rows.T @ rows)
+        return self._of(products)
+
+    def _of(self, products: Sequence[Array]) -> Moments:
+        rows = np.array([len(table) for table in self.tables], dtype=np.int64)
+        return Moments(self.supports, tuple(products), rows, self.base)
+
+    def _with(self, tables: Sequence[Array]) -> _Spread:
+        return _Spread(self.supports, self.base, tuple(tables))
+
+
+def _spread(
+    recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
+) -> _Spread:
+    """Read every recording once and return its rows; of long ones every second, every fourth ... sample is kept.
+
+    Raises:
+        RecordingError: a recording cannot be used.
+    """
+    felt = supports(model.chain, model.layout, base.base)
+    kept: list[tuple[Array, ...]] = []
+    every, samples, seen = 1, 0, 0
+    for recording in recordings:
+        for rows in equation_rows(recording, model, base):
+            picked = np.arange((-seen) % every, len(rows.time), every)
+            seen += len(rows.time)
+            count = np.where(rows.keep[picked], 1.0, shares)
+            torque = rows.torque[picked] * times
+            kept.append(
+                tuple(
+                    np.column_stack([rows.H_b[joint][support[:, None], picked].T, torque[:, joint]])
+                    * count[:, joint, None]
+                    for joint, support in enumerate(felt)
+                )
+            )
+            samples += len(picked)
+            while samples > 2 * _SPREAD:
+                kept = [tuple(np.concatenate(parts)[::2] for parts in zip(*kept, strict=True))]
+                every, samples = 2 * every, samples // 2
+    tables = tuple(np.concatenate(parts) for parts in zip(*kept, strict=True))
+    return _Spread(felt, base.size, tables)
+
+
+_SETTLED = 1e-3  # change of a share that counts as settled
+_MOST_WEIGHINGS = 100
+
+
+def standstill_shares(gathered: Equations) -> Array:
+    """Return the factors of the rows near standstill, shape (joints,), at most one.
+
+    Args:
+        gathered: equations with their rows near standstill apart.
+
+    Raises:
+        ModelError: the joints' weights do not settle.
+    """
+    moving, near = gathered.total, gathered.left_out
+    shares = np.ones(moving.joints)
+    if near is None or not near.rows.any():
+        return shares
+    beta = weighted_least_squares(gathered.everything).beta
+    floor = 1e-9 * np.sqrt(gathered.everything.squared_torques() / np.maximum(gathered.everything.rows, 1))
+    for _ in range(_MOST_WEIGHINGS):
+        fast, slow = (np.maximum(_deviations(part, beta), floor) for part in (moving, near))
+        # A joint whose rows are all of one kind has nothing to compare.
+        wanted = np.where((moving.rows > 0) & (near.rows > 0), np.minimum(1.0, fast / slow), 1.0)
+        settled = bool(np.all(np.abs(wanted - shares) <= _SETTLED * shares))
+        shares = wanted
+        if settled:
+            break
+        each = np.where(moving.rows > 0, 1.0 / fast, 1.0 / slow)
+        beta = ordinary_least_squares(moving.merged(near.times(shares)), each).beta
+    return shares
+
+
+def _deviations(information: Information, beta: Array) -> Array:
+    return np.asarray(np.sqrt(information.squared_residuals(beta) / np.maximum(information.rows, 1)))

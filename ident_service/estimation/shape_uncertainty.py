@@ -1,0 +1,122 @@
+"""Add to covariances how far base parameters may be off because the shape of the friction was fitted, too.
+
+The pre-sliding distance and the Stribeck velocity are found by search (`friction_fit.py`), and the estimate is linear
+once they are numbers. An error of such a number moves the parameters along with it: viscous and Coulomb friction most.
+To first order it is a further column of the equations, the derivative of the predicted torque by the number's
+logarithm. Its covariance C comes from the equations with these columns, blocks as everywhere, and how the parameters
+follow, A, from the same columns by least squares: A C A^T is added to their covariance. Under white noise the two parts
+are independent. No logarithm is less certain than any value of the search would be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.estimation.equations import Rows, equation_rows, equations_of
+from ident_service.estimation.friction_fit import searched, with_friction
+from ident_service.estimation.least_squares import ordinary_least_squares, unit_columns
+from ident_service.estimation.uncertainty import uncertainty
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.chain import Array
+from ident_service.model.information import supports
+from ident_service.recordings.recording import Recording
+
+_STEP = 1e-3  # of a number's logarithm
+_RANK_TOLERANCE = 1e-10
+
+
+def shape_covariance(
+    recordings: Sequence[Recording],
+    model: ArmModel,
+    base: BaseParameters,
+    fitted: Sequence[str],
+    beta: Array,
+    weights: Array,
+    torque_scales: Array,
+    shares: Array,
+) -> Array:
+    """Give the covariance of base parameters by the doubt about the friction's shape, shape (base, base), SI units.
+
+    Args:
+        recordings: that both were fitted to.
+        model: the arm, the shape of its friction as numbers.
+        base: grouping of its parameters.
+        fitted: which of the numbers were fitted, as `to_be_fitted` names them.
+        beta: base parameters, shape (base,).
+        weights: per joint, what its equations are multiplied by, shape (joints,).
+        torque_scales: what each joint's measured torque is multiplied by, shape (joints,).
+        shares: what rows near standstill are multiplied by, shape (joints,).
+
+    Raises:
+        RecordingError: a recording cannot be used.
+    """
+    size, drives = base.size, model.chain.joints
+    columns = _friction_columns(model, base)
+    if not fitted or not len(columns):
+        return np.zeros((size, size))
+    others = [_moved(model, key) for key in fitted]
+    own = replace(base, base=base.base[columns])
+
+    def rows_of(recording: Recording) -> Iterator[Rows]:
+        moved = [equation_rows(recording, other, own) for other in others]
+        for rows, *shifted in zip(equation_rows(recording, model, base), *moved, strict=True):
+            derivatives = [
+                _per_drive((other.H_b - rows.H_b[:, columns]) * beta[columns, None] / _STEP, base.base[columns], model)
+                for other in shifted
+            ]
+            yield replace(rows, H_b=np.concatenate([rows.H_b, *derivatives], axis=1))
+
+    further = np.arange(len(fitted) * drives)
+    felt = tuple(
+        np.concatenate([support, size + further[np.tile(model.chain.coupling[:, joint] != 0.0, len(fitted))]])
+        for joint, support in enumerate(supports(model.chain, model.layout, base.base))
+    )
+    gathered = equations_of(recordings, model, felt, rows_of).with_torques_times(torque_scales).with_near(shares)
+    fit = ordinary_least_squares(gathered.total, weights)
+    W, D = fit.R1[:, :size], fit.R1[:, size:]
+    # A number that was left out, or belongs to friction that is not there, moves nothing.
+    _, seen = unit_columns(fit.R1)
+    used = seen[size:]
+    if not used.any():
+        return np.zeros((size, size))
+    scale, _ = unit_columns(W)
+    follow = -np.linalg.lstsq(W / scale, D[:, used], rcond=_RANK_TOLERANCE)[0] / scale[:, None]
+    most = np.repeat([searched(key) for key in fitted], drives)[used]
+    found = uncertainty(gathered, fit).covariance[size:, size:][np.ix_(used, used)]
+    added = follow @ _at_most(found, most) @ follow.T
+    return np.asarray(0.5 * (added + added.T))
+
+
+def _friction_columns(model: ArmModel, base: BaseParameters) -> NDArray[np.intp]:
+    """Give the places of Coulomb and Stribeck friction among the base parameters."""
+    terms = [term for term in ("coulomb", "stribeck") if term in model.layout.terms]
+    wanted = [column for term in terms for column in model.layout.term_columns(term)]
+    return np.flatnonzero(np.isin(base.base, wanted))
+
+
+def _per_drive(changes: Array, columns: NDArray[np.intp], model: ArmModel) -> Array:
+    """Sum torques of friction's columns, shape (joints, columns, samples), for each drive."""
+    links = columns // model.layout.per_link
+    return np.stack([changes[:, links == drive].sum(axis=1) for drive in range(model.chain.joints)], axis=1)
+
+
+def _moved(model: ArmModel, key: str) -> ArmModel:
+    """Give the arm with one kind of number larger by the step, of all drives at once."""
+    shape = model.config.identification.friction
+    value = np.broadcast_to(np.asarray(getattr(shape, key), dtype=float), (model.chain.joints,))
+    larger = tuple((value * np.exp(_STEP)).tolist())
+    return with_friction(model, shape.model_copy(update={key: larger}))
+
+
+def _at_most(covariance: Array, most: Array) -> Array:
+    """Bound deviations; what the data do not see, or one block alone, has the bound and no correlation."""
+    variances = np.diag(covariance)
+    known = np.isfinite(variances)
+    inner = np.where(np.outer(known, known), covariance, 0.0)
+    factor = np.minimum(1.0, most / np.sqrt(np.where(known & (variances > 0.0), variances, most**2)))
+    return np.asarray(inner * np.outer(factor, factor) + np.diag(np.where(known, 0.0, most**2)))

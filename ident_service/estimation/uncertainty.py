@@ -1,0 +1,221 @@
+"""Estimate parameter uncertainty: covariance from blocks of scores, and a verdict per base parameter.
+
+Eq. 81 takes residuals for independent from sample to sample; smoothing and unmodelled friction make neighbours alike.
+Here the variance of the score `W^T (omega - W beta)` is estimated from blocks of about a second (a cluster-robust
+"sandwich"), each block weighted as if it had been left out (the jackknife, HC3), which is on the careful side when
+blocks are few. What a single block alone tells cannot be left out: nothing says how sure that is.
+
+Blocks that show the same motion are one (`repeats.py`): what repeats with the motion is error of the model and does not
+shrink with its periods; only what differs between them is noise (Pintelon and Schoukens 2012, chapter 4).
+
+A variance from few blocks is itself uncertain. How many degrees of freedom it has follows Satterthwaite's approximation
+for such estimators (Bell and McCaffrey, 2002). The deviation that people are told is widened by as much as Student's t
+is wider than the normal distribution, so that two deviations are 95 % whatever the number of blocks. Blocks of two and
+of four times the length are tried, too, and the largest deviation counts: errors of the model last as long as a slow
+joint stays where it is (decision 0063).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.estimation.least_squares import LeastSquares
+from ident_service.model.blas_threads import one_blas_thread
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+
+if TYPE_CHECKING:
+    from ident_service.estimation.equations import Equations
+
+Verdict = Literal["identified", "weak", "unidentified"]
+
+# Share of a joint's torque over the motion (root mean squares); a parameter with less effect is as good as zero.
+NEGLIGIBLE_TORQUE = 0.10
+IDENTIFIED_BELOW = 0.10
+WEAK_BELOW = 0.50
+_ALONE = 1.0 - 1e-4  # leverage above which one block alone determines a direction
+_SEEN_ALONE = 1e-3  # share of a parameter's variance along such directions, above which it is unknown
+_MOST_DEGREES = 1e6
+_LONGER = (2, 4)  # numbers of neighbouring blocks that are also merged into one
+_LEAST_CLUSTERS = 5
+_NORMAL = 1.959963984540054  # 97.5 % of the normal distribution
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Covariance and standard deviations of an unconstrained estimate.
+
+    Attributes:
+        covariance: shape (base, base), SI units; infinite on the diagonal for what the data, or more than one block of
+            them, do not see. No variance is below that of eq. 81. For tests, which know the degrees of freedom.
+        deviations: standard deviations on the careful side, shape (base,), SI units: the largest of several lengths of
+            the blocks, widened for its degrees of freedom.
+        degrees: degrees of freedom of those deviations before they were widened, shape (base,).
+        noise: variances [SI^2] by what differs between repetitions of the motion, shape (base,); None where most of the
+            motion is not repeated, so that noise and error of the model cannot be told apart.
+    """
+
+    covariance: Array
+    deviations: Array
+    degrees: Array
+    noise: Array | None = None
+
+
+@one_blas_thread()
+def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
+    """Estimate covariance, standard deviations and degrees of freedom from blocks.
+
+    Args:
+        equations: in blocks.
+        fit: what solves them.
+    """
+    clusters = equations.clusters
+    covariance, degrees, blind = jackknife(clusters, fit)
+    deviations = np.sqrt(np.diag(covariance))
+    known = ~blind & (deviations > 0.0)
+    floor = np.where(known, np.maximum(deviations, np.where(known, fit.standard_deviations, 0.0)), deviations)
+    scale = np.where(known, floor / np.where(known, deviations, 1.0), 1.0)
+    covariance = covariance * np.outer(scale, scale)
+    covariance[blind, blind] = np.inf
+    largest = floor * widening(degrees)
+    # Errors of the model last longer than a block where a joint is slow.
+    for count in _LONGER:
+        if len(clusters) < _LEAST_CLUSTERS * count:
+            break
+        longer = [sum(clusters[start : start + count], ()) for start in range(0, len(clusters), count)]
+        other, fewer, _ = jackknife(longer, fit)
+        found = np.sqrt(np.diag(other)) * widening(fewer)
+        degrees = np.where(found > largest, fewer, degrees)
+        largest = np.maximum(largest, found)
+    return Uncertainty(covariance, np.where(blind, np.inf, largest), degrees, _noise(clusters, fit))
+
+
+def jackknife(
+    clusters: Sequence[Sequence[Information]], fit: LeastSquares, along: Array | None = None
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Estimate a covariance by leaving out one cluster after the other (HC3).
+
+    Args:
+        clusters: blocks that count as one.
+        fit: what solves all of them.
+        along: combinations of the parameters, shape (base, combinations); each parameter alone when None. The
+            covariance of few blocks says nothing about combinations, as it knows most of them far too well: their
+            degrees of freedom must be asked for with them.
+
+    Returns:
+        The covariance of the combinations, shape (combinations, combinations); degrees of freedom of its variances,
+        shape (combinations,); and of which of them the data, or all clusters but one, say nothing.
+    """
+    size = len(fit.beta)
+    asked = np.eye(size) if along is None else along
+    meat = np.zeros((size, size))
+    bread = fit.inverse @ fit.inverse.T
+    wanted = bread @ asked
+    variances = np.maximum(np.sum(asked * wanted, axis=0), np.finfo(float).tiny)
+    alone = np.zeros(len(variances))  # largest share of a white variance along a direction of one cluster alone
+    lengths, images = np.zeros((len(clusters), len(alone))), np.zeros((len(clusters), size, len(alone)))
+    for number, cluster in enumerate(clusters):
+        block = Information.sum(cluster)
+        score = block.scores(fit.beta, fit.weights)
+        W = block.stacked(fit.weights)[:-1, :-1]
+        # Leave-one-out: the score times (1 - leverage)^-1, solved in the cluster's own small space.
+        shares, U = np.linalg.eigh(W @ bread @ W.T)
+        others = shares < _ALONE
+        inverse = (U[:, others] / (1.0 - shares[others])) @ U[:, others].T
+        inverse = inverse @ W
+        full = score + W.T @ (inverse @ (bread @ score))
+        meat += np.outer(full, full)
+        alone = np.maximum(alone, np.sum((U[:, ~others].T @ (W @ wanted)) ** 2, axis=0) / variances)
+        left_out = inverse @ wanted
+        lengths[number] = np.sum(left_out**2, axis=0)
+        images[number] = fit.inverse.T @ (W.T @ left_out)
+    unseen = ~np.isfinite(fit.standard_deviations)
+    blind = np.any(asked[unseen] != 0.0, axis=0) | (alone > _SEEN_ALONE)
+    return wanted.T @ meat @ wanted, _degrees(lengths, images), blind
+
+
+def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Array | None:
+    """Return the variances from differences between blocks of the same motion; None where most blocks have no other."""
+    differing = np.zeros((len(fit.beta), len(fit.beta)))
+    repeated = rows = 0
+    for cluster in clusters:
+        scores = np.array([block.scores(fit.beta, fit.weights) for block in cluster])
+        count = len(cluster)
+        apart = scores if count == 1 else np.sqrt(count / (count - 1)) * (scores - scores.mean(axis=0))
+        differing += apart.T @ apart
+        size = sum(int(block.rows.sum()) for block in cluster)
+        rows, repeated = rows + size, repeated + (size if count > 1 else 0)
+    bread = fit.inverse @ fit.inverse.T
+    return np.diag(bread @ differing @ bread).copy() if repeated > 0.5 * rows else None
+
+
+def widening(degrees: Array) -> Array:
+    """Return the factors of standard deviations that make 1.96 of them the 95 % of Student's t, shape (base,).
+
+    Args:
+        degrees: of freedom, shape (base,).
+    """
+    from scipy.special import stdtrit  # loads for 0.2 s, and a run without a target judges nothing
+
+    return np.asarray(stdtrit(np.maximum(degrees, 1.0), 0.975) / _NORMAL)
+
+
+def _degrees(lengths: Array, images: Array) -> Array:
+    """Return Satterthwaite's degrees of freedom tr(G)^2 / |G|^2 of each variance, the quadratic form G of the errors.
+
+    With white errors, G_bc = [b = c] |g_b|^2 - m_b . m_c for blocks b and c: g_b is what the block's errors are
+    multiplied by (squared lengths `lengths`, shape (blocks, asked)), m_b its image under the estimate (`images`, shape
+    (blocks, base, asked)). `asked` are parameters or combinations of them.
+    """
+    own = np.sum(images**2, axis=1)
+    trace = np.sum(lengths - own, axis=0)
+    products = np.einsum("bik,bjk->kij", images, images, optimize=True)
+    squares = np.sum(lengths**2 - 2.0 * lengths * own, axis=0) + np.sum(products**2, axis=(1, 2))
+    found = np.maximum(trace, 0.0) ** 2 / np.maximum(squares, np.finfo(float).tiny)
+    return np.asarray(np.minimum(found, _MOST_DEGREES))
+
+
+def block_covariance(equations: Equations, fit: LeastSquares) -> Array:
+    """Return the covariance alone, shape (base, base), see `Uncertainty`."""
+    return uncertainty(equations, fit).covariance
+
+
+def negligible(information: Information) -> Array:
+    """Return the sizes below which parameters are as good as zero on a motion, shape (base,), SI units.
+
+    A parameter of this size makes a tenth of the torque of some joint that feels it, and no more of any other's. So a
+    deviation of a tenth of it, with which it is called identified, is a hundredth of the joint's torque.
+    """
+    size = np.full(information.base, np.inf)
+    torques = np.sqrt(information.squared_torques())
+    for torque, support, factor in zip(torques, information.supports, information.factors, strict=True):
+        columns = np.linalg.norm(factor[:, :-1], axis=0)
+        felt = columns > 0.0
+        size[support[felt]] = np.minimum(size[support[felt]], NEGLIGIBLE_TORQUE * torque / columns[felt])
+    return size
+
+
+def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, ...]:
+    """Return a verdict per parameter: its deviation against the larger of its size and what is as good as zero.
+
+    Args:
+        beta: parameters, shape (base,).
+        deviations: of them, shape (base,).
+        as_zero: sizes below which parameters are as good as zero, shape (base,), see `negligible`.
+    """
+    return tuple(
+        "identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified"
+        for share in shares(beta, deviations, as_zero)
+    )
+
+
+def shares(beta: Array, deviations: Array, as_zero: Array) -> Array:
+    """Return each deviation as a share of the larger of the parameter's size and what is as good as zero."""
+    sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
+    # Parameters that no joint feels have infinite negligible sizes.
+    return np.where(np.isfinite(deviations), deviations, np.inf) / np.where(np.isfinite(sizes), sizes, 1.0)

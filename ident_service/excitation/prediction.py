@@ -1,0 +1,216 @@
+"""Predict what a motion will teach and how far the arm will fall behind it.
+
+Rows whitened by each joint's torque noise, `G = sum_s H_b' S^-1 H_b`, give the covariance `G^-1` of the best linear
+estimate (eq. 81 with a noise per joint). Noise that resembles itself from sample to sample teaches less than white
+noise of the same size: `NoiseModel.inflation` is by how much deviations grow.
+
+Drives are expected to take `f(w) = F_c s(w) + F_v w` at their velocity w. The law adds the share s_f of it, for the
+velocity of the reference (`FrictionFeedforward`). What is left, `d = (b - s_f) f` where friction is b times what is
+expected, computed torque (eq. 76) answers with the error `e = K_p^-1 M(q)^-1 d`, once it has settled. Where little
+inertia stands behind a joint, as behind the upper arm's rotation when the elbow is straight, little friction moves it
+far. It is static, so a prediction and no bound; the safety monitor keeps the limit.
+
+Friction is the prior's where it has some, else a guess from the torque limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ident_service.config.motion_limits import MotionLimits
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.excitation.trajectory import FourierPath, PosturePath
+from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.chain import Array
+from ident_service.model.expected_friction import ExpectedFriction
+from ident_service.model.inertia_response import InertiaResponse
+from ident_service.model.regressor import joint_regressor
+
+if TYPE_CHECKING:
+    import scipy.sparse
+
+
+_NOISE_SHARE = 0.01  # of the torque limit, where nothing is known of a joint's noise
+_SAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """Expected size and correlation of the torque residual.
+
+    Attributes:
+        deviation: per joint [N m or N], shape (joints,).
+        inflation: standard deviations of parameters against those that white noise would give.
+        source: where it comes from, for people.
+    """
+
+    deviation: Array
+    inflation: float
+    source: str
+
+
+def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
+    """Return the noise of the arm's description: the simulated driver's, else one hundredth of the torque limits."""
+    driver = model.config.driver
+    fallback = _NOISE_SHARE * limits.torque
+    if isinstance(driver, SimulatedDriver):
+        noise = np.broadcast_to(np.asarray(driver.torque_noise, dtype=float), fallback.shape)
+        if (noise > 0.0).any():
+            return NoiseModel(np.where(noise > 0.0, noise, fallback), 1.0, "the driver's torque noise")
+    return NoiseModel(fallback, 1.0, f"{_NOISE_SHARE:.0%} of the torque limits, nothing better being known")
+
+
+def information(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, noise: Array) -> Array:
+    """Return the information per second of a motion, its ramps left out, shape (base, base).
+
+    Args:
+        path: the motion.
+        model: of the arm.
+        base: the parameters.
+        noise: standard deviation of each joint's torque, shape (joints,).
+    """
+    begin, end = path.distinct[1] if len(path.distinct) > 1 else path.distinct[0]
+    time = begin + (np.arange(_SAMPLES) + 0.5) * (end - begin) / _SAMPLES
+    q, dq, ddq, _ = path.at(time)
+    H = joint_regressor(model.chain, model.layout, q, dq, ddq, base.base)
+    return np.asarray(sum(rows @ rows.T / sigma**2 for rows, sigma in zip(H, noise, strict=True)) / _SAMPLES)
+
+
+def seconds_of_information(path: FourierPath | PosturePath) -> float:
+    """Return the time for which `information` holds [s]; ramps count for nothing."""
+    return path.periods * path.series.period if isinstance(path, FourierPath) else path.duration
+
+
+def expected_deviations(
+    path: FourierPath | PosturePath,
+    model: ArmModel,
+    base: BaseParameters,
+    noise: NoiseModel,
+    added: Array | None = None,
+) -> Array:
+    """Return the expected standard deviations of the base parameters [SI], shape (base,); infinite where unseen.
+
+    Args:
+        path: the motion.
+        model: of the arm; its control rate is that of the recording.
+        base: the parameters.
+        noise: of the torques.
+        added: information from earlier recordings, whitened by `noise.deviation`, shape (base, base).
+    """
+    G = information(path, model, base, noise.deviation) * seconds_of_information(path) * model.config.control.rate
+    if added is not None:
+        G = G + added
+    # Parameters have units of their own; scaled to a unit diagonal, what is not taught shows as an eigenvalue of zero.
+    size = np.sqrt(np.diag(G))
+    seen = size > 0.0
+    deviations = np.full(len(G), np.inf)
+    if not seen.any():
+        return deviations
+    scaled = G[np.ix_(seen, seen)] / np.outer(size[seen], size[seen])
+    eigenvalues, V = np.linalg.eigh(scaled)
+    taught = eigenvalues > 1e-12 * eigenvalues[-1]
+    variance = (V[:, taught] ** 2 / eigenvalues[taught]).sum(axis=1)
+    variance[(V[:, ~taught] ** 2).sum(axis=1) > 1e-9] = np.inf
+    deviations[seen] = noise.inflation * np.sqrt(variance) / size[seen]
+    return deviations
+
+
+# Where the inertia behind a joint changes, so does how far it falls behind, and its speed is another than asked for.
+TOLERATED = 1.05  # share of the velocity limit; the safety monitor stops at 1.2
+USABLE = 0.8  # share of the limit: settling overshoots a little, and the prediction is static
+# Times the expected friction, between which an arm's own lies for a forecast: it changes by a third between a cold and
+# a warm drive (Bittencourt & Gunnarsson 2012, figure 5).
+DOUBT = (0.6, 1.4)
+
+
+def dry_friction(model: ArmModel, delta: Array) -> tuple[Array, Array]:
+    """Return the largest dry friction of every drive and of every joint [N m or N], each of shape (joints,)."""
+    drives = np.abs(model.layout.term_values("coulomb", delta)) + np.abs(model.layout.term_values("stribeck", delta))
+    return drives, drives @ np.abs(model.chain.coupling)
+
+
+def unknown_friction(friction: ExpectedFriction, share: float) -> ExpectedFriction:
+    """Return the most of the expected friction that a feed-forward of `share` leaves, either way, within `DOUBT`."""
+    left = max(DOUBT[1] - share, share - DOUBT[0])
+    return ExpectedFriction(left * friction.coulomb, left * friction.viscous, 0.0 * friction.offset)
+
+
+class FollowingError:
+    """Predicted following error at many states, with derivatives of functions of it."""
+
+    def __init__(self, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, creep: Array) -> None:
+        """Build the inertia response of the prior model.
+
+        Args:
+            model: with prior parameters.
+            limits: for the gains.
+            friction: of the drives, as much of it as the law does not know (`unknown_friction`).
+            creep: velocity over which a joint's Coulomb friction turns round [rad/s or m/s], shape (joints,).
+
+        Raises:
+            ModelError: no prior, or one that no real body has.
+        """
+        known = control_model(model).prior
+        prior = np.zeros(model.layout.size) if known is None else known
+        self._response = InertiaResponse(model.chain, model.layout, prior)
+        self._coupling, self._kp = model.chain.coupling, limits.kp
+        self._friction, self._creep = friction, creep
+        self._slope = np.zeros((0, len(creep)))
+
+    def run(self, position: Array, velocity: Array) -> Array:
+        """Return the predicted error [rad or m], shape (samples, joints), at states of shape (samples, joints)."""
+        rate = velocity @ self._coupling.T
+        turned = np.tanh(rate / self._creep)
+        self._slope = self._friction.viscous + self._friction.coulomb * (1.0 - turned**2) / self._creep
+        torque = (self._friction.coulomb * turned + self._friction.viscous * rate) @ self._coupling
+        return self._response.run(position, torque) / self._kp
+
+    def pull(self, seeds: Array) -> tuple[Array, Array]:
+        """Return the gradient of `sum(seeds * run(...))` over position and velocity, each (samples, joints)."""
+        by_position, by_torque = self._response.pull(seeds / self._kp)
+        return by_position, ((by_torque @ self._coupling.T) * self._slope) @ self._coupling
+
+
+def rate_of_change(times: Array) -> scipy.sparse.csr_array:
+    """Return the matrix that takes values at `times` [s] to time derivatives, by differences of neighbours.
+
+    Neighbours are samples of one stretch; where times jump or turn back, another stretch begins.
+    """
+    import scipy.sparse  # loads for 0.1 s, and only a design needs it
+
+    steps = np.diff(times)
+    usual = np.median(np.abs(steps))
+    jumps = np.abs(steps) > 1.6 * usual
+    turns = (np.sign(steps[1:]) != np.sign(steps[:-1])) & ~jumps[:-1]
+    apart = jumps | np.concatenate([[False], turns])
+    stretch = np.concatenate([[0], np.cumsum(apart)])
+    n = len(times)
+    index = np.arange(n)
+    before = np.where((index > 0) & (stretch == np.roll(stretch, 1)), index - 1, index)
+    after = np.where((index < n - 1) & (stretch == np.roll(stretch, -1)), index + 1, index)
+    gap = times[after] - times[before]
+    weight = np.where(gap != 0.0, 1.0 / np.where(gap != 0.0, gap, 1.0), 0.0)
+    rows = np.concatenate([index, index])
+    return scipy.sparse.csr_array((np.concatenate([weight, -weight]), (rows, np.concatenate([after, before]))), (n, n))
+
+
+def forecast(
+    model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, position: Array, velocity: Array
+) -> Array:
+    """Return the largest predicted following error of every joint over a motion [rad or m], shape (joints,).
+
+    Args:
+        model: of the arm; its description says which share of the friction is fed forward.
+        limits: for the gains.
+        friction: expected of the drives.
+        position: [rad or m], shape (samples, joints).
+        velocity: [rad/s or m/s], shape (samples, joints).
+    """
+    sharp = np.full(len(limits.kp), 1e-6)
+    unknown = unknown_friction(friction, model.config.control.friction_feedforward)
+    behind = FollowingError(model, limits, unknown, sharp).run(position, velocity)
+    return np.asarray(np.abs(behind).max(axis=0))

@@ -1,0 +1,84 @@
+"""Model what dry friction is multiplied by: the sign of the velocity, or Dahl's pre-sliding state.
+
+`model/friction_state.py` has it for a whole recording; this is one step of the same solution. Where the drive moves by
+`step` without turning round, the direction s goes to
+
+    s' = sign(step) + (s - sign(step)) exp(-|step| / x0)
+
+exactly, however long the step is. With x0 = 0 it is the sign. Pure computation, no I/O.
+
+A drive that turns round does not change its friction at once: teeth and bearings give by some micrometres or
+milliradians first. The simplest law for that is Dahl's (1968),
+
+    ds/dx = (1 - s sign(v)) / x0
+
+whose solution between two reversals is an exponential in the distance travelled, so it costs nothing to compute. With
+x0 = 0 it is the sign.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+
+
+def presliding_ways(model: ArmModel) -> Array:
+    """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,).
+
+    Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.
+    """
+    given = model.config.identification.friction.presliding
+    if given == "fit" or not {"coulomb", "stribeck"} & set(model.layout.terms):
+        return np.zeros(model.chain.joints)
+    return np.array(np.broadcast_to(np.asarray(given, dtype=float), (model.chain.joints,)))
+
+
+def turned(direction: Array, step: Array, ways: Array) -> Array:
+    """Return the direction of dry friction after a step.
+
+    Args:
+        direction: before it, between -1 and 1, shape (..., drives).
+        step: what the drives travel, none turning round meanwhile [rad or m], shape (..., drives).
+        ways: x0 [rad or m], shape (drives,).
+
+    Returns:
+        Shape (..., drives).
+    """
+    sign, distance = np.sign(step), np.abs(step)
+    left = np.exp(-distance / np.where(ways > 0.0, ways, 1.0))
+    return np.asarray(sign + np.where(ways > 0.0, (direction - sign) * left, 0.0))
+
+
+def direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
+    """Return the direction of friction of each drive, between -1 and 1.
+
+    Args:
+        rate: drive velocities [rad/s or m/s], shape (samples, drives).
+        period: of the samples [s].
+        presliding: x0 per drive [rad or m], shape (drives,); 0 for the sign itself.
+        start: direction before the first sample, shape (drives,); the first sign that follows when None.
+
+    Returns:
+        Shape (samples, drives).
+    """
+    result = np.empty_like(rate)
+    for drive, x0 in enumerate(presliding):
+        signs = np.sign(rate[:, drive])
+        if x0 <= 0.0:
+            result[:, drive] = signs
+            continue
+        # Where the velocity is exactly zero nothing is travelled, and the last sign may stand.
+        moving = np.flatnonzero(signs)
+        before = signs[moving[0]] if start is None and len(moving) else 0.0 if start is None else float(start[drive])
+        travelled = np.cumsum(np.abs(rate[:, drive])) * (period / x0)
+        last = np.maximum.accumulate(np.where(signs != 0.0, np.arange(len(signs)), -1))
+        held = np.where(last >= 0, signs[np.maximum(last, 0)], np.sign(before) or 1.0)
+        turns = np.flatnonzero(np.diff(held)) + 1
+        state, reached = before, 0.0
+        for begin, end in zip([0, *turns], [*turns, len(held)], strict=True):
+            part = slice(begin, end)
+            result[part, drive] = held[begin] + (state - held[begin]) * np.exp(reached - travelled[part])
+            state, reached = result[end - 1, drive], travelled[end - 1]
+    return result

@@ -1,0 +1,593 @@
+"""Take commands while a motion runs: stop, pause, finish and leases, from this process or another.
+
+An arm without brakes that has been stopped is held, and waits for a person to say that it is supported.
+
+The loop reads this once per cycle, so it must answer at once: a word of shared memory, an attribute, never a lock.
+Stop needs no lease. Hold-to-run is nothing but a short lease.
+
+| offset | type | what |
+|---|---|---|
+| 0 | 8 bytes | `identctl` |
+| 8 | uint32 | version |
+| 12 | uint32 | pid of the process that moves the arm |
+| 16 | uint8 | stop: not 0 for a controlled stop; never taken back |
+| 17 | uint8 | pause: not 0 while the arm shall stand |
+| 18 | uint8 | finish: not 0 when the run shall end early, in order; never taken back |
+| 19 | uint8 | waiting: not 0 while the arm is held until a person confirms that it is supported; of the loop |
+| 20 | uint8 | supported: not 0 when that was confirmed; counts while the arm waits for it |
+| 21 | uint8 | homing: 1 when a person asked that the held arm be led home, then the loop's answer (`controls.Homing`) |
+| 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
+| 32 | int64 | how long it lasts [ns]; 0 for none |
+| 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
+| 48 | int64 | when the lease of a way home was renewed last [ns of the same] |
+
+A motion takes seconds to begin, in which no loop can be reached yet. So a stop leaves its time behind, and a motion
+that was asked for before it takes the controls with the stop in them.
+
+Every word is written by one side at a time and read whole. The loop reads memory, so reading costs it nothing and no
+other process can make it wait. The process that moves the arm holds an exclusive lock on the file, which vanishes with
+the process: a second one is refused, and a file without a lock belongs to no process.
+
+The lease is measured on the machine's clock: it is about a process that hangs, not about the arm. `command_channel.py`
+says when it counts.
+
+The pipe ends with the process at its other end, however that dies, and within a cycle; so does the motion, in real and
+in virtual time. The lease is for one that lives but hangs. It is measured on the machine's clock, because that is where
+a process hangs, and counts in real time only: in lock step the arm's time waits for nobody but the plant and the
+recorder, seconds of it pass while the machine stalls for none, and a stall would be taken for a silence. No real arm
+moves in lock step.
+
+Preflight moves an arm by a few centimetres, and ends whatever goes wrong with torque off; so does a stop in it.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import mmap
+import os
+import select
+import struct
+import time
+from collections.abc import Callable
+from enum import IntEnum
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
+from drivers.axis_status import AxisStatus
+from ident_service.errors import DriverError, UsageError
+
+LEASE_SECONDS = 2.0  # ARCHITECTURE.md: renewed every 0.5 s
+HOLD_TO_RUN_SECONDS = 0.25
+
+
+class Homing(IntEnum):
+    """Name the stages of leading home an arm that is held after a stop."""
+
+    NONE = 0
+    ASKED = 1
+    GOING = 2
+    ENDED = 3  # it stands again and is held, at home unless it was stopped
+    REFUSED = 4  # it stands where it stood
+
+
+class Controls(Protocol):
+    """Define the controls that the loop reads once per cycle; whatever they raise stops the arm."""
+
+    @property
+    def stop(self) -> bool:
+        """Return whether the arm is to be brought to a controlled stop; the run ends with it."""
+
+    @property
+    def pause(self) -> bool:
+        """Return whether the arm is to pause; it goes on when this is False again."""
+
+    @property
+    def finish(self) -> bool:
+        """Return whether the rest of the motion is to be left out: the arm rests, and goes back to where it stood."""
+
+    @property
+    def supported(self) -> bool:
+        """Return whether a person has confirmed, since the arm began to wait for it, that it is supported or home."""
+
+    def wait_for_support(self) -> None:
+        """Announce that the arm is held until a person confirms that it is supported; called once for each hold."""
+
+    @property
+    def homing(self) -> Homing:
+        """Return whether a person wants the held arm led home, and the stage of that."""
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Set the stage of leading the arm home; from `GOING` on, the lease of its requester counts."""
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Return whether the requester of the motion is still alive, at this time of the loop's clock [ns]."""
+
+
+class StopWhen:
+    """Provide controls that neither pause nor finish early: the arm stops when a function returns true.
+
+    A second function tells whether the arm, held after that stop, is supported.
+    """
+
+    pause = False
+    finish = False
+    homing = Homing.NONE
+
+    def __init__(
+        self, asked: Callable[[], bool] = lambda: False, supported: Callable[[], bool] = lambda: False
+    ) -> None:
+        self._asked, self._supported = asked, supported
+
+    @property
+    def stop(self) -> bool:
+        """Return whether the stop function asks for a stop."""
+        return self._asked()
+
+    @property
+    def supported(self) -> bool:
+        """Return whether the support function says that the arm is supported."""
+        return self._supported()
+
+    def wait_for_support(self) -> None:
+        """Do nothing: the support function is asked in every cycle."""
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Do nothing: these controls never ask for the way home."""
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Return True: there is no lease to lose."""
+        return True
+
+
+class Switches:
+    """Hold controls as attributes for use within this process, each written and read whole.
+
+    Attributes:
+        stop: the arm is to stop.
+        pause: the arm is to stand.
+        finish: the run is to end early.
+        supported: the arm, which is held, is supported.
+        waiting: whether the arm is held until that is so.
+        homing: the arm, which is held, is to be led home.
+    """
+
+    def __init__(self, lease_seconds: float | None = None) -> None:
+        """Start with all controls off.
+
+        Args:
+            lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
+        """
+        self.stop = False
+        self.pause = False
+        self.finish = False
+        self.supported = self.waiting = False
+        self.homing = Homing.NONE
+        self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
+        self._renewed_ns: int | None = None
+
+    def wait_for_support(self) -> None:
+        """Wait for the switch `supported`; one that was set before does not count."""
+        self.supported, self.waiting = False, True
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Set the stage of leading the arm home; `stop`, which preceded it, is off while the arm goes home."""
+        if stage is Homing.GOING:
+            self.stop = self.pause = self.waiting = False
+        self.homing = stage
+
+    def renew(self, now_ns: int) -> None:
+        """Renew the lease at a time of the loop's clock [ns]."""
+        self._renewed_ns = now_ns
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Return whether the lease was renewed in time; before any renewal, the first call starts it."""
+        if self._length_ns is None:
+            return True
+        if self._renewed_ns is None:
+            self._renewed_ns = now_ns
+        return now_ns - self._renewed_ns <= self._length_ns
+
+
+_MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
+_PID, _STOP, _PAUSE, _FINISH, _WAITING, _SUPPORTED, _RENEWED, _LENGTH, _STOPPED = 12, 16, 17, 18, 19, 20, 24, 32, 40
+_HOMING, _HOME_RENEWED = 21, 48
+_TRIES, _TRY_AGAIN = 20, 0.005  # s; a process that checks whether the file is in use locks it for a moment
+
+
+class ControlFile:
+    """Represent the controls of one arm; `motion/command_channel.py` says how the loop reads them."""
+
+    def __init__(self, fd: int, memory: mmap.mmap, now_ns: Callable[[], int]) -> None:
+        self._fd, self._memory, self._now_ns = fd, memory, now_ns
+        # Words of 64 bits, each read and written whole: `struct` with a byte order goes byte by byte.
+        self._view = memoryview(memory)
+        self._words = self._view.cast("q")
+
+    @classmethod
+    def take(
+        cls,
+        path: Path,
+        lease_seconds: float | None,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        asked_ns: int | None = None,
+    ) -> Self:
+        """Take the controls of the arm as the process that moves it: all controls off, the lease renewed.
+
+        Only a stop that was asked for after `asked_ns` is there from the beginning.
+
+        Args:
+            path: of the file; made where it is missing.
+            lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
+            now_ns: the lease's clock.
+            asked_ns: when the motion was asked for, on that clock [ns]; when None, no earlier stop counts.
+
+        Raises:
+            DriverError: another process moves the arm.
+            UsageError: the file cannot be made.
+        """
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise UsageError(f"{path}: cannot be made: {error.strerror}; give another state folder") from None
+        if not _locked(fd):
+            pid = _pid_in(fd)
+            os.close(fd)
+            raise DriverError(f"the arm is in use by process {pid}; `ident stop` stops it")
+        os.ftruncate(fd, _SIZE)
+        memory = mmap.mmap(fd, _SIZE)
+        length = 0 if lease_seconds is None else round(lease_seconds * 1e9)
+        memory[:_STOPPED] = _MAGIC + struct.pack("<IIBB6xqq", _VERSION, os.getpid(), 0, 0, now_ns(), length)
+        taken = cls(fd, memory, now_ns)
+        # Read last: a stop either finds these controls in place, or has left its time behind before.
+        stopped = taken._words[_STOPPED // 8]
+        # One that seems yet to come is from before the machine was started.
+        if asked_ns is not None and asked_ns <= stopped <= now_ns():
+            taken.ask_stop()
+        return taken
+
+    @classmethod
+    def reach(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> Self:
+        """Open the controls of an arm that another process moves.
+
+        Raises:
+            UsageError: no process moves the arm.
+        """
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError:
+            raise UsageError(f"nobody moves the arm ({path} does not exist)") from None
+        try:
+            fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            if os.fstat(fd).st_size == _SIZE and os.pread(fd, 8, 0) == _MAGIC:
+                return cls(fd, mmap.mmap(fd, _SIZE), now_ns)
+        os.close(fd)
+        raise UsageError(f"nobody moves the arm ({path} is left from a run that has ended)")
+
+    @classmethod
+    def stop_all(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
+        """Bring an arm to a controlled stop, and let no motion begin that has been asked for already.
+
+        Args:
+            path: of the file; made where it is missing.
+            now_ns: the clock of `take`.
+
+        Returns:
+            The id of the process that moves the arm; None where none does.
+
+        Raises:
+            UsageError: the file cannot be written; an arm that moves has been stopped all the same.
+        """
+        refusal: OSError | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            try:
+                os.pwrite(fd, struct.pack("<q", now_ns()), _STOPPED)
+            finally:
+                os.close(fd)
+        except OSError as error:
+            refusal = error
+        try:
+            with cls.reach(path, now_ns) as controls:
+                controls.ask_stop()
+                return controls.pid
+        except UsageError:
+            if refusal is not None:
+                raise UsageError(f"{path}: cannot be written: {refusal.strerror}; nobody moves the arm now") from None
+            return None
+
+    @property
+    def pid(self) -> int:
+        """Return the id of the process that moves the arm."""
+        return int(struct.unpack_from("<I", self._memory, _PID)[0])
+
+    @property
+    def stop(self) -> bool:
+        """Return whether the arm is to be brought to a controlled stop."""
+        return self._memory[_STOP] != 0
+
+    def ask_stop(self) -> None:
+        """Bring the arm to a controlled stop; needs no lease and cannot be taken back."""
+        self._memory[_STOP] = 1
+
+    @property
+    def pause(self) -> bool:
+        """Return whether the arm is to pause."""
+        return self._memory[_PAUSE] != 0
+
+    def ask_pause(self, wanted: bool) -> None:
+        """Pause the arm, or let it go on."""
+        self._memory[_PAUSE] = int(wanted)
+
+    @property
+    def finish(self) -> bool:
+        """Return whether the run is to end early, where it began."""
+        return self._memory[_FINISH] != 0
+
+    def ask_finish(self) -> None:
+        """Let the run end early, in order; cannot be taken back. A pause stays one until that is taken back."""
+        self._memory[_FINISH] = 1
+
+    @property
+    def waiting(self) -> bool:
+        """Return whether the arm is held until a person confirms that it is supported or home."""
+        return self._memory[_WAITING] != 0
+
+    def wait_for_support(self) -> None:
+        """Announce that the arm is held until a person confirms that it is supported; for the process that moves it."""
+        self._memory[_SUPPORTED] = 0
+        self._memory[_WAITING] = 1
+
+    @property
+    def supported(self) -> bool:
+        """Return whether a person has confirmed the support since the arm began to wait for it."""
+        return self._memory[_SUPPORTED] != 0
+
+    def confirm_support(self) -> None:
+        """Confirm, as a person who sees it, that the arm is supported or home; cannot be taken back.
+
+        Raises:
+            UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
+        """
+        if not self.waiting:
+            raise UsageError("the arm is not held after a stop; there is nothing to confirm")
+        self._memory[_SUPPORTED] = 1
+
+    @property
+    def homing(self) -> Homing:
+        """Return the stage of leading a held arm home."""
+        return Homing(self._memory[_HOMING])
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Set the stage of leading a held arm home; for the process that moves it."""
+        if stage is Homing.GOING:
+            self._memory[_WAITING] = 0
+        self._memory[_HOMING] = stage
+
+    def ask_home(self) -> None:
+        """Have the arm, which is held after a stop, led home; `renew_home` from now on, four times a second.
+
+        Raises:
+            UsageError: the arm is not held; one that moves is stopped before it is led elsewhere.
+        """
+        if not self.waiting:
+            raise UsageError("the arm is not held after a stop; `ident stop` comes first, or its run is waited for")
+        begun = self._now_ns()
+        self.renew_home()
+        self._memory[_STOP] = self._memory[_PAUSE] = 0
+        if self._words[_STOPPED // 8] >= begun:  # asked for by another process in this moment
+            self._memory[_STOP] = 1
+        self._memory[_HOMING] = Homing.ASKED
+
+    def renew_home(self) -> None:
+        """Renew the lease of the requester of the motion home."""
+        self._words[_HOME_RENEWED // 8] = self._now_ns()
+
+    def home_lease_ok(self) -> bool:
+        """Return whether the lease of the requester of the motion home was renewed within `LEASE_SECONDS`."""
+        return self._now_ns() - self._words[_HOME_RENEWED // 8] <= round(LEASE_SECONDS * 1e9)
+
+    def renew(self) -> None:
+        """Renew the lease of the requester of the motion."""
+        self._words[_RENEWED // 8] = self._now_ns()
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Return whether the lease was renewed in time, by the machine's clock instead of the loop's."""
+        renewed, length = self._words[_RENEWED // 8], self._words[_LENGTH // 8]
+        return length == 0 or self._now_ns() - renewed <= length
+
+    def close(self) -> None:
+        """Release the lock and the memory."""
+        self._words.release()
+        self._view.release()
+        self._memory.close()
+        os.close(self._fd)
+
+    def __enter__(self) -> Self:
+        """Return these controls."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the controls."""
+        self.close()
+
+
+def mover(path: Path) -> int | None:
+    """Return the id of the process that moves the arm of a control file, None when no process does."""
+    try:
+        with ControlFile.reach(path) as controls:
+            return controls.pid
+    except UsageError:
+        return None
+
+
+def stop_asked_ns(path: Path) -> int:
+    """Return when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except OSError:
+        return 0
+    try:
+        stamp = os.pread(fd, 8, _STOPPED)
+    finally:
+        os.close(fd)
+    return int(struct.unpack("<q", stamp)[0]) if len(stamp) == 8 else 0
+
+
+def in_use(path: Path) -> bool:
+    """Return whether a process moves the arm of a control file."""
+    try:
+        fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    try:
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(fd)
+    return False
+
+
+def _locked(fd: int) -> bool:
+    """Take the exclusive lock, unless another process keeps it; returns whether it was taken."""
+    for again in range(_TRIES):
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(_TRY_AGAIN if again + 1 < _TRIES else 0.0)
+        else:
+            return True
+    return False
+
+
+def _pid_in(fd: int) -> int:
+    head = os.pread(fd, 16, 0)
+    return int(struct.unpack_from("<I", head, _PID)[0]) if len(head) == 16 else 0
+
+
+class Lifeline:
+    """Implement the loop's `Controls` in a process of its own, supervised by pipe and lease."""
+
+    def __init__(self, controls: ControlFile, pipe: int, *, lock_step: bool) -> None:
+        """Use the given control file and pipe.
+
+        Args:
+            controls: taken by this process.
+            pipe: readable end of the pipe that the requester of the motion holds open; a file or a device, too, which
+                never ends.
+            lock_step: whether the loop's clock waits (a clock's `lock_step`).
+        """
+        self._controls, self._lock_step = controls, lock_step
+        self._poll = select.poll()
+        self._poll.register(pipe, 0)  # nothing but its end
+
+    @property
+    def stop(self) -> bool:
+        """Return whether the arm is to be brought to a controlled stop."""
+        return self._controls.stop
+
+    @property
+    def pause(self) -> bool:
+        """Return whether the arm is to pause."""
+        return self._controls.pause
+
+    @property
+    def finish(self) -> bool:
+        """Return whether the run is to end early."""
+        return self._controls.finish
+
+    @property
+    def supported(self) -> bool:
+        """Return whether a person has confirmed that the waiting arm is supported or home."""
+        return self._controls.supported
+
+    def wait_for_support(self) -> None:
+        """Announce that the arm is held until a person confirms that it is supported."""
+        self._controls.wait_for_support()
+
+    @property
+    def homing(self) -> Homing:
+        """Return the stage of leading a held arm home."""
+        return self._controls.homing
+
+    def tell_homing(self, stage: Homing) -> None:
+        """Set the stage of leading a held arm home."""
+        self._controls.tell_homing(stage)
+
+    @property
+    def cut(self) -> bool:
+        """Return whether the other end of the pipe is closed."""
+        return bool(self._poll.poll(0))
+
+    def lease_ok(self, now_ns: int) -> bool:
+        """Return whether the requester of the motion is still alive; a system call that does not wait.
+
+        The motion home of a held arm has another requester, whose lease counts instead.
+        """
+        if self._controls.homing is Homing.GOING:
+            return self._lock_step or self._controls.home_lease_ok()
+        return not self.cut and (self._lock_step or self._controls.lease_ok(now_ns))
+
+
+class StoppableArm(Arm):
+    """Wrap an arm and refuse to enable it, or to send a torque, once a stop was asked for."""
+
+    def __init__(self, arm: Arm, asked: Callable[[], bool]) -> None:
+        """Wrap the given arm; `asked` returns whether it is to stop."""
+        self._arm, self._asked = arm, asked
+        self.clock = arm.clock
+
+    def open(self) -> None:
+        """Open the wrapped arm and use its clock."""
+        self._arm.open()
+        self.clock = self._arm.clock
+
+    def describe(self) -> ArmDescription:
+        """Return the wrapped arm's description."""
+        return self._arm.describe()
+
+    def enable(self) -> None:
+        """Enable the wrapped arm; raises DriverError instead once a stop was asked for."""
+        self._require_not_asked()
+        self._arm.enable()
+
+    def reset(self) -> None:
+        """Reset the wrapped arm."""
+        self._arm.reset()
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        """Exchange with the wrapped arm; raises DriverError instead of sending a torque once a stop was asked for."""
+        if torque is not None:
+            self._require_not_asked()
+        return self._arm.exchange(torque)
+
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        """Return the wrapped arm's watchdogs."""
+        return self._arm.watchdogs()
+
+    def withhold(self, kind: str) -> None:
+        """Withhold what watchdogs of one kind watch from the wrapped arm's drives."""
+        self._arm.withhold(kind)
+
+    def drive_status(self) -> tuple[AxisStatus, ...]:
+        """Return the wrapped arm's drive status."""
+        return self._arm.drive_status()
+
+    def stop(self, kind: StopKind) -> None:
+        """Stop the wrapped arm."""
+        self._arm.stop(kind)
+
+    def close(self) -> None:
+        """Close the wrapped arm."""
+        self._arm.close()
+
+    def _require_not_asked(self) -> None:
+        if self._asked():
+            raise DriverError("somebody asked for a stop")

@@ -1,0 +1,135 @@
+"""Detect frozen encoders: estimate how far a joint whose position reads constant would have moved against dry friction.
+
+Behind a light joint a small torque makes a large speed before a push that is large for the drive is reached, so what is
+asked is not how hard a joint is pushed but what the push must have done. The push c is the correction and the friction
+fed forward. Dry friction f holds a joint that stands still within `[-f, f]`, so the push can change by
+`2 f` from the `c_0` with which the position last changed before the joint must move; one that was sliding is held by
+`f` already, and a change that pushes it on in its direction moves it, but for what friction is larger at rest. With the
+allowance b of the one case or the other
+
+    dv = max(|c - c_0| - b, 0) / m_jj(q) dt          dd = v dt
+
+with m the inertia of the prior alone: with the drive inertia that the description states, the estimate d would grow
+more slowly, and behind a light joint too slowly. Of the change only as much counts as is also the joint's own, what is
+fed forward and `M_jj (a - a_0)_j` with M the control law's inertia and a the feedback acceleration: the rest balances
+what other joints' corrections do to it. A joint whose estimated displacement d is more than its encoder's steps can
+hide is not where its encoder says. A jammed joint looks the same, and so does one whose dry friction is far larger than
+configuration says.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from drivers.arm import Counts, Flags, Vector
+from ident_service.config.motion_limits import MotionLimits
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.expected_friction import expected_friction
+from ident_service.model.pinocchio_models import InverseDynamics
+
+# Times the expected friction, which is a guess: by how much the push may change against a joint that stands, and along
+# the direction of one that slid, since friction is larger at rest and other joints react.
+STANDING, SLIDING = 3.0, 1.0
+SLID = 20  # cycles within which a second step in the same direction shows that a joint slides
+OWED, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
+
+
+class Owed:
+    """Observe joints whose encoders may be frozen: integrate the motion that each joint's push should have caused."""
+
+    def __init__(
+        self,
+        dynamics: InverseDynamics,
+        limits: MotionLimits,
+        period: float,
+        friction: Vector,
+        resolution: Vector,
+        least: InverseDynamics | None = None,
+    ) -> None:
+        """Start with an estimated displacement of zero.
+
+        Args:
+            dynamics: the control law's model.
+            limits: of the arm.
+            period: of the loop [s].
+            friction: dry friction expected of each joint [N m or N], shape (joints,).
+            resolution: smallest step of the positions [rad or m], shape (joints,).
+            least: the prior model; the control law's when None.
+        """
+        self._dynamics, self._least, self._period = dynamics, least or dynamics, period
+        self._standing, self._sliding = STANDING * friction, SLIDING * friction
+        self._hidden = OWED * limits.following_error + STEPS * resolution
+        self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
+        self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
+        self._base_fed = np.zeros_like(friction)
+        self._none: Flags = np.zeros(len(friction), dtype=bool)
+        self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
+        self._cycle = 0
+        self._stepped: Counts = np.zeros(len(friction), dtype=np.int64)
+        self._owing = False
+
+    def update(
+        self,
+        direction: Vector,
+        correction: Vector,
+        answer: Vector,
+        position: Vector,
+        feedforward: Vector | float = 0.0,
+    ) -> Flags:
+        """Update the estimate for one cycle.
+
+        Args:
+            direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape
+                (joints,).
+            correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
+                allows no conclusion.
+            answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
+            position: last known [rad or m], shape (joints,).
+            feedforward: friction in the torque [N m or N], shape (joints,).
+
+        Returns:
+            Which joints should have moved farther than their encoders can hide, shape (joints,).
+        """
+        self._cycle += 1
+        pushed = correction + feedforward
+        changed = direction != 0.0
+        if changed.any():
+            slides = (direction == self._direction) & (self._cycle - self._stepped <= SLID)
+            np.copyto(self._slid, direction * slides, where=changed)
+            np.copyto(self._direction, direction, where=changed)
+            np.copyto(self._stepped, self._cycle, where=changed)
+            np.copyto(self._base, pushed, where=changed)
+            np.copyto(self._base_answer, answer, where=changed)
+            np.copyto(self._base_fed, feedforward, where=changed)
+        change = pushed - self._base
+        allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
+        if not (np.abs(change) > allowed).any():
+            self._forgive()
+            return self._none
+        if not correction.any():
+            self._base, self._base_answer = correction.copy(), answer.copy()
+            self._base_fed = np.zeros_like(correction)
+            self._forgive()
+            return self._none
+        inertia = np.diag(self._dynamics.mass_matrix(position))
+        own = np.sign(change) * (inertia * (answer - self._base_answer) + feedforward - self._base_fed)
+        push = np.minimum(np.abs(change), own) - allowed
+        acting, gained = push > 0.0, push / np.diag(self._least.mass_matrix(position)) * self._period
+        self._speed = np.where(acting, self._speed + gained, 0.0)
+        self._way = np.where(acting, self._way + self._speed * self._period, 0.0)
+        self._owing = True
+        return np.asarray(self._way > self._hidden)
+
+    def _forgive(self) -> None:
+        if self._owing:
+            self._speed, self._way, self._owing = np.zeros_like(self._speed), np.zeros_like(self._way), False
+
+
+def owed_ways(
+    dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, resolution: Vector
+) -> Owed:
+    """Create the frozen-encoder observer of an arm; dry friction is the prior's, at least the configuration's guess."""
+    guess = model.config.design.friction_guess
+    expected = expected_friction(model, limits, guess).at_joints(model.chain).coulomb
+    least = None if model.prior is None else InverseDynamics(model.chain, model.layout, model.prior)
+    return Owed(dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution, least)

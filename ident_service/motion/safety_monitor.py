@@ -1,0 +1,536 @@
+"""Judge every sample before the next torque leaves, and every torque before it leaves.
+
+Called only when `safety_monitor.py` has found that some threshold is violated.
+
+Nearly all cycles are healthy, so all thresholds are compared at once, in one array. Only when one of them is violated
+is each compared by itself and put into words. NaN violates every threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.arm import Counts, Flags, Sample, Vector
+from drivers.axis_status import TRIPPED, AxisEvent, AxisStatus
+from ident_service.config.motion_limits import MotionLimits
+from ident_service.model.collision import Contact
+from ident_service.motion.encoder_observer import Owed
+from ident_service.motion.faults import Fault, Findings
+from ident_service.motion.faults import Reaction as Reaction
+from ident_service.motion.trajectory import Setpoint
+
+
+def told(events: Sequence[AxisEvent], names: Sequence[str], findings: Findings) -> Fault | None:
+    """Return the most severe fault among the events of one sample.
+
+    Args:
+        events: of the sample.
+        names: of the joints.
+        findings: makes the faults; every warning is counted.
+
+    Returns:
+        The most severe fault, the first of equals; None without events.
+    """
+    worst: Fault | None = None
+    for event in events:
+        whose = "" if event.axis is None else f"{names[event.axis]}: "
+        found = findings.found(event.code.value, f"{whose}{event.words}")
+        if worst is None or found.reaction > worst.reaction:
+            worst = found
+    return worst
+
+
+MAX_AGE = 3  # cycles without an axis' feedback before it counts as gone, where its driver does not say (FIELDBUS.md)
+VELOCITY_STOP, VELOCITY_OFF = 1.2, 2.0  # times the velocity limit (ODrive stops at 1.2)
+JUMP = 4.0  # times what the velocity limit allows in one cycle, away from where the arm should have gone on to
+# A position that stays the same to the last bit for `FROZEN_CYCLES`, while the controller asks for more than
+# `FROZEN_EFFORT` of the torque limit beyond the model's torque: no free joint stands that long against that much.
+FROZEN_CYCLES, FROZEN_EFFORT = 20, 0.2
+# Likewise one that moved at more than `SUDDEN_SPEED` of its velocity limit and then stands still to the last bit for
+# `SUDDEN_CYCLES`: only a hard stop does that. Behind light joints the push above may never come.
+SUDDEN_CYCLES, SUDDEN_SPEED = 10, 0.1
+FOLLOWING_LOST = 2.0  # times the following error allowed
+# Towards a position limit no motion within the acceleration limit a is faster than sqrt(2 a d) at a distance d from it
+# (FIELDBUS.md). The arm may brake `ENVELOPE` times as hard, and be `ENVELOPE_SLACK` of its velocity limit faster.
+ENVELOPE, ENVELOPE_SLACK = 1.5, 0.2
+# Share of the torque limit by which the acting torque may differ from the one asked for, and the measured one from
+# both. A healthy drive is within its current loop's offset and noise, some hundredths of its largest torque.
+NOT_APPLIED = 0.1
+
+
+@dataclass(frozen=True)
+class Check:
+    """Represent the comparison of one quantity with its threshold, for all joints.
+
+    Attributes:
+        code: of the fault that a violation would be.
+        hit: where the threshold is violated, shape (joints,) or (names,).
+        what: the sentence's middle; `{}` stands for numbers, `{u}` for the position's unit, `{f}` for the torque's.
+        numbers: one array, shaped like `hit`, for each `{}`.
+        names: of what `hit` is about, the joints when None.
+    """
+
+    code: str
+    hit: Flags
+    what: str
+    numbers: tuple[Vector, ...] = ()
+    names: Sequence[str] | None = None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Hold a sample together with the state known from the samples before it.
+
+    Attributes:
+        sample: of this cycle.
+        wanted: where the arm should be [rad or m], shape (joints,).
+        position: last usable one of each axis [rad or m], shape (joints,).
+        velocity: filtered [rad/s or m/s], shape (joints,).
+        usable: which axes' positions may be used.
+        jumped: which have just jumped.
+        age: cycles since each was usable.
+        jumps: jumps of each in a row.
+        frozen: which encoders stand still although the joint cannot.
+        was_powered: which axes' drives have said so before.
+        sent: last torque asked for [N m or N], shape (joints,), or None.
+        max_age: cycles without an axis' feedback before it counts as gone.
+        depths: how deep pairs of solids reach into each other [m].
+        pairs: names for them.
+    """
+
+    sample: Sample
+    wanted: Vector
+    position: Vector
+    velocity: Vector
+    usable: Flags
+    jumped: Flags
+    age: Counts
+    jumps: Counts
+    frozen: Flags
+    was_powered: Flags
+    sent: Vector | None
+    max_age: int
+    depths: Vector
+    pairs: tuple[str, ...]
+
+
+def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Yield all checks of a sample, ordered by how far the data they need can be believed."""
+    yield from _what_cannot_be_believed(seen, limits)
+    yield from _what_has_failed(seen)
+    yield from _what_must_end(seen, limits)
+    yield from _what_can_be_bridged(seen, limits)
+
+
+def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Check for faults that take the torque off: feedback that is not credible, an emergency stop, a runaway."""
+    sample, position, speed = seen.sample, seen.position, np.abs(seen.velocity)
+    bad = sample.valid & ~np.isfinite(sample.position)
+    yield Check("feedback_not_finite", bad, "position is not a number")
+    if sample.velocity is not None:
+        yield Check("feedback_not_finite", sample.valid & ~np.isfinite(sample.velocity), "velocity is not a number")
+    yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "torque that acts is not a number")
+    yield Check("emergency_stop", _says(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
+    what = "position unchanged to the last bit although the joint moved or was pushed"
+    yield Check("frozen_encoder", seen.frozen, what)
+    beyond, limit = _beyond(position, limits)
+    what = "at {} {u}, more than a following error beyond the position limit of {} {u}"
+    yield Check("far_outside", beyond > limits.following_error, what, (position, limit))
+    what = f"moves at {{}} {{u}}/s, more than {VELOCITY_OFF:g} times the limit of {{}} {{u}}/s"
+    yield Check("runaway", speed > VELOCITY_OFF * limits.velocity, what, (seen.velocity, limits.velocity))
+
+
+def _what_has_failed(seen: Seen) -> Iterator[Check]:
+    """Check for faults that lead to a quick stop."""
+    yield Check("drive_fault", _says(seen, AxisStatus.FAULT), "the drive reports a fault")
+    yield Check("drive_watchdog", _says(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
+    unpowered = seen.was_powered & ~_says(seen, AxisStatus.POWERED) & bool(seen.sample.status)
+    yield Check("drive_fault", unpowered, "the drive is no longer energised")
+    yield Check("feedback_gone", seen.age >= seen.max_age, f"no usable feedback for {seen.max_age} cycles")
+
+
+def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Check for faults that lead to damped lowering, then for those that lead to a controlled stop."""
+    position, velocity, speed = seen.position, seen.velocity, np.abs(seen.velocity)
+    away, allowed = np.abs(seen.wanted - position), limits.following_error
+    what = "{} {u} from where it should be, {} {u} allowed"
+    yield Check("following_lost", away > FOLLOWING_LOST * allowed, what, (away, allowed))
+    yield Check("encoder_jumps", seen.jumps >= 2, "position jumped in consecutive cycles")
+    beyond, limit = _beyond(position, limits)
+    yield Check("position_limit", beyond > 0.0, "at {} {u}, beyond the limit of {} {u}", (position, limit))
+    towards = np.where(velocity > 0.0, limits.upper - position, position - limits.lower)
+    envelope = approach_speed(towards, limits)
+    what_near = "moves towards its position limit at {} {u}/s, {} {u}/s allowed so near to it"
+    yield Check("position_envelope", speed > envelope, what_near, (velocity, envelope))
+    what_fast = f"moves at {{}} {{u}}/s, more than {VELOCITY_STOP:g} times the limit of {{}} {{u}}/s"
+    yield Check("over_velocity", speed > VELOCITY_STOP * limits.velocity, what_fast, (velocity, limits.velocity))
+    yield Check("following_error", away > allowed, what, (away, allowed))
+    yield Check("workspace", seen.depths > 0.0, "touch, {} m deep", (seen.depths,), seen.pairs)
+
+
+def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+    """Check for warnings."""
+    jumped_to = seen.sample.position
+    yield Check("encoder_jump", seen.jumped, "position jumped to {} {u} from {} {u}", (jumped_to, seen.position))
+    yield Check("lost_feedback", ~seen.usable, "no feedback in this cycle")
+    if seen.sent is not None:
+        differs = np.abs(seen.sample.torque - seen.sent) > NOT_APPLIED * limits.torque
+        what = "the drive gives {} of the {} {f} it was told"
+        yield Check("torque_not_applied", differs, what, (seen.sample.torque, seen.sent))
+    if (more := seen.sample.torque_difference) is not None:
+        what = "the drive measures {} {f} more than it was told, at {} {f}"
+        yield Check("torque_not_applied", np.abs(more) > NOT_APPLIED * limits.torque, what, (more, seen.sample.torque))
+
+
+def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
+    """Return the largest speed allowed towards a position limit.
+
+    Args:
+        distance: from the limit, negative beyond it [rad or m], shape (joints,).
+        limits: of the arm.
+
+    Returns:
+        sqrt(2 a d) with the allowances `ENVELOPE` and `ENVELOPE_SLACK` [rad/s or m/s], shape (joints,).
+    """
+    squared = np.maximum(2.0 * ENVELOPE * limits.acceleration * distance, 0.0)
+    return np.asarray(np.sqrt(squared + (ENVELOPE_SLACK * limits.velocity) ** 2))
+
+
+def in_words(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
+    """Describe a violated check in words: the joints concerned, and what was measured.
+
+    Args:
+        check: with at least one hit.
+        names: of the joints.
+        units: of their positions.
+    """
+    hit: list[int] = np.flatnonzero(check.hit).tolist()
+    names = check.names or names
+    texts = [", ".join(f"{number[k]:.4g}" for k in hit) for number in check.numbers]
+    unit = "" if check.names else units[hit[0]]
+    force = {"rad": "N m", "m": "N"}.get(unit, "")
+    return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
+
+
+def _beyond(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
+    """Return how far positions [rad or m] are outside their limits, and the limit concerned, shape (joints,) each."""
+    above, below = position - limits.upper, limits.lower - position
+    return np.maximum(above, below), np.where(above > below, limits.upper, limits.lower)
+
+
+def _says(seen: Seen, bit: AxisStatus) -> Flags:
+    """Return which axes' status words have a bit set, shape (joints,)."""
+    status = seen.sample.status or (0,) * len(seen.position)
+    return np.array([bool(word & bit) for word in status])
+
+
+ABSURD = 3.0  # times the torque limit: no controller here asks for that
+# Change of torque: libfranka's 1000 N m/s; on small joints, which that would not limit, from none to full in 10 ms.
+TORQUE_RATE, TORQUE_RATE_SHARE = 1000.0, 100.0  # N m/s or N/s; times the torque limit per second
+
+
+class Guard:
+    """Check every sample and every torque of one motion.
+
+    Attributes:
+        findings: makes the faults and counts the warnings, of others than the guard too.
+        rate: largest change of torque per cycle [N m or N], shape (joints,).
+    """
+
+    def __init__(
+        self,
+        joint_names: tuple[str, ...],
+        limits: MotionLimits,
+        period: float,
+        position: Vector,
+        *,
+        revolute: tuple[bool, ...] | None = None,
+        contact: Contact | None = None,
+        owed: Owed | None = None,
+        max_age: int = MAX_AGE,
+    ) -> None:
+        """Start with the arm standing at a position.
+
+        Args:
+            joint_names: for the sentences.
+            limits: of the arm.
+            period: of the loop [s].
+            position: where it stands [rad or m], shape (joints,).
+            revolute: which joints turn, for the units in the sentences; all when None.
+            contact: pairs of solids that may not touch; None for no collision check.
+            owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full
+                motion reveal frozen encoders.
+            max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
+        """
+        joints = len(position)
+        self.findings = Findings()
+        self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
+        self._names, self._limits, self._period = joint_names, limits, period
+        self._elapsed, self._known, self._max_age = period, True, max_age
+        self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
+        self._contact = contact if contact is not None and contact.pairs else None
+        self._pairs = contact.pairs if contact is not None else ()
+        self._owed = owed
+        self._position = self._shown = position.copy()
+        self._age: Counts = np.zeros(joints, dtype=np.int64)
+        self._jumps: Counts = np.zeros(joints, dtype=np.int64)
+        self._still: Counts = np.zeros(joints, dtype=np.int64)
+        self._unchanged: Counts = np.zeros(joints, dtype=np.int64)
+        self._sudden = np.zeros(joints, dtype=bool)
+        self._owes: Flags = np.zeros(joints, dtype=bool)
+        self._all_fresh = self._none_still = self._all_change = True
+        self._depths = np.zeros(len(self._pairs))
+        self._sent: Vector | None = None
+        self._healthy: tuple[int, ...] = ()
+        self._was_powered = np.zeros(joints, dtype=bool)
+        self._jump = JUMP * limits.velocity * period
+        self._push = FROZEN_EFFORT * limits.torque
+        self._not_applied = NOT_APPLIED * limits.torque
+        together = np.eye(joints, dtype=bool) if limits.motors is None else limits.motors.together
+        self._joined = together @ together.T  # which joints share motors
+        self._braking = 2.0 * ENVELOPE * limits.acceleration
+        zero, slack = np.zeros(joints), (ENVELOPE_SLACK * limits.velocity) ** 2
+        away = limits.following_error
+        self._bounds = np.array([zero, zero, slack, slack, VELOCITY_STOP * limits.velocity, away, self._jump])
+        self._values = np.zeros_like(self._bounds)
+        self._rows = tuple(self._values)
+
+    @property
+    def warnings(self) -> dict[str, int]:
+        """Return how often each warning was found, by code."""
+        return self.findings.warnings
+
+    def feedback(
+        self,
+        sample: Sample,
+        reference: Setpoint,
+        velocity: Vector,
+        correction: Vector,
+        answer: Vector | None = None,
+        elapsed: float | None = None,
+        feedforward: Vector | float = 0.0,
+        *,
+        known: bool = True,
+    ) -> tuple[Flags, Fault | None]:
+        """Check a sample against all thresholds; returns the usable positions and the most severe fault.
+
+        Args:
+            sample: of this cycle.
+            reference: where the arm should be at its stamp.
+            velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
+            correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
+            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, `owed` is not updated.
+            elapsed: since the sample before [s]; one period when None.
+            known: whether `elapsed` is the true time; if not, it is the longest that it may be.
+            feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
+                against its own friction as the correction does.
+
+        Returns:
+            Which axes' positions may be used, and the most severe fault found, if any.
+        """
+        self.findings.cycle += 1
+        self._elapsed, self._known = self._period if elapsed is None else elapsed, known
+        answered = bool(sample.valid.all())
+        self._count_still(sample, correction + feedforward)
+        self._count_unchanged(sample, velocity)
+        if self._owed is not None and answer is not None:
+            up, down = sample.position > self._shown, sample.position < self._shown
+            direction = np.where(sample.valid, up * 1.0 - down, 0.0)
+            self._owes = self._owed.update(direction, correction, answer, self._position, feedforward)
+        held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
+        if held and self._plain(sample):
+            # Copied, in case that a driver fills the same array again.
+            self._position = self._shown = sample.position.copy()
+            usable, fault = sample.valid, None
+        else:
+            with np.errstate(all="ignore"):
+                usable, fault = self._judged(sample, reference.position, velocity)
+        if sample.events:
+            event = told(sample.events, self._names, self.findings)
+            # Of equally severe faults, a drive's event tells more than its status word.
+            if event is not None and (fault is None or event.reaction >= fault.reaction):
+                fault = event
+        return usable, fault
+
+    def torque(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+        """Check and limit a torque; the first torque is not limited in rate, because the support yields to it.
+
+        Args:
+            wanted: by the controller [N m or N], shape (joints,).
+
+        Returns:
+            The torque that may leave: within limits, or zero when the fault takes torque away.
+        """
+        limit, before, motors = self._limits.torque, self._sent, self._limits.motors
+        size = np.abs(wanted)
+        if (
+            (size <= limit).all()
+            and (motors is None or (motors.used(wanted) <= 1.0).all())
+            and (before is None or (np.abs(wanted - before) <= self.rate).all())
+        ):
+            self._sent = wanted
+            return wanted, None
+        finite = np.isfinite(wanted)
+        what = f"a torque of {{}} {{f}} was asked for, more than {ABSURD:g} times the limit of {{}}"
+        for check in (
+            Check("torque_not_finite", ~finite, "the torque asked for is not a number"),
+            Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),
+        ):
+            if check.hit.any():
+                return np.zeros_like(limit), self._found(check)
+        leaves = np.clip(wanted, -limit, limit)
+        over, fault = size > limit, None
+        if over.any():
+            what = "a torque of {} {f} was asked for, the limit is {}"
+            fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
+        if motors is not None and (over := motors.used(leaves) > 1.0).any():
+            what = "a torque of {} N m was asked for, the limit is {}"
+            asked = leaves @ motors.to_motors.T
+            fault = self._found(Check("torque_saturated", over, what, (asked, motors.torque), motors.names))
+            leaves = motors.limited(leaves)
+        if before is not None and (fast := np.abs(leaves - before) > self.rate).any():
+            change = (leaves - before) / self._period
+            what = "the torque was to change by {} {f}/s, {} allowed"
+            found = self._found(Check("torque_rate", fast, what, (change, self.rate / self._period)))
+            leaves = self._slowed(before, leaves)
+            fault = found if fault is None or found.reaction > fault.reaction else fault
+        self._sent = leaves
+        return leaves, fault
+
+    def _slowed(self, before: Vector, wanted: Vector) -> Vector:
+        """Return the torque on the way from the last one to the one wanted that the rate allows."""
+        if self._limits.motors is None:
+            return np.clip(wanted, before - self.rate, before + self.rate)
+        # Joints that share motors change by the same share: between two torques that their motors can give lies one
+        # that they can give, but not where each joint goes its own share of the way.
+        change = np.abs(wanted - before)
+        share = np.minimum(1.0, self.rate / np.maximum(change, self.rate))
+        return np.asarray(before + np.where(self._joined, share, 1.0).min(axis=1) * (wanted - before))
+
+    def about(self, joint: int, what: str, velocity: float) -> str:
+        """Return the beginning of a sentence about one joint; `{}` in `what` stands for its velocity [rad/s or m/s]."""
+        return f"{self._names[joint]}: {what.format(f'{velocity:.4g} {self._units[joint]}/s')}"
+
+    def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:
+        """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
+        above, below, to_upper, to_lower, speed, away, jump = self._rows
+        np.subtract(position, self._limits.upper, out=above)
+        np.subtract(self._limits.lower, position, out=below)
+        np.abs(velocity, out=speed)
+        signed = velocity * speed
+        # v |v| - 2 a d, towards either limit.
+        np.multiply(self._braking, above, out=to_upper)
+        np.add(to_upper, signed, out=to_upper)
+        np.multiply(self._braking, below, out=to_lower)
+        np.subtract(to_lower, signed, out=to_lower)
+        np.subtract(wanted, position, out=away)
+        np.abs(away, out=away)
+        np.subtract(position, self._position, out=jump)
+        np.subtract(jump, velocity * self._elapsed, out=jump)
+        np.abs(jump, out=jump)
+        self._bounds[-1] = self._farthest()
+        return bool((self._values <= self._bounds).all())
+
+    def _farthest(self) -> Vector:
+        """Return how far a position may be from the expected one [rad or m], shape (joints,)."""
+        return self._jump if self._known else self._jump * (self._elapsed / self._period)
+
+    def _plain(self, sample: Sample) -> bool:
+        """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""
+        if not (self._none_still and self._all_change) and bool(self._frozen().any()):
+            return False
+        if sample.status is not self._healthy and not self._all_well(sample.status):
+            return False
+        if self._sent is not None and not bool((np.abs(sample.torque - self._sent) <= self._not_applied).all()):
+            return False
+        if sample.torque_difference is not None and not bool(
+            (np.abs(sample.torque_difference) <= self._not_applied).all()
+        ):
+            return False
+        if sample.velocity is not None and not bool(np.isfinite(sample.velocity).all()):
+            return False
+        if self._contact is None:
+            return True
+        self._depths = self._contact.depths(sample.position)
+        return bool((self._depths <= 0.0).all())
+
+    def _all_well(self, status: tuple[int, ...]) -> bool:
+        """Return whether no drive has tripped or lost its power; remembers healthy status words."""
+        if status != self._healthy:
+            powered = np.array([bool(word & AxisStatus.POWERED) for word in status])
+            if any(word & TRIPPED for word in status) or bool((self._was_powered & ~powered).any()):
+                return False
+            self._was_powered = powered
+        self._healthy = status
+        return True
+
+    def _judged(self, sample: Sample, wanted: Vector, velocity: Vector) -> tuple[Flags, Fault | None]:
+        """Check a sample that may violate a threshold, threshold by threshold."""
+        position = sample.position
+        # If the window only grew with the age, the second reading of a wrong position would be accepted.
+        expected = self._position + velocity * (self._elapsed + self._period * self._age)
+        jumped = sample.valid & (np.abs(position - expected) > self._farthest())
+        usable = sample.valid & ~jumped
+        self._jumps = np.where(jumped, self._jumps + 1, 0)
+        self._age = np.where(usable, 0, np.maximum(self._age + 1, sample.age))
+        self._position = np.where(usable, position, self._position)
+        self._all_fresh = not self._age.any()
+        self._shown = np.where(sample.valid, position, self._shown)
+        if sample.status:
+            self._all_well(sample.status)
+        if self._contact is not None and bool(np.isfinite(self._position).all()):
+            self._depths = self._contact.depths(self._position)
+        seen = Seen(
+            sample,
+            wanted,
+            self._position,
+            velocity,
+            usable,
+            jumped,
+            self._age,
+            self._jumps,
+            self._frozen(),
+            self._was_powered,
+            self._sent,
+            self._max_age,
+            self._depths,
+            self._pairs,
+        )
+        for check in checks(seen, self._limits):
+            if check.hit.any():
+                return usable, self._found(check)
+        return usable, None
+
+    def _count_still(self, sample: Sample, correction: Vector) -> None:
+        """Count for how many cycles each position has stood still while the controller pushed."""
+        pushed = np.abs(correction) > self._push
+        if pushed.any():
+            changed = sample.valid & (sample.position != self._shown)
+            self._still = np.where(pushed & ~changed, self._still + 1, 0)
+            self._none_still = False
+        elif not self._none_still:
+            self._still = np.zeros_like(self._still)
+            self._none_still = True
+
+    def _count_unchanged(self, sample: Sample, velocity: Vector) -> None:
+        """Count for how many cycles each position has stood still, and note whether that began in full motion."""
+        same = sample.position == self._shown
+        if same.any():
+            same &= sample.valid
+            fast = np.abs(velocity) > SUDDEN_SPEED * self._limits.velocity
+            self._sudden = np.where(self._unchanged == 0, same & fast, self._sudden)
+            self._unchanged = np.where(same, self._unchanged + 1, 0)
+            self._all_change = False
+        elif not self._all_change:
+            self._unchanged = np.zeros_like(self._unchanged)
+            self._all_change = True
+
+    def _frozen(self) -> Flags:
+        """Return which encoders stand still although the joint cannot."""
+        return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES)) | self._owes
+
+    def _found(self, check: Check) -> Fault:
+        return self.findings.found(check.code, in_words(check, self._names, self._units))

@@ -1,0 +1,554 @@
+"""Answer for an arm's buses: their load, who is on them, and what their drives can.
+
+Drives are read by SDO uploads alone; for a drive that does not answer, and for files without a drive, the capabilities
+are derived from the data sheet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from drivers.can.bus_state import BusError
+from drivers.can.can_link import Link, open_links
+from drivers.canopen.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line, budget
+from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
+from drivers.canopen.capabilities import Capabilities, capabilities, foretold, judged, named, where
+from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
+from drivers.canopen.drive_setup import IDENTITY, differences
+from drivers.canopen.pdo_mapping import bus_profiles
+from drivers.canopen.sdo import Objects
+from ident_service.config.arm import ArmConfig
+from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
+from ident_service.config.eds import data_sheet
+from ident_service.config.load import mistake
+from ident_service.config.quantities import TextFile
+from ident_service.errors import DriverError, UsageError
+
+_HEAD = f"  {'frames':<28}{'COB-IDs':<12}{'bytes':>6}{'Hz':>7}{'one of them, us':>24}{'load of all, %':>24}"
+_UNDER = f"  {'':<53}{'least':>8}{'typical':>8}{'worst':>8}{'least':>8}{'typical':>8}{'worst':>8}"
+
+
+def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
+    """Return what an arm's frames cost on its buses.
+
+    Args:
+        config: the arm's.
+        rate: cycles per second; by default the arm's.
+
+    Raises:
+        UsageError: the arm's driver has no bus that frames could be counted on.
+    """
+    if not isinstance(config.driver, CanopenDriver):
+        kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
+        raise UsageError(f"{config.name} has {kind}; a bus load is that of CANopen drives (driver.kind: canopen)")
+    return budget(config.driver, config.control.rate if rate is None else rate)
+
+
+def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
+    """Return the bus budget of an arm with CANopen drives, which must fit; None for other arms.
+
+    Args:
+        arm: its file, or its name if it is shipped.
+        config: what stands there.
+
+    Raises:
+        ConfigError: over budget; the mistake has the place of the driver, and the remedies.
+    """
+    if not isinstance(config.driver, CanopenDriver):
+        return None
+    found = bus_load(config)
+    if not found.fits:
+        raise mistake(arm, ("driver",), f"{found.reason}. {found.remedy}")
+    return found
+
+
+def bus_lines(found: Budget) -> str:
+    """Format the verdict as one line per bus."""
+    return "".join(
+        f"bus {bus.profile.number} ({bus.profile.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
+        f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
+        for bus in found.buses
+    )
+
+
+def bus_text(name: str, found: Budget) -> str:
+    """Format the budget as text, with a last line break."""
+    lines = [f"{name} at {found.rate:g} Hz: {'fits' if found.fits else 'DOES NOT FIT'}"]
+    for bus in found.buses:
+        lines += ["", *_bus_lines(bus)]
+    if not found.fits:
+        lines += ["", f"{found.reason}.", "Any of these helps:", *(f"  - {remedy}" for remedy in found.remedies)]
+    return "\n".join(lines) + "\n"
+
+
+def bus_document(name: str, found: Budget) -> dict[str, Any]:
+    """Return the budget as JSON values."""
+    return {
+        "arm": name,
+        "rate": found.rate,
+        "fits": found.fits,
+        "highest_rate": found.highest_rate,
+        "reason": found.reason,
+        "remedies": list(found.remedies),
+        "buses": [_bus_document(bus) for bus in found.buses],
+    }
+
+
+def _bus_lines(bus: BusLoad) -> list[str]:
+    cycle, load = bus.cycle, bus.load
+    lines = [f"bus {bus.profile.number}: {_described(bus.profile.bus)}", _HEAD, _UNDER]
+    lines += [_row(line.name, _ids(line), f"{line.length}", f"{line.per_second:.4g}", line) for line in bus.lines]
+    return [
+        *lines,
+        f"  {'one cycle, until the last position':<53}{_numbers(cycle, 1e6)} us",
+        f"  {'in all':<77}{_numbers(load, 100)}",
+        f"  {'allowed':<77}{'':>8}{100 * MOST_TYPICAL:>8.1f}{100 * MOST_WORST:>8.1f}",
+        f"  highest rate: {bus.highest_rate} Hz",
+    ]
+
+
+def _row(name: str, ids: str, length: str, rate: str, line: Line) -> str:
+    words = f"  {name:<28}{ids:<12}{length:>6}{rate:>7}"
+    return words + _numbers(line.each, 1e6) + _numbers(line.load, 100)
+
+
+def _numbers(cost: Cost, unit: float) -> str:
+    return "".join(f"{unit * each:>8.1f}" for each in cost)
+
+
+def _described(bus: CanBus) -> str:
+    data = "" if bus.data_bitrate is None else f", data {bus.data_bitrate / 1e6:g} Mbit/s"
+    return f"{bus.interface} {bus.channel}, {bus.bitrate / 1e6:g} Mbit/s{data}"
+
+
+def _ids(line: Line) -> str:
+    first, last = line.cob_ids[0], line.cob_ids[-1]
+    return f"{first:03X}" if first == last else f"{first:03X} .. {last:03X}"
+
+
+def _bus_document(bus: BusLoad) -> dict[str, Any]:
+    profile = bus.profile
+    return {
+        "number": profile.number,
+        "interface": profile.bus.interface,
+        "channel": profile.bus.channel,
+        "bitrate": profile.bus.bitrate,
+        "data_bitrate": profile.bus.data_bitrate,
+        "fits": bus.fits,
+        "highest_rate": bus.highest_rate,
+        "cycle_us": _values(bus.cycle, 1e6),
+        "load_percent": _values(bus.load, 100),
+        "frames": [
+            {
+                "name": line.name,
+                "cob_ids": list(line.cob_ids),
+                "bytes": line.length,
+                "per_second": line.per_second,
+                "cyclic": line.cyclic,
+                "us": _values(line.each, 1e6),
+                "load_percent": _values(line.load, 100),
+            }
+            for line in bus.lines
+        ],
+    }
+
+
+def _values(cost: Cost, unit: float) -> dict[str, float]:
+    return {key: round(unit * value, 4) for key, value in cost._asdict().items()}
+
+
+class Match(StrEnum):
+    """Result of comparing a node with the configuration."""
+
+    CONFIGURED = "configured"
+    OTHER = "another one"  # than the configured one
+    SILENT = "does not answer"  # but is heard
+    MISSING = "missing"
+    UNKNOWN = "not configured"
+
+
+_GOOD = (Match.CONFIGURED, Match.UNKNOWN)
+
+
+@dataclass(frozen=True)
+class ScannedNode:
+    """One node, or a configured drive that is missing.
+
+    Attributes:
+        bus: number of its bus, from 0.
+        node: its number.
+        drive: number of the configured drive, from 1; None for a node that is none.
+        match: result of the comparison with the configuration.
+        why: what is different, in words; empty where nothing is.
+        found: its identity, state and errors; None where it is missing.
+    """
+
+    bus: int
+    node: int
+    drive: int | None
+    match: Match
+    why: str
+    found: FoundNode | None
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Nodes on all buses of an arm.
+
+    Attributes:
+        lines: by bus and node number.
+        complete: whether every configured drive is there and is the configured one.
+    """
+
+    lines: tuple[ScannedNode, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Return whether every configured drive is there and is the configured one."""
+        return all(line.match in _GOOD for line in self.lines)
+
+
+def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links) -> Scan:
+    """Find and identify the nodes on every bus of an arm; nothing is changed.
+
+    Args:
+        config: the arm's.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        UsageError: the arm's driver has no bus to scan.
+        DriverError: as `drivers.canopen.bus_scan.scan`.
+    """
+    driver = config.driver
+    if not isinstance(driver, CanopenDriver):
+        kind = "no driver" if driver is None else f"driver {driver.kind!r}"
+        raise UsageError(f"{config.name} has {kind}; a bus scan is of CANopen drives (driver.kind: canopen)")
+    found = {(node.bus, node.node): node for node in scan(config, open_bus)}
+    wanted = {(drive.bus, drive.node): (number, drive) for number, drive in enumerate(driver.drives, 1)}
+    lines = []
+    for place in sorted({*found, *wanted}):
+        node = found.get(place)
+        if place in wanted:
+            number, drive = wanted[place]
+            lines.append(ScannedNode(*place, number, *_judged(node, drive), node))
+        else:
+            lines.append(ScannedNode(*place, None, Match.UNKNOWN, "", node))
+    return Scan(tuple(lines))
+
+
+def _judged(node: FoundNode | None, drive: CanopenDrive) -> tuple[Match, str]:
+    if node is None:
+        return Match.MISSING, "neither heard nor answering"
+    if not node.answers:
+        return Match.SILENT, "heard, but answers no SDO request"
+    if not node.is_drive:
+        kind = "not told" if node.device_type is None else f"{node.device_type:08X}h"
+        return Match.OTHER, f"no drive of CiA 402 (1000h is {kind})"
+    if others := differences(node.identity, drive.identity):
+        return Match.OTHER, ", ".join(others)
+    return Match.CONFIGURED, ""
+
+
+def scan_text(config: ArmConfig, found: Scan) -> str:
+    """Format a scan as text, with a last line break."""
+    lines = [f"{config.name}: {_verdict(found)}"]
+    assert isinstance(config.driver, CanopenDriver)  # noqa: S101 - bus_scan has seen to it
+    for number, bus in enumerate(config.driver.buses):
+        lines += ["", f"bus {number}: {bus.interface} {bus.channel}, {bus.bitrate / 1e6:g} Mbit/s"]
+        lines.append(f"  {'node':>4}  {'drive':<6}{'configuration':<17}{'drive state':<28}NMT state")
+        for line in found.lines:
+            if line.bus == number:
+                lines += _node_lines(line)
+    return "\n".join(lines) + "\n"
+
+
+def _verdict(found: Scan) -> str:
+    bad = [f"node {line.node} on bus {line.bus} {_MATCHES[line.match]}" for line in found.lines if _bad(line)]
+    return "; ".join(bad) if bad else "every configured drive is there"
+
+
+_MATCHES = {Match.MISSING: "IS MISSING", Match.OTHER: "IS ANOTHER ONE", Match.SILENT: "DOES NOT ANSWER"}
+
+
+def _bad(line: ScannedNode) -> bool:
+    return line.match not in _GOOD
+
+
+def _node_lines(line: ScannedNode) -> Iterator[str]:
+    drive = "-" if line.drive is None else str(line.drive)
+    node = line.found
+    state = "-" if node is None or node.status is None else drive_words(node.status)
+    match = line.match.upper() if _bad(line) else line.match
+    yield f"  {line.node:>4}  {drive:<6}{match:<17}{state:<28}{'-' if node is None else node.nmt}".rstrip()
+    if line.why:
+        yield f"{'':8}{line.why}"
+    if node is None or not node.answers:
+        return
+    identity = ", ".join(f"{name} {value:08X}h" for name, value in node.identity.items())
+    yield f"{'':8}{node.name or 'no device name'}, firmware {node.firmware or 'not told'}; {identity or 'no identity'}"
+    if node.error_register:
+        code = f"; 603Fh: {emergency_words(node.last_error)}" if node.last_error else ""
+        yield f"{'':8}has errors: {register_words(node.error_register)}{code}"
+    if node.history:
+        yield f"{'':8}history, latest first: {'; '.join(emergency_words(entry & 0xFFFF) for entry in node.history)}"
+    for words in node.unread:
+        yield f"{'':8}{words}"
+
+
+def scan_document(config: ArmConfig, found: Scan) -> dict[str, Any]:
+    """Return a scan as JSON values."""
+    return {
+        "arm": config.name,
+        "complete": found.complete,
+        "nodes": [_node_document(line) for line in found.lines],
+    }
+
+
+def _node_document(line: ScannedNode) -> dict[str, Any]:
+    said = None
+    if (node := line.found) is not None:
+        said = {
+            "nmt": node.nmt,
+            "answers": node.answers,
+            "device_type": node.device_type,
+            "identity": node.identity,
+            "name": node.name,
+            "firmware": node.firmware,
+            "status_word": node.status,
+            "state": None if node.status is None else str(state_of(node.status)),
+            "error_register": node.error_register,
+            "last_error": _error(node.last_error),
+            "history": [_error(entry & 0xFFFF) for entry in node.history],
+            "unread": node.unread,
+        }
+    return {
+        "bus": line.bus,
+        "node": line.node,
+        "drive": line.drive,
+        "match": line.match.name.lower(),
+        "why": line.why,
+        "found": said,
+    }
+
+
+def _error(code: int | None) -> dict[str, Any] | None:
+    return {"code": code, "words": emergency_words(code)} if code else None
+
+
+@dataclass(frozen=True)
+class Probed:
+    """Capabilities of one drive, or of one data sheet.
+
+    Attributes:
+        title: `drive N`, or the name of the file.
+        node: number of the drive, as the description has it.
+        silent: why it was not asked, or did not answer; empty for one that did.
+        can: its capabilities; None where neither the drive nor a file tells them.
+    """
+
+    title: str
+    node: int
+    silent: str
+    can: Capabilities | None
+
+    @property
+    def drivable(self) -> bool:
+        """Return whether the drive can be driven as the description stands."""
+        return self.can is not None and not (self.silent or self.can.problems or self.can.changes)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Capabilities of all drives of an arm, or of all data sheets.
+
+    Attributes:
+        probed: the drives in the arm's order, or the files.
+        shares: whether all of them can share torque frames, as far as files and families know.
+        rates: cycles per second that the buses carry at most, by kind of torque frames (`shared`, `single`).
+        status_syncs: SYNCs from one status report to the next, of drives without a timer for them.
+    """
+
+    probed: tuple[Probed, ...]
+    shares: bool
+    rates: dict[str, int]
+    status_syncs: int
+
+    @property
+    def good(self) -> bool:
+        """Return whether every drive can be driven."""
+        return all(one.drivable for one in self.probed)
+
+    @property
+    def highest_rate(self) -> int:
+        """Return the highest rate with the torque frames that the drives allow [Hz]."""
+        return self.rates["shared" if self.shares else "single"]
+
+
+def bus_probe(
+    config: ArmConfig,
+    files: Sequence[TextFile] = (),
+    open_bus: Callable[[ArmConfig], list[Link]] = open_links,
+) -> Probe:
+    """Read the capabilities of an arm's drives; nothing is changed.
+
+    Args:
+        config: the arm's.
+        files: data sheets, judged in place of the drives without any bus.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        UsageError: the arm's driver has no bus.
+        DriverError: a bus is in use, by another host too, cannot be opened, or is lost.
+    """
+    driver = config.driver
+    if not isinstance(driver, CanopenDriver):
+        kind = "no driver" if driver is None else f"driver {driver.kind!r}"
+        raise UsageError(f"{config.name} has {kind}; a bus probe is of CANopen drives (driver.kind: canopen)")
+    if files:
+        probed = [_of_file(driver, number % len(driver.drives), one) for number, one in enumerate(files)]
+    else:
+        with asking(config, open_bus) as (_, links, heard):
+            probed = []
+            for number, drive in enumerate(driver.drives):
+                objects = Objects(links[drive.bus], drive.node, hearing(heard, drive.bus))
+                probed.append(_of_drive(driver, number, objects))
+    rate = config.control.rate
+    rates = {
+        frames: budget(driver.model_copy(update={"torque_frames": frames}), rate).highest_rate
+        for frames in ("shared", "single")
+    }
+    shares = all(one.can is not None and one.can.shares for one in probed)
+    return Probe(tuple(probed), shares, rates, bus_profiles(driver, rate)[0].status_syncs)
+
+
+def _of_drive(driver: CanopenDriver, number: int, objects: Objects) -> Probed:
+    drive = driver.drives[number]
+    title = f"drive {number + 1}"
+    try:
+        return Probed(title, drive.node, "", capabilities(objects, driver, number))
+    except BusError:
+        raise
+    except DriverError as error:
+        return Probed(title, drive.node, str(error), _foretold(driver, number, driver.sheet_file(number)))
+
+
+def _of_file(driver: CanopenDriver, number: int, file: TextFile) -> Probed:
+    mistake = data_sheet(file.text).mistake
+    why = f"is no EDS: {mistake}" if mistake else ""
+    return Probed(file.name, driver.drives[number].node, why, _foretold(driver, number, file))
+
+
+def _foretold(driver: CanopenDriver, number: int, file: TextFile) -> Capabilities | None:
+    sheet, drive = data_sheet(file.text), driver.drives[number]
+    if not sheet.entries:
+        return None
+    family, found = foretold(sheet, drive, driver.families)
+    return judged(found, family, drive, driver, sheet)
+
+
+def probe_text(config: ArmConfig, found: Probe) -> str:
+    """Format a probe as text, with a last line break."""
+    bad = [one for one in found.probed if not one.drivable]
+    verdict = f"{len(bad)} of {len(found.probed)} NOT AS IT IS" if bad else "every drive can be driven"
+    lines = [f"{config.name}: {verdict}; nothing was written"]
+    for one in found.probed:
+        lines += ["", *_lines(one, found)]
+    frames = "shared" if found.shares else "single"
+    lines += ["", f"highest rate: {found.highest_rate} Hz, with {frames} torque frames (driver.torque_frames)"]
+    if found.shares:
+        lines.append(f"with single ones: {found.rates['single']} Hz")
+    if config.control.rate > found.highest_rate:
+        lines.append(f"control.rate is {config.control.rate:g} Hz, which is TOO MUCH")
+    return "\n".join(lines) + "\n"
+
+
+def _lines(one: Probed, found: Probe) -> Iterator[str]:
+    can = one.can
+    if can is None:
+        yield f"{one.title}, node {one.node}: {one.silent}"
+        return
+    verdict = "CANNOT BE DRIVEN" if can.problems else "not as described" if can.changes else "can be driven"
+    by = "" if can.found.asked else ", foretold by its data sheet"
+    yield f"{one.title}, node {one.node}: {can.family.name}: {verdict}{by}"
+    if one.silent:
+        yield f"  {one.silent}"
+    for problem in can.problems:
+        yield f"  {'REFUSED':<16}{problem}"
+    for change in can.changes:
+        yield f"  {'to change':<16}{change}"
+    for name, words in _facts(one, found).items():
+        yield f"  {name.replace('_', ' '):<16}{words}"
+    for note in can.notes if can.torque is not None else ():
+        yield f"  {'lacks':<16}{note}"
+    if can.family.notes:
+        yield f"  {'family':<16}{can.family.notes}"
+
+
+def _facts(one: Probed, found: Probe) -> dict[str, str]:
+    """Return the chosen torque path, limits, watchdogs and frames of a drive, in words."""
+    can = one.can
+    if can is None:
+        return {}
+    values = {name: can.found.get(entry) for name, entry in IDENTITY.items()}
+    facts = {"identity": ", ".join(f"{name} {value:08X}h" for name, value in values.items() if value is not None)}
+    if can.torque is None:
+        return facts
+    unit = can.family.unit
+    of = "" if unit is None or unit.rated is None else f", by {named(unit.rated)} in {unit.unit}"
+    count = "unknown" if can.count is None else f"{can.count:.4g} N m"
+    mode = f"mode {can.torque.mode}" + (f" ({named(can.torque.by.entry)})" if can.torque.by else "")
+    facts["torque"] = f"{mode}, {named(can.torque.target)}; a count is {count}{of}"
+    facts["torque_limit"] = "none" if can.limit is None else named(can.limit.entry)
+    facts["speed_limit"] = "the host's alone" if can.speed is None else where(can.speed)
+    facts["watchdogs"] = ", ".join(can.watchdogs) or "none"
+    dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
+    shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"
+    facts["torque_frames"] = f"{shares}, as far as its file and family know"
+    facts["status_reports"] = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    facts["proved"] = "on hardware" if can.family.proved else "not on hardware"
+    return facts
+
+
+def probe_document(config: ArmConfig, found: Probe) -> dict[str, Any]:
+    """Return a probe as JSON values."""
+    return {
+        "arm": config.name,
+        "good": found.good,
+        "shares": found.shares,
+        "rates": found.rates,
+        "highest_rate": found.highest_rate,
+        "drives": [_document(one, found) for one in found.probed],
+    }
+
+
+def _document(one: Probed, found: Probe) -> dict[str, Any]:
+    document: dict[str, Any] = {"title": one.title, "node": one.node, "drivable": one.drivable, "silent": one.silent}
+    can = one.can
+    if can is None:
+        return {**document, "can": None}
+    return {
+        **document,
+        "can": {
+            "family": can.family.name,
+            "proved": can.family.proved,
+            "asked": can.found.asked,
+            "identity": {name: can.found.get(entry) for name, entry in IDENTITY.items()},
+            "mode": None if can.torque is None else can.torque.mode,
+            "target": None if can.torque is None else can.torque.target,
+            "count": can.count,
+            "torque_limit": None if can.limit is None else can.limit.entry,
+            "speed_limit": None if can.speed is None else where(can.speed),
+            "watchdogs": list(can.watchdogs),
+            "shares": can.shares,
+            "dummies": list(can.dummies),
+            "status_timer": can.event,
+            "problems": [{"where": problem.where, "why": problem.why} for problem in can.problems],
+            "changes": [{"where": change.where, "why": change.why} for change in can.changes],
+            "missing": list(can.notes),
+        },
+        "facts": _facts(one, found),
+    }

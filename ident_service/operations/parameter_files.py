@@ -1,0 +1,340 @@
+"""Test, correct and compare parameter files, and identify a payload from one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.arm import Constraints, FeasibleSetName
+from ident_service.config.load import load_arm
+from ident_service.errors import ParameterError, UsageError
+from ident_service.estimation.certificate import certify
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.problems import (
+    FeasibilityTest,
+    FeasibleEstimate,
+    feasibility_correction,
+    feasibility_test,
+)
+from ident_service.estimation.fit import gather
+from ident_service.estimation.payload import KnownArm, Payload, identify_payload
+from ident_service.model.arm_model import arm_model
+from ident_service.model.notation import Notation
+from ident_service.operations.recordings import open_together, require_no_fault
+from ident_service.operations.verify import custom_note
+from ident_service.recordings.adapters import overlap
+from ident_service.recordings.recording import Recording
+from ident_service.results.comparison.comparison import Comparison, Side, compare, read_side
+from ident_service.results.comparison.presentation import comparison_html, comparison_text, write_comparison
+from ident_service.results.export.urdf import write_urdf
+from ident_service.results.manifest import (
+    appearing_folder,
+    replacing_folder,
+    require_place,
+    require_replaceable,
+    write_atomically,
+)
+from ident_service.results.parameter_file import ParameterFile, read_parameters, write_parameters
+from ident_service.results.payload_file import (
+    loaded_config,
+    loaded_parameters,
+    payload_document,
+    payload_text,
+    write_payload,
+)
+from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
+
+
+@dataclass(frozen=True)
+class CheckedFile:
+    """Result of a feasibility test of a parameter file."""
+
+    kind: FeasibleSetName
+    result: FeasibilityTest
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CorrectedFile:
+    """Feasible parameters nearest to those of a file."""
+
+    kind: FeasibleSetName
+    result: FeasibleEstimate
+    notes: tuple[str, ...] = ()
+
+
+def check_file(
+    path: Path, kind: FeasibleSetName | None = None, arm: str | None = None, notation: Notation | None = None
+) -> CheckedFile:
+    """Test the feasibility of a parameter file (BPFT, eq. 51).
+
+    Args:
+        path: the file.
+        kind: feasible set; the file's own when None, or else `pseudo_inertia`.
+        arm: a description whose physical constraints are added; without one, drive inertia, viscous and Coulomb
+            friction are positive.
+        notation: of the file's names, where it is not ours.
+
+    Raises:
+        UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
+        SolverError: the solver stopped without an optimum.
+    """
+    file, conditions, notes = _read(path, kind, arm, notation)
+    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes)
+
+
+def correct_file(
+    path: Path,
+    out: Path,
+    kind: FeasibleSetName | None = None,
+    arm: str | None = None,
+    metric: Literal["euclidean", "covariance"] = "euclidean",
+    notation: Notation | None = None,
+) -> CorrectedFile:
+    """Write the feasible parameters nearest to a file's (BPFC, eq. 55) to another file; other content is copied.
+
+    What no longer holds for the new values is left out: covariances, verdicts, fit and validation.
+
+    Args:
+        path: the file.
+        out: where the corrected one goes.
+        kind: feasible set; the file's own when None, or else `pseudo_inertia`.
+        arm: a description whose physical constraints are added, as for `check_file`.
+        metric: what nearest means: the paper's, in the units of the parameters, or that of the file's covariance, which
+            does not depend on the choice of base columns.
+        notation: of the file's names, where it is not ours; the corrected file has ours.
+
+    Raises:
+        UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
+        SolverError: the solver stopped without an optimum.
+    """
+    file, conditions, notes = _read(path, kind, arm, notation)
+    result = feasibility_correction(
+        file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
+    ).centred(file.base, conditions)
+    content = deepcopy(file.content)
+    for stale in ("fit", "information", "validation", "custom", "second_opinion"):
+        content.pop(stale, None)
+    table = content["base_parameters"]
+    for stale in (
+        "unconstrained_values",
+        "standard_deviations",
+        "white_standard_deviations",
+        "degrees_of_freedom",
+        "covariance",
+        "verdicts",
+    ):
+        table.pop(stale, None)
+    table["values"] = result.beta.tolist()
+    content["method"] = "correction"
+    content["feasible_set"] = conditions.kind
+    content["link_parameters"] = {"names": list(file.base.names), "values": result.delta.tolist()}
+    proof = certify(result.beta, file.base, conditions, result.delta, expressions=table["expressions"])
+    content["feasibility"] = {
+        "feasible": proof.verdict == "feasible",
+        "margin": result.margin,
+        "certificate": proof.document,
+    }
+    write_parameters(out, content)
+    return CorrectedFile(conditions.kind, result, notes)
+
+
+def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
+    rows = file.content["base_parameters"].get("covariance")
+    if rows is None or any(len(row) != file.base.size for row in rows):
+        raise ParameterError(
+            f"{path}: has no covariance of its {file.base.size} base parameters to measure distance with"
+        )
+    return np.array([[np.inf if value is None else value for value in row] for row in rows], dtype=float)
+
+
+def _read(
+    path: Path, kind: FeasibleSetName | None, arm: str | None, notation: Notation | None
+) -> tuple[ParameterFile, FeasibleSet, tuple[str, ...]]:
+    config, names = None, None
+    if arm is not None:
+        model = arm_model(load_arm(arm))
+        config, names = model.config, model.layout.names
+    file = read_parameters(path, names, notation)
+    if config is not None and (claimed := file.content.get("arm")) is not None and claimed["name"] != config.name:
+        joints = list(model.chain.names)
+        if claimed["joints"] != joints:
+            raise ParameterError(f"{path}: is about the arm {claimed['name']} with other joints than {config.name}")
+    claimed_set: FeasibleSetName = "inertia" if file.feasible_set == "inertia" else "pseudo_inertia"
+    conditions = feasible_set(kind or claimed_set, file.base.names, config, positive=Constraints().positive)
+    custom = () if config is None or config.constraints.custom is None else (custom_note(config.constraints.custom),)
+    return file, conditions, (*file.notes, *custom)
+
+
+DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"
+KEPT = (DOCUMENT, TEXT, PAGE)
+
+
+def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Comparison, tuple[Path, ...]]:
+    """Compare folders of results or parameter files; the first is the reference.
+
+    Args:
+        paths: two or more.
+        out: a file that ends in `.json`, or a folder for everything; nothing is written when None.
+
+    Returns:
+        The comparison, and the files written.
+
+    Raises:
+        UsageError: fewer than two, one that is not there, or `out` cannot be written.
+        ParameterError: one is torn, changed or foreign, or they have nothing in common.
+        ConfigError: an arm in a folder is not one that this version reads.
+    """
+    comparison = compare([read_side(path) for path in paths])
+    if out is None:
+        return comparison, ()
+    if out.suffix == ".json" and not out.is_dir():
+        write_comparison(out, comparison)
+        return comparison, (out,)
+    with appearing_folder(out) as staging:
+        names = write_comparison_files(staging, comparison)
+    return comparison, tuple(out / name for name in names)
+
+
+def compare_into(reference: Path, folder: Path) -> Comparison:
+    """Compare a folder of results with a reference, and store the comparison in it, named by its manifest.
+
+    A kill in between leaves files that the manifest does not name, and which are therefore ignored.
+
+    Args:
+        reference: folder of results or parameter file.
+        folder: of results, verified here.
+
+    Raises:
+        UsageError, ParameterError, ConfigError: as `compare_files`.
+    """
+    comparison = compare([read_side(reference), read_side(folder)])
+    write_comparison_files(folder, comparison)
+    write_manifest(folder)
+    return comparison
+
+
+def write_comparison_files(folder: Path, comparison: Comparison) -> tuple[str, ...]:
+    """Write a comparison in every form into a folder that exists; returns the names."""
+    write_comparison(folder / DOCUMENT, comparison)
+    write_atomically(folder / TEXT, comparison_text(comparison))
+    write_atomically(folder / PAGE, comparison_html(comparison))
+    return KEPT
+
+
+PAYLOAD_DOCUMENT, PAYLOAD_TEXT = "payload.json", "payload.txt"
+
+
+@dataclass(frozen=True)
+class Found:
+    """Result of a payload identification, and the files written.
+
+    Attributes:
+        arm: as it was identified.
+        payload: what it carries.
+        document: the content of `payload.json`.
+        text: for a person.
+        comparison: the arm against the arm with its load; None where there is no body.
+        files: names of the files in the folder.
+    """
+
+    arm: KnownArm
+    payload: Payload
+    document: dict[str, Any]
+    text: str
+    comparison: Comparison | None
+    files: tuple[str, ...]
+
+
+def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> Found:
+    """Identify the payload that an identified arm carries, and write the results.
+
+    Args:
+        run: folder of results of the arm.
+        recordings: with the load; a path may end in `@START:END`, the seconds to read.
+        out: where results go; an earlier result there is replaced as a whole.
+        refit_offsets: whether torque offsets may differ from those of the arm.
+
+    Raises:
+        UsageError, ConfigError, ParameterError: the folder cannot be used, or is no folder of results.
+        RecordingError: a recording cannot be used, or ended in a fault.
+        SolverError: the solver stopped without an optimum.
+    """
+    require_place(out)
+    if not run.is_dir():
+        raise UsageError(f"{run}: not a folder; give the folder of results of the arm without the load")
+    if out.exists() and out.samefile(run):
+        raise UsageError(f"{out}: would replace the arm's own parameters; give another folder")
+    require_replaceable(out)
+    side = read_side(run)
+    arm = known_arm(side)
+    known = side.content.get("torque")  # the torque difference is the load's only if both torques are of the same kind
+    opened = open_together(
+        recordings, arm.model, torque=known if known in ("measured", "commanded") else None
+    ).recordings
+    _require_new(side, opened)
+    for path, recording in zip(recordings, opened, strict=True):
+        require_no_fault(path, recording)
+    scales = np.array(side.content.get("torque_scales", np.ones(arm.model.chain.joints)), dtype=float)
+    recorded = gather(opened, arm.model, arm.base).with_torques_times(scales)
+    payload = identify_payload(arm, recorded, refit_offsets=refit_offsets)
+    sources = [{"name": one.path.name, "sha256": one.sha256} for one in opened]
+    document = payload_document(payload, arm, side.sha256, sources)
+    text, comparison = payload_text(payload, arm), None
+    with replacing_folder(out) as staging:
+        write_payload(staging / PAYLOAD_DOCUMENT, document)
+        write_atomically(staging / PAYLOAD_TEXT, text)
+        names = [PAYLOAD_DOCUMENT, PAYLOAD_TEXT]
+        if payload.body is not None:
+            content, delta = loaded_parameters(side.content, arm, payload, recorded, sources)
+            write_parameters(staging / PARAMETERS, content)
+            write_verifier(staging)
+            write_atomically(staging / ARM, loaded_config(arm.model.config).model_dump_json(indent=1) + "\n")
+            names += [PARAMETERS, VERIFIER, ARM]
+            if delta is not None:
+                write_urdf(staging / URDF, arm.model, delta)
+                names.append(URDF)
+            comparison = _compared(side, staging, out)
+            names += write_comparison_files(staging, comparison)
+        write_manifest(staging)
+    return Found(arm, payload, document, text, comparison, (*names, MANIFEST))
+
+
+def known_arm(side: Side) -> KnownArm:
+    """Return the identified arm of a folder of results.
+
+    Raises:
+        ParameterError: the parameters have no covariance, or belong to another mechanism.
+    """
+    if side.config is None:
+        raise ParameterError(f"{side.path}: a payload needs the arm's model; give a folder of results")
+    if side.covariance is None:
+        raise ParameterError(f"{side.path}: its parameters have no covariance; identify the arm again")
+    model = arm_model(side.config)
+    file = read_parameters(side.path / PARAMETERS, model.layout.names)
+    fit = side.content.get("fit", {})
+    residual = np.array([one["rms"] for one in fit.get("per_joint", [])], dtype=float)
+    known = residual if residual.shape == (model.chain.joints,) else None
+    return KnownArm(model, file.base, file.values, side.covariance, fit.get("blocks"), known)
+
+
+def _require_new(side: Side, recordings: Sequence[Recording]) -> None:
+    fitted = {one["sha256"] for one in side.content.get("provenance", {}).get("recordings", [])}
+    for index, recording in enumerate(recordings):
+        if recording.sha256 in fitted:
+            raise UsageError(f"{recording.path}: the arm was identified from it; give a recording with the load")
+        if any(overlap(recording, other) for other in recordings[:index]):
+            raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
+
+
+def _compared(side: Side, staging: Path, out: Path) -> Comparison:
+    """Return the comparison of the arm with the arm under load, under the paths of the final folder."""
+    loaded = read_side(staging / PARAMETERS)
+    config = None if side.config is None else loaded_config(side.config)
+    return compare([side, Side(out / PARAMETERS, loaded.sha256, loaded.file, config)])

@@ -1,0 +1,296 @@
+"""Tell what stands between an arm and its next motion, reset what may be reset, and set the zero at home.
+
+Looking sends no torque and changes no state. When every latched fault has been acknowledged by name, drives that have
+latched something are reset (`Arm.reset`), which energises nothing.
+
+A person must move the arm to its home and compare it with the displayed posture. Everything that a program can check is
+checked first: another process that moves the arm, another host, powered drives, an arm that moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+
+import numpy as np
+
+from drivers.arm import Arm, StopKind
+from drivers.axis_status import TRIPPED, AxisStatus
+from ident_service.config.arm import ArmConfig
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.motion_limits import MotionLimits, motion_limits
+from ident_service.errors import DriverError, MotionRefused, PositionUnknown, UsageError
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.arm_factory import make_arm
+from ident_service.motion.clearance import outside, require_near
+from ident_service.motion.command_channel import ControlFile, mover
+from ident_service.motion.control_loop import REST_SPEED
+from ident_service.motion.fault_store import Remembered
+from ident_service.motion.last_position import PositionFile
+from ident_service.motion.read_only_monitor import Watched, watch
+from ident_service.recordings.files import require_writable
+from ident_service.registry.state_folder import control_path, fault_file, ticket_path
+
+LOOK = 0.3  # s
+AT_HOME = 0.05  # rad or m
+_SUPPORT = "Support the arm, or see that it rests on something: nothing holds it up now."
+_HELD = "Support the arm, then `ident supported {}`: its drives hold it in quick stop, and let it go by that."
+_SEEN = 20  # cycles until the drives' status has arrived
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Findings about an arm after a fault or a stop, and the next steps.
+
+    Attributes:
+        arm: name.
+        faults: that nobody has acknowledged, the earliest first.
+        mover: process that moves the arm, or None.
+        seen: at the arm, after a reset if there was one; None where it could not be looked at.
+        unreachable: why not, or empty.
+        zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
+        reset: axes whose drives were reset just now.
+        tripped: what drives still have latched, by axis.
+        outside: joints outside their position limits, in words.
+        steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
+        usable: whether `ident check` can be run.
+    """
+
+    arm: str
+    faults: tuple[Remembered, ...]
+    mover: int | None
+    seen: Watched | None
+    unreachable: str
+    zero_lost: str
+    reset: tuple[str, ...]
+    tripped: dict[str, str]
+    outside: tuple[str, ...]
+    steps: tuple[str, ...]
+    usable: bool
+
+
+def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str | None = None) -> Recovery:
+    """Read an arm's state, reset its drives if all faults are acknowledged, and list the next steps.
+
+    Args:
+        config: of the arm.
+        state: the state folder.
+        arm: not open; the configured one when None.
+        called: the arm as commands are to name it, its file for example; its name when None.
+
+    Raises:
+        UsageError: the file of faults is damaged.
+        MotionRefused: the description has no position limits.
+        DriverError: nothing is installed that can reach such an arm.
+    """
+    limits, called = motion_limits(config), called or config.name
+    faults = fault_file(state, config.name).remembered()
+    pid = mover(control_path(state, config.name))
+    if pid is not None:
+        stop_first = (
+            f"`ident stop {called}` brings it to rest; process {pid} moves it.",
+            f"`ident recover {called}` again, when it stands.",
+        )
+        return Recovery(config.name, faults, pid, None, "", "", (), {}, (), stop_first, False)
+    arm = make_arm(config) if arm is None else arm
+    seen, unreachable, zero_lost, refusal = None, "", "", ""
+    reset: tuple[str, ...] = ()
+    try:
+        seen = watch(arm, LOOK)
+        if (latched := _tripped(seen)) and not faults:
+            refusal = _reset(arm)
+            seen = watch(arm, LOOK)
+            reset = tuple(name for name in latched if name not in _tripped(seen))
+    except PositionUnknown as error:
+        seen, zero_lost = None, str(error)
+    except DriverError as error:
+        unreachable = str(error)
+    tripped = {} if seen is None else _tripped(seen)
+    out = [] if seen is None else outside(seen.position, limits, seen.joint_names)
+    support = _SUPPORT
+    if seen is not None and isinstance(config.driver, CanopenDriver) and any(w & AxisStatus.IDLE for w in seen.status):
+        support = _HELD.format(called)
+    before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits, support)
+    usable = not before
+    steps = (*before, _at_last(called, seen, limits, bool(out)))
+    return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
+
+
+def let_go(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str, ...]:
+    """Switch off drives that hold an arm in quick stop, once a person has confirmed that it is supported.
+
+    Args:
+        config: of the arm.
+        state: the state folder.
+        arm: not open; the configured one when None.
+
+    Returns:
+        Names of the axes that were held.
+
+    Raises:
+        UsageError: the drives do not hold it.
+        DriverError: the arm cannot be had, or another process has it.
+    """
+    arm = make_arm(config) if arm is None else arm
+    with ControlFile.take(control_path(state, config.name), None), arm:
+        for _ in range(_SEEN):
+            status = arm.exchange(None).status
+        names = arm.describe().joint_names
+        held = tuple(name for name, word in zip(names, status, strict=True) if word & AxisStatus.IDLE)
+        if not held:
+            raise UsageError(f"{config.name}: nobody moves the arm, and its drives do not hold it")
+        arm.stop(StopKind.TORQUE_OFF)
+    return held
+
+
+def _tripped(seen: Watched) -> dict[str, str]:
+    """Return what drives have latched, in words, by axis."""
+    words = {name: AxisStatus(word) & TRIPPED for name, word in zip(seen.joint_names, seen.status, strict=False)}
+    return {
+        name: " and ".join(str(bit.name).lower().replace("_", " ") for bit in AxisStatus if bit in word)
+        for name, word in words.items()
+        if word
+    }
+
+
+def _reset(arm: Arm) -> str:
+    """Reset the drives; return why they refuse, or an empty text."""
+    with arm:
+        arm.exchange(None)
+        try:
+            arm.reset()
+            arm.exchange(None)
+        except DriverError as error:
+            return str(error)
+    return ""
+
+
+def _before(
+    name: str,
+    faults: tuple[Remembered, ...],
+    seen: Watched | None,
+    unreachable: str,
+    zero_lost: str,
+    tripped: dict[str, str],
+    refusal: str,
+    limits: MotionLimits,
+    support: str,
+) -> list[str]:
+    """Return what must be done before the arm is usable, in order."""
+    steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
+    if unreachable:
+        steps.append(f"Check power, cables, emergency stop, and that no other program has the arm: {unreachable}.")
+    if zero_lost:
+        steps.append(f"Zero it: {zero_lost}.")
+    if seen is None:
+        return [support, *steps, f"`ident recover {name}` again."]
+    silent = [joint for joint, q in zip(seen.joint_names, seen.position, strict=True) if not np.isfinite(q)]
+    if silent:
+        steps.append(f"Check power and cables of the axes that do not answer: {', '.join(silent)}.")
+    if bool((np.abs(seen.velocity) > REST_SPEED * limits.velocity).any()):
+        steps.append("Keep out of its reach until it rests: the arm moves, though nobody moves it.")
+    if tripped and refusal:
+        steps.append(f"Release the emergency stop, or read the drive's own fault code and mend its cause: {refusal}.")
+    if tripped or (faults and steps):
+        steps.append(f"`ident recover {name}` again: it resets the drives when every fault is acknowledged.")
+    if not silent and (out := outside(seen.position, limits, seen.joint_names)):
+        try:
+            require_near(seen.position, limits, seen.joint_names)
+            steps.append(
+                f"`ident check {name} --home`, then `ident recover {name} --leave-limit` leads it back inside, slowly; "
+                f"or push it by hand: {'; '.join(out)}."
+            )
+        except MotionRefused as error:
+            steps.append(f"Bring it back by hand: {error}.")
+    return [support, *steps] if steps or support is not _SUPPORT else steps
+
+
+def _at_last(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:
+    away = seen is None or out or bool((np.abs(seen.position - limits.home) > AT_HOME).any())
+    home = f"`ident check {name} --home`, then `ident home {name}` leads it home; then " if away else ""
+    return f"{home}`ident check {name}` for the next motion."
+
+
+@dataclass(frozen=True)
+class JointPosture:
+    """One joint of a posture: its name, position [rad or m], and the unit of that."""
+
+    joint: str
+    position: float
+    unit: str
+
+    def __str__(self) -> str:
+        """Format the joint's position, for a revolute joint in degrees too."""
+        turned = f" ({degrees(self.position):.1f} degrees)" if self.unit == "rad" else ""
+        return f"{self.joint} at {self.position:g} {self.unit}{turned}"
+
+
+@dataclass(frozen=True)
+class Zeroed:
+    """Result of zeroing an arm.
+
+    Attributes:
+        arm: name.
+        posture: that the arm stands in, of all joints.
+        drives: message of each drive about its zero.
+        faults: that nobody has acknowledged; zeroing is possible with them and leaves them as they are.
+        ticket_removed: whether there was a preflight ticket, which was about another zero.
+    """
+
+    arm: str
+    posture: tuple[JointPosture, ...]
+    drives: tuple[str, ...]
+    faults: tuple[Remembered, ...]
+    ticket_removed: bool
+
+
+def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
+    """Return the posture in which an arm is zeroed.
+
+    Raises:
+        UsageError: its description does not say `zero: at_home`, or has no home of every joint.
+    """
+    if not isinstance(config.driver, CanopenDriver) or config.driver.zero != "at_home":
+        raise UsageError(
+            f"{config.name}: has no zero to be set: only drives with `driver: {{zero: at_home}}`, whose encoders count "
+            "from where they were when power came, need one"
+        )
+    chain = arm_model(config).chain
+    found = []
+    for name, revolute in zip(chain.names, chain.revolute, strict=True):
+        joint = config.joints.get(name)
+        if joint is None or joint.home is None:
+            raise UsageError(f"{config.name}: joints.{name}.home is missing: the posture in which the arm is zeroed")
+        found.append(JointPosture(name, joint.home, "rad" if revolute else "m"))
+    return tuple(found)
+
+
+def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> Zeroed:
+    """Set an arm's present position as its home in the drives, once a person has confirmed the posture.
+
+    Args:
+        config: of the arm.
+        state: the state folder.
+        confirm: asks a person, who has seen the posture, for the arm's name.
+        arm: not open; the configured one when None.
+
+    Raises:
+        UsageError: as `home_posture`.
+        MotionRefused: nobody confirmed it; nothing has changed.
+        DriverError: a process moves the arm, or as `Arm.zero`.
+    """
+    posture = home_posture(config)
+    ticket = ticket_path(state, config.name)
+    require_writable(ticket.parent)
+    with ControlFile.take(control_path(state, config.name), None):
+        typed = confirm(f"type the arm's name, {config.name}, if it stands in this posture and at rest:")
+        if typed.strip() != config.name:
+            raise MotionRefused(f"{config.name}: not zeroed: the arm's name was not typed; nothing has changed")
+        # Removed before zeroing: a ticket that outlived it would be for another zero.
+        existed = ticket.exists()
+        ticket.unlink(missing_ok=True)
+        PositionFile(ticket.parent, config).forget()  # what drives tell is about another zero from now on
+        drives = (make_arm(config) if arm is None else arm).zero()
+    return Zeroed(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

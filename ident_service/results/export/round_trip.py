@@ -1,0 +1,143 @@
+"""Check that an export, read back, predicts the torques of the parameters on random states."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.config.arm import JointTerm
+from ident_service.errors import ModelError
+from ident_service.model.arm_model import ArmModel
+from ident_service.model.chain import Array
+from ident_service.model.friction_state import presliding_ways
+from ident_service.model.parameter_layout import JOINT_TERMS, TERM_SYMBOLS, Layout, WrittenArm, joint_drives
+from ident_service.model.regressor import joint_regressor
+
+AGREEMENT = 1e-9
+"""Largest difference of two torques that are the same, relative to the largest torque of all states."""
+_STATES = 40
+_SEED = 19990101
+
+Carried = Mapping[JointTerm, NDArray[np.bool_]]
+"""By joint term, the joints whose values a file carries, shape (joints,)."""
+States = tuple[Array, Array, Array]
+
+
+def random_states(joints: int, samples: int = _STATES) -> States:
+    """Return position, velocity and acceleration, always the same ones, each of shape (samples, joints)."""
+    rng = np.random.default_rng(_SEED)
+    position, velocity, acceleration = rng.uniform(-3.0, 3.0, size=(3, samples, joints))
+    velocity[::4] *= 0.02  # where the friction of slow motion differs from that of fast
+    return position, velocity, acceleration
+
+
+def gravity_of(model: ArmModel) -> tuple[float, float, float]:
+    """Return gravity in the base frame [m/s^2]."""
+    x, y, z = (float(component) for component in model.chain.gravity)
+    return x, y, z
+
+
+def disagreement(found: Array, meant: Array) -> float:
+    """Return the largest difference, relative to the largest value meant."""
+    if not np.all(np.isfinite(found)):
+        return np.inf
+    return float(np.abs(found - meant).max() / max(np.abs(meant).max(), np.finfo(float).tiny))
+
+
+def torque(model: ArmModel, delta: Array, states: States) -> Array:
+    """Return the torque of an arm with some link parameters at states of shape (samples, joints); same shape."""
+    return np.asarray(np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, *states), delta))
+
+
+def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Array:
+    """Return the link parameters with all joint terms zero that are not named."""
+    kept, layout = np.array(delta, dtype=float), model.layout
+    for term in layout.terms:
+        if term not in terms:
+            kept[layout.term_columns(term)] = 0.0
+    return kept
+
+
+def carried(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
+    """Return which values a format with some joint terms supports: none negative, of joints with an own drive only."""
+    drives = joint_drives(model.chain, model.layout, delta)
+    known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
+    return {term: drives.own & (drives.of(term) >= 0.0) for term in known}
+
+
+def require_same_torques(model: ArmModel, delta: Array, written: WrittenArm, has: Carried, name: str) -> None:
+    """Check that an arm read from a file predicts the parameters' torques, as far as the format supports them.
+
+    Args:
+        model: the arm.
+        delta: link parameters, shape (layout.size,).
+        written: what was read back.
+        has: what the file carries.
+        name: of the file.
+
+    Raises:
+        ModelError: other joints, or other torques.
+    """
+    refused = f"{name}: what is read back differs from the parameters"
+    if sorted(written.chain.names) != sorted(model.chain.names):
+        raise ModelError(f"{refused}: its joints are {', '.join(written.chain.names)}; it was not written")
+    order = [written.chain.names.index(joint) for joint in model.chain.names]
+    layout = Layout(written.chain.revolute, JOINT_TERMS)
+    values = np.zeros((layout.joints, layout.per_link))
+    values[:, :10] = written.bodies
+    states = position, velocity, acceleration = random_states(model.chain.joints)
+    shape: dict[JointTerm, Array] = {"drive_inertia": acceleration, "viscous": velocity, "coulomb": np.sign(velocity)}
+    found = dict(zip(JOINT_TERMS, (written.armature, written.damping, written.friction), strict=True))
+    drives = joint_drives(model.chain, model.layout, delta)
+    meant = torque(model, with_terms(model, delta, ()), states)
+    for place, term in enumerate(JOINT_TERMS):
+        if term in has:
+            values[order, 10 + place] = np.where(has[term], found[term][order], 0.0)
+            meant = meant + np.where(has[term], drives.of(term), 0.0) * shape[term]
+    back = np.argsort(order)  # from our order to the file's
+    H = joint_regressor(written.chain, layout, position[:, back], velocity[:, back], acceleration[:, back])
+    predicted = np.einsum("jps,p->sj", H, values.ravel())[:, order]
+    if not (apart := disagreement(predicted, meant)) <= AGREEMENT:
+        raise ModelError(f"{refused}: torques are up to {apart:.1e} of the largest apart; it was not written")
+
+
+_WORDS: dict[JointTerm, str] = {
+    "drive_inertia": "drive inertia",
+    "viscous": "viscous friction",
+    "coulomb": "Coulomb friction",
+    "offset": "torque offset",
+    "stribeck": "Stribeck friction",
+    "quadratic": "quadratic friction",
+    "viscous_asymmetry": "viscous asymmetry",
+}
+
+
+def left_out(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
+    """Return the joint terms with a value that a file does not carry, in words."""
+    found = []
+    for term in model.layout.terms:
+        values = model.layout.term_values(term, delta)
+        missing = (values != 0.0) & ~has.get(term, np.zeros(model.chain.joints, dtype=bool))
+        if missing.any():
+            joints = "every joint" if missing.all() else ", ".join(np.array(model.chain.names)[missing])
+            found.append(f"{_WORDS[term]} ({TERM_SYMBOLS[term]}) of {joints}")
+    return (*found, *presliding_left_out(model, delta))
+
+
+def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
+    """Return the drives' pre-sliding, in words, which a format without friction state does not carry."""
+    layout, ways = model.layout, presliding_ways(model)
+    dry = [layout.term_values(term, delta) for term in ("coulomb", "stribeck") if term in layout.terms]
+    said = [
+        f"{name} {way:.3g} {'rad' if turns else 'm'}"
+        for name, way, turns, *values in zip(model.chain.names, ways, model.chain.revolute, *dry, strict=True)
+        if way > 0.0 and any(values)
+    ]
+    if not said:
+        return ()
+    return (
+        f"pre-sliding of dry friction (way: {', '.join(said)}): here it turns round at once, and torques after a "
+        "reversal differ by up to twice the dry friction; the torque errors of the report are with pre-sliding",
+    )

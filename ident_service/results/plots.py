@@ -1,0 +1,413 @@
+"""Draw SVG charts: canvas, axes, round numbers, thinned lines, one style sheet for light and dark.
+
+Colours follow Okabe and Ito, "Color Universal Design" (2008), so that no meaning hangs on telling red from green.
+
+A drawing is one self-contained text: no script, no font, no identifier that could clash inside a larger page. What the
+kinds of shape look like is in `plots.py`.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.errors import UsageError
+
+STEPS = 8  # shades from early to late
+
+# Light colours, for every program without a dark mode.
+_LIGHT = {
+    "ground": "fill:#ffffff",
+    "ink": "fill:#1f2328",
+    "soft": "fill:#57606a",
+    "warn": "fill:#b04a00",
+    "frame": "stroke:#b6bec8",
+    "grid": "stroke:#e3e7ec",
+    "limit": "stroke:#d55e00",
+    "trace": "stroke:#0072b2",
+    "path": "stroke:#009e73",
+    "closest": "stroke:#d55e00",
+    "dot": "fill:#d55e00;stroke:#ffffff",
+    "base": "fill:#1f2328",
+    "rule": "stroke:#1f2328",
+    "ramp": "fill:#8c959f",
+    "solid": "fill:#8c959f",
+    "edge": "stroke:#6e7781",
+    "rod": "stroke:#8c959f",
+    "halo": "stroke:#ffffff",
+    "measured": "fill:#0072b2;stroke:#0072b2",
+    "predicted": "fill:#d55e00;stroke:#d55e00",
+    "residual": "fill:#007a5a;stroke:#007a5a",
+    "first": "stroke:#0072b2",
+    "second": "stroke:#d55e00",
+    "cloud": "fill:#0072b2",
+    "good": "fill:#0072b2",
+    "doubt": "fill:#e69f00",
+    "bad": "fill:#d55e00",
+    "plus": "fill:#0072b2",
+    "minus": "fill:#d55e00",
+    "body": "fill:#56b4e9;stroke:#0072b2",
+}
+_DARK = {
+    "ground": "fill:#0d1117",
+    "ink": "fill:#e6edf3",
+    "soft": "fill:#9da7b3",
+    "warn": "fill:#ffa657",
+    "frame": "stroke:#4a535e",
+    "grid": "stroke:#222931",
+    "limit": "stroke:#e69f00",
+    "trace": "stroke:#56b4e9",
+    "path": "stroke:#2fc79b",
+    "closest": "stroke:#ff9440",
+    "dot": "fill:#ff9440;stroke:#0d1117",
+    "base": "fill:#e6edf3",
+    "rule": "stroke:#e6edf3",
+    "ramp": "fill:#8c959f",
+    "solid": "fill:#8c959f",
+    "edge": "stroke:#9da7b3",
+    "rod": "stroke:#8c959f",
+    "halo": "stroke:#0d1117",
+    "measured": "fill:#56b4e9;stroke:#56b4e9",
+    "predicted": "fill:#ff9440;stroke:#ff9440",
+    "residual": "fill:#2fc79b;stroke:#2fc79b",
+    "first": "stroke:#56b4e9",
+    "second": "stroke:#ff9440",
+    "cloud": "fill:#56b4e9",
+    "good": "fill:#56b4e9",
+    "doubt": "fill:#f0e442",
+    "bad": "fill:#ff9440",
+    "plus": "fill:#56b4e9",
+    "minus": "fill:#ff9440",
+    "body": "fill:#56b4e9;stroke:#9acdf2",
+}
+# From hardly visible on the ground to clearly visible, in either mode.
+_LIGHT_STEPS = ("#c6d9ea", "#b0cce4", "#95bbdb", "#76a9d0", "#538fbf", "#3475aa", "#1b5c91", "#0a4475")
+_DARK_STEPS = ("#22394d", "#27445e", "#2c5171", "#315e83", "#3d75a1", "#4f8fbf", "#6dacd9", "#9acdf2")
+_SHAPES = {
+    "": "font-family:sans-serif",
+    "grid": "stroke-width:1",
+    "frame": "stroke-width:1;fill:none",
+    "limit": "stroke-width:1.2;stroke-dasharray:5 3",
+    "trace": "stroke-width:1.2;fill:none;stroke-linejoin:round",
+    "path": "stroke-width:1.1;fill:none;stroke-linejoin:round",
+    "posture": "stroke-width:2;fill:none;stroke-linejoin:round;stroke-linecap:round",
+    "closest": "stroke-width:3.2;fill:none;stroke-linejoin:round;stroke-linecap:round",
+    "gap": "stroke-width:1.4;stroke-dasharray:2 2",
+    "dot": "stroke-width:1",
+    "ramp": "fill-opacity:.16",
+    "solid": "fill-opacity:.28",
+    "edge": "stroke-width:1.4;fill:none",
+    "room": "stroke-width:1.2;fill:none;stroke-dasharray:8 3 2 3",
+    "rod": "stroke-linecap:round;stroke-opacity:.45",
+    "halo": "paint-order:stroke;stroke-width:3;stroke-linejoin:round",
+    "rule": "stroke-width:1.6;fill:none",
+    "strong": "font-weight:bold",
+    "measured": "stroke-width:3;stroke-linejoin:round;fill-opacity:.6;stroke-opacity:.6",
+    "predicted": "stroke-width:.8;stroke-linejoin:round;fill-opacity:.8",
+    "residual": "stroke-width:1;stroke-linejoin:round",
+    "first": "stroke-width:1.4;fill:none;stroke-linejoin:round",
+    "second": "stroke-width:1.4;fill:none;stroke-linejoin:round;stroke-dasharray:6 2",
+    "cloud": "fill-opacity:.45",
+    "body": "fill-opacity:.3;stroke-width:1.2",
+}
+
+
+def style() -> str:
+    """Return the style sheet as an SVG element; readers who prefer dark get the dark colours."""
+    return f"<style>{sheet()}</style>"
+
+
+def sheet() -> str:
+    """Return the style sheet as CSS, for a page that holds many drawings."""
+
+    def rules(rows: Iterable[tuple[str, str]]) -> str:
+        # Everything below one class: a style inside an SVG would otherwise reach the page around it.
+        return "".join(f".ident-figure{f' .{name}' if name else ''}{{{body}}}" for name, body in rows)
+
+    def steps(shades: Sequence[str]) -> list[tuple[str, str]]:
+        return [(f"step{number}", f"stroke:{shade}") for number, shade in enumerate(shades)]
+
+    light = rules([*_SHAPES.items(), *_LIGHT.items(), *steps(_LIGHT_STEPS)])
+    dark = rules([*_DARK.items(), *steps(_DARK_STEPS)])
+    return f"{light}@media (prefers-color-scheme:dark){{{dark}}}"
+
+
+Array = NDArray[np.float64]
+LARGEST = 1e12  # beyond any quantity of an arm; pixels could not be computed from much more
+
+
+def plain(text: str) -> str:
+    """Return text as XML content or attribute: quoted, without characters that XML 1.0 (2.2) does not have."""
+    return html.escape(re.sub("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]", "\ufffd", text))
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Format a number for people, with a real minus sign."""
+    text = f"{value:.{digits}g}"
+    if "e+" in text and abs(value) < 1e6:
+        text = f"{value:.0f}"
+    return ("0" if float(text) == 0.0 else text).replace("-", "\u2212")
+
+
+def _pixel(value: float) -> str:
+    text = f"{value:.1f}".removesuffix(".0")
+    return "0" if text == "-0" else text
+
+
+def points_of(x: Array, y: Array) -> str:
+    """Return the coordinates of a polyline or polygon [px]."""
+    return " ".join(f"{_pixel(a)},{_pixel(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+
+
+class Canvas:
+    """Shapes of one drawing."""
+
+    def __init__(self, width: float, height: float) -> None:
+        self._width, self._height = _pixel(width), _pixel(height)
+        self._parts: list[str] = []
+
+    def rectangle(self, kind: str, left: float, top: float, width: float, height: float) -> None:
+        """Draw a rectangle [px]."""
+        size = f'width="{_pixel(width)}" height="{_pixel(height)}"'
+        self._parts.append(f'<rect class="{kind}" x="{_pixel(left)}" y="{_pixel(top)}" {size}/>')
+
+    def line(self, kind: str, x1: float, y1: float, x2: float, y2: float, width: float | None = None) -> None:
+        """Draw a line [px], as wide as its kind or as `width` says."""
+        more = "" if width is None else f' stroke-width="{_pixel(width)}"'
+        ends = f'x1="{_pixel(x1)}" y1="{_pixel(y1)}" x2="{_pixel(x2)}" y2="{_pixel(y2)}"'
+        self._parts.append(f'<line class="{kind}" {ends}{more}/>')
+
+    def polyline(self, kind: str, x: Array, y: Array) -> None:
+        """Draw a line through points [px], each of shape (points,)."""
+        self._parts.append(f'<polyline class="{kind}" points="{points_of(x, y)}"/>')
+
+    def polygon(self, kind: str, x: Array, y: Array) -> None:
+        """Draw a closed line through points [px], each of shape (points,)."""
+        self._parts.append(f'<polygon class="{kind}" points="{points_of(x, y)}"/>')
+
+    def circle(self, kind: str, x: float, y: float, radius: float) -> None:
+        """Draw a disc [px]."""
+        self._parts.append(f'<circle class="{kind}" cx="{_pixel(x)}" cy="{_pixel(y)}" r="{_pixel(radius)}"/>')
+
+    def text(
+        self, kind: str, x: float, y: float, words: str, *, size: float = 11.0, anchor: str = "start", hint: str = ""
+    ) -> None:
+        """Draw one line of text; `hint` appears where a pointer rests on it."""
+        title = f"<title>{plain(hint)}</title>" if hint else ""
+        where = f'x="{_pixel(x)}" y="{_pixel(y)}" font-size="{_pixel(size)}" text-anchor="{anchor}"'
+        self._parts.append(f'<text class="{kind}" {where}>{title}{plain(words)}</text>')
+
+    def clip(self, axes: Axes | None) -> None:
+        """Clip what follows to axes, until it is called with None."""
+        if axes is None:
+            self._parts.append("</svg>")
+            return
+        left, top, width, height = (_pixel(value) for value in (axes.left, axes.top, axes.width, axes.height))
+        # A drawing within the drawing needs no identifier, unlike a clip path.
+        where = f'x="{left}" y="{top}" width="{width}" height="{height}" viewBox="{left} {top} {width} {height}"'
+        self._parts.append(f"<svg {where}>")
+
+    def svg(self, title: str, description: str, *, inline: bool = False) -> str:
+        """Return the whole drawing.
+
+        Args:
+            title: what a screen reader says first.
+            description: what the drawing shows, for who cannot see it.
+            inline: for a page that has the style sheet once and knows what an SVG is.
+        """
+        space = "" if inline else ' xmlns="http://www.w3.org/2000/svg"'
+        head = (
+            f'<svg{space} class="ident-figure" role="img" width="{self._width}" '
+            f'height="{self._height}" viewBox="0 0 {self._width} {self._height}" style="max-width:100%;height:auto">'
+        )
+        about = f"<title>{plain(title)}</title><desc>{plain(description)}</desc>"
+        ground = '<rect class="ground" width="100%" height="100%"/>'
+        sheet = "" if inline else style()
+        return "\n".join([head + about + sheet + ground, *self._parts, "</svg>"]) + "\n"
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Rectangle of the canvas [px] that shows a range of two quantities, the second one upwards."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    low_x: float
+    high_x: float
+    low_y: float
+    high_y: float
+
+    def x(self, value: Array | float) -> Array:
+        """Return pixels from the left."""
+        return np.asarray(self.left + self.width * (np.asarray(value) - self.low_x) / (self.high_x - self.low_x))
+
+    def y(self, value: Array | float) -> Array:
+        """Return pixels from the top."""
+        return np.asarray(self.top + self.height * (self.high_y - np.asarray(value)) / (self.high_y - self.low_y))
+
+
+def round_values(low: float, high: float, most: int) -> list[float]:
+    """Return at most `most` + 1 round numbers between two numbers, evenly spaced by 1, 2 or 5 times a power of ten."""
+    step = 10.0 ** np.floor(np.log10((high - low) / most))
+    step = next(step * factor for factor in (1.0, 2.0, 5.0, 10.0) if step * factor * most >= (high - low) * (1 - 1e-9))
+    first = np.ceil(low / step - 1e-9)
+    return [float(step * (first + k)) for k in range(int(np.floor(high / step + 1e-9) - first) + 1)]
+
+
+def visible(time: Array, values: Array, columns: int) -> NDArray[np.intp]:
+    """Return the samples that a line needs so that it looks like the line through all of them.
+
+    Args:
+        time: increasing, shape (samples,).
+        values: shape (samples,).
+        columns: how many columns of pixels show the whole time.
+
+    Returns:
+        Increasing indices: of the lowest and highest sample of every column, the first and the last sample.
+    """
+    if len(time) <= 2 * columns:
+        return np.arange(len(time))
+    column = np.minimum((time - time[0]) / (time[-1] - time[0]) * columns, columns - 1).astype(int)
+    order = np.lexsort((values, column))
+    begins = np.flatnonzero(np.diff(column, prepend=-1))
+    ends = np.append(begins[1:], len(time)) - 1
+    # Sorting keeps every column's samples where its samples were.
+    return np.unique(np.concatenate([[0], order[begins], order[ends], [len(time) - 1]]))
+
+
+def require_drawable(name: str, values: Array, shape: tuple[int, ...], *, unlimited: bool = False) -> None:
+    """Refuse values that cannot be drawn.
+
+    Args:
+        name: what the values are, for the message.
+        values: to be drawn.
+        shape: what they must have.
+        unlimited: infinities may stand for limits that are not there.
+
+    Raises:
+        UsageError: nothing in it, another shape, or values that are NaN or (where not `unlimited`) infinite or huge.
+    """
+    if values.shape != shape:
+        raise UsageError(f"cannot draw {name}: its shape is {values.shape}, not {shape}")
+    if values.size == 0:
+        raise UsageError(f"cannot draw {name}: it is empty")
+    bad = np.isnan(values) | (np.zeros(shape, bool) if unlimited else ~(np.abs(values) < LARGEST))
+    if bad.any():
+        first = tuple(int(k) for k in np.argwhere(bad)[0])
+        raise UsageError(f"cannot draw {name}: the value at {list(first)} is {values[first]}")
+
+
+FONT = 12.0
+_LINE = 15.0
+_FEWEST, _MOST = 3, 6  # round numbers along an axis
+
+
+def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: float = 0.06) -> tuple[float, float]:
+    """Return a range that holds all finite values with room for the lines' own width.
+
+    Args:
+        values: of any shapes.
+        least: how long the range is at least.
+        zero: whether it holds zero.
+        share: of its length, that is left free at either end.
+    """
+    everything = np.concatenate([np.ravel(one)[np.isfinite(np.ravel(one))] for one in values])
+    low, high = (float(everything.min()), float(everything.max())) if len(everything) else (0.0, 0.0)
+    if zero:
+        low, high = min(low, 0.0), max(high, 0.0)
+    if high - low <= max(least, 1e-9 * max(abs(low), abs(high))):
+        half = 0.5 * max(least, 1e-9, 0.1 * max(abs(low), abs(high)))
+        low, high = 0.5 * (low + high) - half, 0.5 * (low + high) + half
+    return low - share * (high - low), high + share * (high - low)
+
+
+def draw_frame(
+    canvas: Canvas,
+    axes: Axes,
+    *,
+    x: str,
+    y: str,
+    x_log: bool = False,
+    y_log: bool = False,
+    y_ticks: Sequence[tuple[float, str]] | None = None,
+) -> None:
+    """Draw grid, frame, ticks and names of both quantities.
+
+    Args:
+        canvas: to draw on.
+        axes: where; of a quantity in powers of ten they show the logarithm.
+        x: name and unit of what lies across; no numbers either where it is empty.
+        y: of what stands upright, written above the frame.
+        x_log: whether the axes show the logarithm of x.
+        y_log: likewise.
+        y_ticks: values upright and their words, where the scale is neither straight nor in powers of ten.
+    """
+    bottom, right = axes.top + axes.height, axes.left + axes.width
+    for value, words in _ticks(axes.low_x, axes.high_x, x_log, 6):
+        at = float(axes.x(value))
+        canvas.line("grid grid-x", at, axes.top, at, bottom)
+        if x:
+            canvas.text("soft tick-x", at, bottom + _LINE, words, size=FONT, anchor="middle")
+    chosen = _ticks(axes.low_y, axes.high_y, y_log, max(4, int(axes.height / 32))) if y_ticks is None else y_ticks
+    for value, words in chosen:
+        at = float(axes.y(value))
+        canvas.line("grid", axes.left, at, right, at)
+        canvas.text("soft", axes.left - 5, at + 4, words, size=FONT, anchor="end")
+    canvas.rectangle("frame", axes.left, axes.top, axes.width, axes.height)
+    if x:
+        canvas.text("soft", axes.left + axes.width / 2, bottom + 2 * _LINE + 3, x, size=FONT, anchor="middle")
+    canvas.text("ink", axes.left, axes.top - 6, y, size=FONT)
+
+
+def draw_key(canvas: Canvas, right: float, y: float, entries: Sequence[tuple[str, str, str]]) -> None:
+    """Draw a legend of colours and strokes, in one row that ends at `right` [px].
+
+    Args:
+        canvas: to draw on.
+        right: where the row ends.
+        y: its base line.
+        entries: form (`line`, `area` or `dot`), kind, words.
+    """
+    at = right
+    for form, kind, words in reversed(entries):
+        # Text has no width before it is drawn; this is a wide sans serif's.
+        at -= 7.0 * len(words)
+        canvas.text("soft", at, y, words, size=FONT)
+        if form == "line":
+            canvas.line(kind, at - 24, y - 4, at - 5, y - 4)
+        elif form == "area":
+            canvas.rectangle(kind, at - 20, y - 9, 14, 9)
+        else:
+            canvas.circle(kind, at - 12, y - 4, 4)
+        at -= 34.0
+
+
+def _ticks(low: float, high: float, log: bool, most: int) -> list[tuple[float, str]]:
+    low, high = min(low, high), max(low, high)
+    if not log:
+        values = round_values(low, high, most)
+        # Around zero the round step for a few values can be larger than the range on either side of it.
+        while len(values) < _FEWEST and most < 2 * _MOST:
+            most += 1
+            values = round_values(low, high, most)
+        return [(value, number(value, 6)) for value in values]
+    step = max(1, int(np.ceil((high - low) / most)))
+    first = int(np.ceil(low / step - 1e-9)) * step
+    found = [(float(power), _power(power)) for power in range(first, int(np.floor(high + 1e-9)) + 1, step)]
+    return found or [(low, number(10.0**low, 2)), (high, number(10.0**high, 2))]
+
+
+def _power(power: int) -> str:
+    if -3 <= power <= 3:
+        return number(10.0**power)
+    return "10" + "".join(
+        "\u207b" if sign == "-" else "\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079"[int(sign)]
+        for sign in str(power)
+    )
