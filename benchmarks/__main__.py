@@ -27,7 +27,7 @@ from ident_service.model.pinocchio_models import pinocchio_model
 from ident_service.model.regressor import joint_regressor
 from ident_service.motion.arm_factory import make_arm
 from ident_service.operations.commissioning import record_motion
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.open import open_recording
 from ident_service.results.parameter_file import parameters_document, write_parameters
 
@@ -105,7 +105,7 @@ def _estimation(model: ArmModel, folder: Path) -> list[Row]:
     np.savetxt(as_csv, np.concatenate(table), delimiter=",", fmt="%.12g", header=head, comments="")
 
     def whole(recorded: Path) -> None:
-        estimate = identify(model, [KeptRecording(open_recording(recorded, names))])  # as the command reads it
+        estimate = identify(model, [CachedRecording(open_recording(recorded, names))])  # as the command reads it
         write_parameters(folder / "parameters.json", parameters_document(estimate))
 
     base = base_parameters(model.chain, model.layout)

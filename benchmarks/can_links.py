@@ -28,7 +28,7 @@ from drivers.canopen.bus_load import exact
 from drivers.clock import RealClock
 from ident_service.config.canopen import CanBus
 from sim_backend.can_bus.host import LocalPort
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.can_bus.link import Connection, WireLink
 from sim_backend.can_bus.packets import Hello
 
@@ -168,7 +168,7 @@ def _serve(side: str, name: str) -> None:
     with ExitStack() as stack:
         link: Link
         if side in ("host", "paced"):
-            wire = stack.enter_context(Wire(name, 1_000_000 if side == "paced" else 0))
+            wire = stack.enter_context(CanBusServer(name, 1_000_000 if side == "paced" else 0))
             link = LocalPort(wire, "drives")
         elif side == "wire":
             link = WireLink(Connection(name, Hello("drives")))

@@ -21,8 +21,8 @@ from ident_service.model.collision import Contact
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines
-from ident_service.motion.encoder_observer import owed_ways
-from ident_service.motion.safety_monitor import Guard
+from ident_service.motion.encoder_observer import frozen_encoder_observer
+from ident_service.motion.safety_monitor import SafetyMonitor
 from ident_service.motion.trajectory import PathReference
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.ring_buffer import RingWriter, create_ring
@@ -40,8 +40,8 @@ def measure(model: ArmModel) -> list[Row]:
     steps = np.array([3.65e-5, 5.4e-5, 5.4e-5, 8.5e-5, 7.9e-5, 7.9e-5, 1.03e-4])
     home = reference.at(0.0).position
     dynamics = InverseDynamics(model.chain, model.layout, prior)
-    owed = owed_ways(dynamics, model, limits, period, steps)
-    guard = Guard(model.chain.names, limits, period, home, contact=Contact(model), owed=owed)
+    owed = frozen_encoder_observer(dynamics, model, limits, period, steps)
+    guard = SafetyMonitor(model.chain.names, limits, period, home, contact=Contact(model), owed=owed)
     control = ComputedTorque(dynamics, limits, period, 30.0, home)
     deadlines = Deadlines(guard.findings, period)
     valid, age = np.ones(7, dtype=bool), np.zeros(7, dtype=np.int64)

@@ -24,8 +24,8 @@ from ident_service.config.motion_design import Criterion
 from ident_service.config.motion_limits import motion_limits
 from ident_service.estimation.identify import identify
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import Designed, design_motion, family, settled
-from ident_service.excitation.limit_proof import objections
+from ident_service.excitation.design import Designed, complete_task, design_motion, family
+from ident_service.excitation.limit_proof import violations
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import Problem, usable_limits
 from ident_service.excitation.prediction import described_noise, expected_deviations, information
@@ -69,7 +69,7 @@ def _evaluation(model: ArmModel) -> list[Row]:
     for criterion in ("condition_number", "d_optimal"):
         design = model.config.design.model_copy(update={"criterion": criterion, "position_margin": 0.15, "ramp": 0.0})
         basis, base = family(design, model)
-        problem = Problem(settled(model, design, basis, base), 500)
+        problem = Problem(complete_task(model, design, basis, base), 500)
         x = 0.3 * np.random.default_rng(0).normal(size=problem.size)
         multipliers = problem.no_multipliers(1.0)
         with one_blas_thread():
@@ -261,7 +261,7 @@ def _figure(
 
 def _require_proven(model: ArmModel, found: Designed, margin: float) -> None:
     limits = motion_limits(model.config)
-    if wrong := objections(found.proof, model, limits):
+    if wrong := violations(found.proof, model, limits):
         raise AssertionError(wrong)
     asked = found.proof.demands
     if not ((asked.lowest >= limits.lower + margin).all() and (asked.highest <= limits.upper - margin).all()):

@@ -21,7 +21,7 @@ from ident_service.estimation.least_squares import ordinary_least_squares, weigh
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
-from ident_service.model.information import information_of, supports
+from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.recordings.recording import Block
 
@@ -115,7 +115,7 @@ def long_chain(seed: int) -> list[float]:
     H = joint_regressor(model.chain, model.layout, *states, base.base)
     torque = np.einsum("jps,p->sj", H, base.K @ delta) + 0.5 * rng.normal(size=(2000, _LINKS))
     keep = np.ones(torque.shape, dtype=bool)
-    fit = ordinary_least_squares(information_of(H, torque, keep, supports(model.chain, model.layout, base.base)))
+    fit = ordinary_least_squares(information_of(H, torque, keep, sparsity(model.chain, model.layout, base.base)))
 
     def solve(kind: str) -> None:
         constrained_least_squares(fit, base, feasible_set(kind, base.names, config))  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ParameterError
 from ident_service.estimation.identify import Candidate, Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.open import open_recording
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -68,9 +68,9 @@ def case_estimate(case: Case, method: Method | None, prior: str = "none", model:
     model = replace(model, config=model.config.model_copy(update={"identification": options}))
     config = model.config
 
-    def opened(name: str) -> KeptRecording:
+    def opened(name: str) -> CachedRecording:
         path = DATA / case.folder / name
-        return KeptRecording(
+        return CachedRecording(
             open_recording(path, model.chain.names, fmt=config.recording, transmission=config.transmission)
         )
 

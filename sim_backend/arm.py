@@ -21,7 +21,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from sim_backend.build import build_machine
 from sim_backend.faults import Fault
-from sim_backend.machine import Machine, Schedule, Stand, checked_torque, description
+from sim_backend.machine import Schedule, SimulatedHardware, Stand, checked_torque, description
 from sim_backend.machine import Truth as Truth
 from sim_backend.plant import Imperfections, Plant
 from sim_backend.remote_arm import RemoteArm
@@ -56,7 +56,7 @@ class SimulatedArm(Arm):
                 contract's, each further one a cycle that torques wait in a queue.
             watchdog: time without a torque after which enabled drives go idle [s].
             braking: damping of idle axes [N m s/rad or N s/m], shape (joints,); None for none.
-            unpowered: damping of axes that are off, as `Machine` has it.
+            unpowered: damping of axes that are off, as `SimulatedHardware` has it.
             stand: likewise.
             faults: to inject, by cycle since `open`.
             observer: called with the truth of every cycle.
@@ -66,7 +66,7 @@ class SimulatedArm(Arm):
         """
         self.clock = clock
         self.observer = observer
-        self._machine = Machine(
+        self._machine = SimulatedHardware(
             plant,
             imperfections,
             seed=seed,

@@ -17,7 +17,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model, with_payload
 from sim_backend.faults import Fault, configured_faults
-from sim_backend.machine import Machine, Stand
+from sim_backend.machine import SimulatedHardware, Stand
 from sim_backend.plant import Imperfections, Plant
 
 # Where limits do not state a drive's strength, its shorted windings stop the joint in about this time [s].
@@ -27,7 +27,7 @@ _BRAKING_SHARE = 0.5
 _HOLDING = 1e3
 
 
-def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
+def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> SimulatedHardware:
     """Build the machine that a configuration describes, at its home position and at rest.
 
     Args:
@@ -81,7 +81,7 @@ def build_machine(config: ArmConfig, faults: Sequence[Fault] = ()) -> Machine:
         braking = np.where(known, _BRAKING_SHARE * limit, plant.inertia) / np.where(known, speed, _BRAKING_TIME)
     held = np.array([config.has_brake(name) for name in model.chain.names])
     shorted = np.full(count, driver.windings_off == "shorted")
-    return Machine(
+    return SimulatedHardware(
         plant,
         imperfections,
         seed=driver.seed,

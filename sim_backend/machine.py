@@ -338,7 +338,7 @@ class Stand:
     damping: Vector
 
 
-class Machine:
+class SimulatedHardware:
     """Simulate a plant, its drives, encoders and faults; the same seed gives the same readings bit for bit."""
 
     def __init__(
@@ -535,7 +535,7 @@ def checked_torque(torque: Vector | None, enabled: bool, joints: int) -> Vector 
     return value
 
 
-def description(machine: Machine) -> ArmDescription:
+def description(machine: SimulatedHardware) -> ArmDescription:
     """Return the description of a simulated arm."""
     names = machine.plant.chain.names
     return ArmDescription(

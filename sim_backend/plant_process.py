@@ -33,16 +33,16 @@ from ident_service.errors import DriverError
 from sim_backend import wire
 from sim_backend.build import build_machine
 from sim_backend.faults import Fault, FaultKind
-from sim_backend.machine import Machine
+from sim_backend.machine import SimulatedHardware
 from sim_backend.plant_status import PlantState, PlantStatus, encode_status, status_size
 
 _EVERY = 20  # periods between two writings, when nothing happens
 
 
-class PlantStory:
+class PlantStatistics:
     """Collect and write the status record of one machine."""
 
-    def __init__(self, machine: Machine, descriptor: int) -> None:
+    def __init__(self, machine: SimulatedHardware, descriptor: int) -> None:
         """Start, and write the first record.
 
         Args:
@@ -148,11 +148,11 @@ class PlantProcess:
 
     def __init__(
         self,
-        machine: Machine,
+        machine: SimulatedHardware,
         listener: socket.socket,
         lifeline: int,
         sha256: bytes,
-        story: PlantStory,
+        story: PlantStatistics,
         lock_step: bool,
     ) -> None:
         """Use the given machine and socket.
@@ -411,7 +411,7 @@ def main() -> int:
             for at, kind, joint, duration, size, offset in start["faults"]
         ]
         machine = build_machine(config, faults)
-        story = PlantStory(machine, start["status"])
+        story = PlantStatistics(machine, start["status"])
     except Exception as error:  # noqa: BLE001 - the parent must learn why this process cannot begin
         listener.close()
         _say(f"{type(error).__name__}: {error}")

@@ -74,7 +74,7 @@ _FD: Final = struct.Struct("=IBB2x64s")
 MAX_PACKET_BYTES: Final = 8192
 MAX_PACKET_FRAMES: Final = 64  # fits with 64 bytes each
 _PACKED: Final = struct.Struct("<qIBB2x")
-_OWN_FLAG: Final = 1  # the frame is an echo, or was sent rather than received
+_ECHO_FLAG: Final = 1  # the frame is an echo, or was sent rather than received
 _FD_FLAG: Final = 2
 
 
@@ -155,17 +155,17 @@ def unpack_frames(data: bytes) -> list[tuple[Frame, bool]]:
             or (length > 8 and not fd)
             or (remote and length)
             or (fd and (remote or error))
-            or flags & ~(_OWN_FLAG | _FD_FLAG)
+            or flags & ~(_ECHO_FLAG | _FD_FLAG)
         ):
             raise DriverError(f"a malformed frame: {length=}, {flags=}")
         if identifier > 0x7FF and not (extended or error):
             raise DriverError(f"identifier {identifier:X}h does not fit 11 bits")
-        frames.append((Frame(identifier, payload, remote, error, extended, stamp_ns, fd), bool(flags & _OWN_FLAG)))
+        frames.append((Frame(identifier, payload, remote, error, extended, stamp_ns, fd), bool(flags & _ECHO_FLAG)))
     return frames
 
 
 # Identifier and mask; a frame with 11 bits of identifier is received when any pair fits.
-HEARD: Final = ((0x000, 0x000),)
+RECEIVE_FILTER: Final = ((0x000, 0x000),)
 
 
 # Frames of one drain: a flood, which no bus but a local socket can bring, must not hold the loop.

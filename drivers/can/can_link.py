@@ -98,7 +98,7 @@ class BusLock:
             self._socket.close()
             if error.errno != errno.EADDRINUSE:
                 raise DriverError(f"the bus {bus.channel} cannot be locked: {error.strerror}") from None
-            raise DriverError(f"the bus {bus.channel} is in use by process {_owner(address)}") from None
+            raise DriverError(f"the bus {bus.channel} is in use by process {_owner_pid(address)}") from None
 
     def close(self) -> None:
         """Release the lock; any number of times."""
@@ -114,7 +114,7 @@ def _address(bus: CanBus) -> bytes:
     return b"\0ident-can-" + (name if len(name) <= _LONGEST else hashlib.sha256(name).hexdigest().encode())
 
 
-def _owner(address: bytes) -> str:
+def _owner_pid(address: bytes) -> str:
     """Return the id of the process that holds an address; `unknown` where the kernel does not tell."""
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)

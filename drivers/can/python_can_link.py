@@ -20,7 +20,7 @@ from typing import Any
 import can
 
 from drivers.can.bus_state import BusError, BusOffWatch, Kind, kind_of
-from drivers.can.can_frame import HEARD, MOST_AT_ONCE, Frame, check_sendable
+from drivers.can.can_frame import MOST_AT_ONCE, RECEIVE_FILTER, Frame, check_sendable
 from drivers.can.socketcan_link import check_interface
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
@@ -95,7 +95,7 @@ def bus_error(error: Exception, bus: CanBus, otherwise: Kind = "gone") -> BusErr
 
 
 def _filters() -> list[dict[str, Any]]:
-    return [{"can_id": wanted, "can_mask": mask, "extended": False} for wanted, mask in HEARD]
+    return [{"can_id": wanted, "can_mask": mask, "extended": False} for wanted, mask in RECEIVE_FILTER]
 
 
 class PythonCanLink:

@@ -18,7 +18,16 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from drivers.can.bus_state import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
-from drivers.can.can_frame import EXTENDED, FD_BYTES, HEARD, MOST_AT_ONCE, Frame, check_sendable, from_kernel, to_kernel
+from drivers.can.can_frame import (
+    EXTENDED,
+    FD_BYTES,
+    MOST_AT_ONCE,
+    RECEIVE_FILTER,
+    Frame,
+    check_sendable,
+    from_kernel,
+    to_kernel,
+)
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus, CanopenDriver
@@ -105,7 +114,7 @@ def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> 
         raise BusError("refused", channel, bitrate, f"{detail}: {error.strerror}") from None
     try:
         # Until the bind nothing arrives, so that no frame passes an unset filter.
-        filters = b"".join(struct.pack("=II", wanted, mask | EXTENDED) for wanted, mask in HEARD)
+        filters = b"".join(struct.pack("=II", wanted, mask | EXTENDED) for wanted, mask in RECEIVE_FILTER)
         sock.setsockopt(_SOL_CAN_RAW, _RAW_FILTER, filters)
         sock.setsockopt(_SOL_CAN_RAW, _RAW_ERR_FILTER, _ALL_ERRORS)
         sock.setsockopt(_SOL_CAN_RAW, _RAW_LOOPBACK, 1)

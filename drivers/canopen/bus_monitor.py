@@ -35,7 +35,7 @@ from ident_service.errors import DriverError, PositionUnknown
 LONGER = 1.2  # times a heartbeat's period, in which one must come
 
 
-class Overheard:
+class BusListener:
     """Listen on every bus of an arm.
 
     Attributes:
@@ -130,7 +130,7 @@ def look_rate(driver: CanopenDriver) -> float:
     return min(RATE, SHARE / max(loads))
 
 
-class LookingArm(Arm):
+class MonitoringArm(Arm):
     """Implement an arm whose drives, on one or more buses, are only observed."""
 
     def __init__(self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]]) -> None:
@@ -156,7 +156,7 @@ class LookingArm(Arm):
         self._begin()
 
     def _begin(self) -> None:
-        self._heard = Overheard()
+        self._heard = BusListener()
         self._seen = [_Seen() for _ in self._places]
         self._identities: tuple[str, ...] = ()
         self._missing: set[int] = set()  # drives that did not answer when the arm was opened, so that no zero is known

@@ -16,7 +16,7 @@ from drivers.can.can_frame import Frame
 from drivers.can.can_link import BusLock, Link, open_links
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import worst
-from drivers.canopen.bus_monitor import Overheard
+from drivers.canopen.bus_monitor import BusListener
 from drivers.canopen.capabilities import DRIVE_PROFILE
 from drivers.canopen.drive_setup import IDENTITY
 from drivers.canopen.sdo import BURST, DOES_NOT_EXIST, TIMEOUT, Objects, Place, SdoRefused, poll
@@ -89,7 +89,7 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
 @contextmanager
 def asking(
     config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
-) -> Iterator[tuple[CanopenDriver, list[Link], Overheard]]:
+) -> Iterator[tuple[CanopenDriver, list[Link], BusListener]]:
     """Open the buses of an arm exclusively, to ask nodes on them, after a second of listening for heartbeats.
 
     Args:
@@ -108,7 +108,7 @@ def asking(
         if all(bus.interface != "lock_step" for bus in driver.buses):
             locks += [BusLock(bus) for bus in driver.buses]
         links += open_bus(config)
-        heard = Overheard()
+        heard = BusListener()
         heard.listen(links, LISTEN)
         if heard.streaming:
             buses = ", ".join(driver.buses[bus].channel for bus in sorted(heard.streaming))
@@ -122,7 +122,7 @@ def asking(
             lock.close()
 
 
-def _found(driver: CanopenDriver, links: list[Link], heard: Overheard) -> list[FoundNode]:
+def _found(driver: CanopenDriver, links: list[Link], heard: BusListener) -> list[FoundNode]:
     clock = links[0].clock
 
     def asked(places: set[Place], patience: float) -> dict[Place, int | None]:
@@ -148,7 +148,7 @@ def _found(driver: CanopenDriver, links: list[Link], heard: Overheard) -> list[F
     return found
 
 
-def hearing(heard: Overheard, bus: int) -> Callable[[Frame], None]:
+def hearing(heard: BusListener, bus: int) -> Callable[[Frame], None]:
     """Return the function that takes the frames of a bus that are not answers."""
     return lambda frame: heard.take(bus, frame)
 

@@ -99,7 +99,7 @@ _OTHERS: Sequence[Entry] = (
 
 
 @dataclass(frozen=True)
-class Found:
+class DriveEntries:
     """Hold what is known of a drive's object dictionary.
 
     Attributes:
@@ -161,7 +161,7 @@ class Capabilities:
     """
 
     family: Family
-    found: Found
+    found: DriveEntries
     torque: TorquePath | None
     count: float | None
     limit: TorqueLimit | None
@@ -194,7 +194,7 @@ def capabilities(objects: Objects, driver: CanopenDriver, number: int) -> Capabi
     """
     drive = driver.drives[number]
     family, found = discovered(objects, drive, driver.families)
-    return judged(found, family, drive, driver, driver.sheets[number])
+    return assess(found, family, drive, driver, driver.sheets[number])
 
 
 def required(objects: Objects, driver: CanopenDriver, number: int) -> Capabilities:
@@ -204,7 +204,7 @@ def required(objects: Objects, driver: CanopenDriver, number: int) -> Capabiliti
     return can
 
 
-def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, Found]:
+def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, DriveEntries]:
     """Ask a drive for all entries that matter, by uploads alone.
 
     Args:
@@ -221,12 +221,14 @@ def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()
     return family, _asked(objects, _entries(family, drive))
 
 
-def foretold(sheet: DataSheet, drive: CanopenDrive, own: Sequence[Family] = ()) -> tuple[Family, Found]:
+def entries_from_sheet(
+    sheet: DataSheet, drive: CanopenDrive, own: Sequence[Family] = ()
+) -> tuple[Family, DriveEntries]:
     """Return a drive's entries from its data sheet instead of the drive; arguments as for `discovered`."""
     told = {0x101800 | sub: value for sub, value in sheet.identity.items()}
-    family = family_of(Found(frozenset(), told).identity, own)
+    family = family_of(DriveEntries(frozenset(), told).identity, own)
     values = {key: value for key, one in sheet.entries.items() if (value := one.number(drive.node)) is not None}
-    return family, Found(frozenset(sheet.entries), values | told, asked=False)
+    return family, DriveEntries(frozenset(sheet.entries), values | told, asked=False)
 
 
 def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
@@ -242,7 +244,7 @@ def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
     return {entry.key: entry for entry in reversed(entries)}
 
 
-def _asked(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> Found:
+def _asked(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> DriveEntries:
     there, values, unread = set(), {}, {}
     for entry in entries.values() if isinstance(entries, Mapping) else entries:
         try:
@@ -256,11 +258,11 @@ def _asked(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> 
         except DriverError as error:
             unread[entry.key] = str(error)
         there.add(entry.key)
-    return Found(frozenset(there), values, unread)
+    return DriveEntries(frozenset(there), values, unread)
 
 
-def judged(
-    found: Found, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
+def assess(
+    found: DriveEntries, family: Family, drive: CanopenDrive, driver: CanopenDriver, sheet: DataSheet | None
 ) -> Capabilities:
     """Compare what a drive has with what it needs.
 
@@ -335,7 +337,7 @@ def named(text: str) -> str:
     return where(entry_of(text, ""))
 
 
-def _streams(path: TorquePath, found: Found) -> bool:
+def _streams(path: TorquePath, found: DriveEntries) -> bool:
     """Return whether a drive supports a way of streaming torques; where 6502h is unknown, it may."""
     needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
     modes = found.get(od.SUPPORTED_MODES)
@@ -343,18 +345,18 @@ def _streams(path: TorquePath, found: Found) -> bool:
     return supported and all(found.has(entry_of(text, "")) for text in needed)
 
 
-def _no_torque(family: Family, found: Found) -> str:
+def _no_torque(family: Family, found: DriveEntries) -> str:
     modes = found.get(od.SUPPORTED_MODES)
     said = "has no value" if modes is None else f"is {modes:X}h"
     lacking = sorted({named(p.target) for p in family.torque if not found.has(entry_of(p.target, ""))})
     return f"no torque mode: 6502h {said}" + (f", {', '.join(lacking)} missing" if lacking else "")
 
 
-def _limits(limit: TorqueLimit, found: Found) -> bool:
+def _limits(limit: TorqueLimit, found: DriveEntries) -> bool:
     return all(found.has(entry_of(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
 
 
-def _count(family: Family, found: Found, drive: CanopenDrive) -> float | None:
+def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | None:
     """Return the torque of one count of the target [N m]; None where it is unknown."""
     unit = family.unit
     if unit is None or (unit.unit == "mA" and drive.torque_constant is None):
@@ -366,7 +368,7 @@ def _count(family: Family, found: Found, drive: CanopenDrive) -> float | None:
     return None if not held else held * factor * 1e-3
 
 
-def _unit_problems(family: Family, found: Found, count: float | None) -> Iterator[Problem]:
+def _unit_problems(family: Family, found: DriveEntries, count: float | None) -> Iterator[Problem]:
     unit = family.unit
     if unit is None or unit.writable or unit.rated is None or not found.asked:
         return
@@ -375,7 +377,7 @@ def _unit_problems(family: Family, found: Found, count: float | None) -> Iterato
         yield Problem(named(unit.rated), words)
 
 
-def _unit_changes(family: Family, found: Found, drive: CanopenDrive, count: float | None) -> Iterator[Problem]:
+def _unit_changes(family: Family, found: DriveEntries, drive: CanopenDrive, count: float | None) -> Iterator[Problem]:
     """Compare a count's torque in the drive with the description, and with its current and torque constant."""
     unit = family.unit
     if unit is None or unit.writable:
@@ -409,7 +411,7 @@ def _factor(first: float, second: float, tolerance: float) -> str:
     return f": wrong by {ratio:.3g}" if power is None else f": wrong by {power}, which is another unit"
 
 
-def _watchdogs(family: Family, found: Found, drive: CanopenDrive) -> Iterator[WatchdogKind]:
+def _watchdogs(family: Family, found: DriveEntries, drive: CanopenDrive) -> Iterator[WatchdogKind]:
     if found.has(od.RPDO_DEADLINE):
         yield "rpdo_timer"
     mine = drive.watchdog_entry

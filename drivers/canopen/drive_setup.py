@@ -23,7 +23,7 @@ from drivers.canopen.cia402 import POWER_OFF, state_of
 from drivers.canopen.motor_units import Coordinates, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
-from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, NotHeld, Objects, SdoRefused, optional
+from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused, WriteNotVerified, optional
 from drivers.canopen.stored_zero import Zeros
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import (
@@ -165,7 +165,7 @@ class MotorLimits:
 
 
 @dataclass(frozen=True)
-class Setup:
+class DriveConfiguration:
     """Hold one drive's part of the configuration.
 
     Attributes:
@@ -311,7 +311,7 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
     return f"node {objects.node}: {words}, firmware {firmware}"
 
 
-def configure(objects: Objects, setup: Setup) -> int:
+def configure(objects: Objects, setup: DriveConfiguration) -> int:
     """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
 
     Returns:
@@ -338,13 +338,13 @@ def configure(objects: Objects, setup: Setup) -> int:
     for write in setup.watchdog():
         objects.ensure(write)
     for write in setup.hints():
-        with suppress(SdoRefused, NotHeld):
+        with suppress(SdoRefused, WriteNotVerified):
             objects.ensure_if_there(write)
     _mode(objects, setup)
     return setup.torque.mode if setup.torque.by is None else objects.read(od.MODE)
 
 
-def _timing(objects: Objects, setup: Setup) -> None:
+def _timing(objects: Objects, setup: DriveConfiguration) -> None:
     """Configure SYNC without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
     for write in setup.profile.identifiers(setup.drive.node):
         objects.ensure_if_there(write)
@@ -355,7 +355,7 @@ def _timing(objects: Objects, setup: Setup) -> None:
     objects.ensure_if_there(Write(od.SYNC_WINDOW, 0))  # torques come just before the next SYNC
 
 
-def _largest_torque(objects: Objects, setup: Setup) -> None:
+def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
     """Set the largest torque that the drive gives, in its own entry and unit."""
     limit, value = setup.can.limit, setup.limit_counts
     assert limit is not None  # noqa: S101 - else it has been refused
@@ -374,7 +374,7 @@ def _largest_torque(objects: Objects, setup: Setup) -> None:
         objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
 
 
-def _mode(objects: Objects, setup: Setup) -> None:
+def _mode(objects: Objects, setup: DriveConfiguration) -> None:
     """Set the mode of operation, and wait until the drive reports it, which may take some time."""
     by, clock = setup.torque.by, objects.clock
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
@@ -392,7 +392,9 @@ def _mode_entry(text: str) -> Entry:
     return entry_of(text, "mode of operation of the maker's")
 
 
-def released(objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]) -> Iterator[None]:
+def disable_supervision(
+    objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]
+) -> Iterator[None]:
     """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
 
     It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed it
@@ -440,7 +442,7 @@ def _encoder(objects: Objects, drive: CanopenDrive) -> None:
         )
 
 
-def _rated_torque(objects: Objects, setup: Setup) -> None:
+def _rated_torque(objects: Objects, setup: DriveConfiguration) -> None:
     """Set the rated torque where the family lets it be set, or check that the drive's own is the described one."""
     unit, rated = setup.can.family.unit, setup.drive.rated_torque
     if unit is None or unit.rated is None or not unit.writable:
@@ -461,7 +463,7 @@ def _rated_torque(objects: Objects, setup: Setup) -> None:
         ) from None
 
 
-def _max_speed(objects: Objects, setup: Setup) -> None:
+def _max_speed(objects: Objects, setup: DriveConfiguration) -> None:
     """Set the motor's largest speed, or check that the drive's own leaves the joints their velocities.
 
     Above it a drive takes its torque back, in the middle of a motion.
@@ -482,7 +484,7 @@ def _max_speed(objects: Objects, setup: Setup) -> None:
             ) from None
 
 
-def _deceleration(objects: Objects, setup: Setup) -> None:
+def _deceleration(objects: Objects, setup: DriveConfiguration) -> None:
     """Set the deceleration of quick stops (6085h), where a drive has it; a sufficient one of its own may stay."""
     if setup.motor.deceleration is None:
         return

@@ -30,16 +30,16 @@ from drivers.can.bus_state import HOST, Event, EventCode
 from drivers.can.can_link import BusLock, Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links, require_format
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_monitor import LookingArm
+from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.capabilities import required
 from drivers.canopen.cia402 import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, joint_status
 from drivers.canopen.drive_setup import (
-    Setup,
+    DriveConfiguration,
     configure,
+    disable_supervision,
     identify,
     motor_limits,
     quick_stop_option,
-    released,
     watchdogs_of,
 )
 from drivers.canopen.homing import ZeroingArm
@@ -48,7 +48,7 @@ from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.stored_zero import zeros_of
-from drivers.canopen.sync_cycle import Buses, Enabling, Resetting, hold
+from drivers.canopen.sync_cycle import Buses, EnableSequence, Resetting, hold
 from drivers.clock import Clock, RealClock, VirtualClock
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
@@ -331,7 +331,7 @@ class CanopenArm(Arm):
 
     def look(self) -> Arm:
         """Return an arm that reads the drives' objects by SDO and sends nothing else."""
-        return LookingArm(self._config, self._open_bus)
+        return MonitoringArm(self._config, self._open_bus)
 
     def zero(self) -> tuple[str, ...]:
         """Store the drives' present position as the home of the description; as in the contract."""
@@ -414,7 +414,7 @@ class CanopenArm(Arm):
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
-            steps = Enabling(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
+            steps = EnableSequence(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
             self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
@@ -511,7 +511,7 @@ class CanopenArm(Arm):
                 objects = buses.objects(number)
                 # Between two conversations, so that the others do not miss their torque frames.
                 buses.cycle(zero)
-                for _ in released(objects, self._zeros, number, buses.restarted(number)):
+                for _ in disable_supervision(objects, self._zeros, number, buses.restarted(number)):
                     buses.cycle(zero)
                 there[drive.bus] = objects
         for number in range(len(buses.drives)):
@@ -544,7 +544,7 @@ class CanopenArm(Arm):
             identity = identify(objects, drive.identity)
             own = self._driver.reactions, self._quick_stop, motors[number], required(objects, self._driver, number)
             self._begun = number + 1
-            buses.modes[number] = configure(objects, Setup(drive, buses.profile(number), *own))
+            buses.modes[number] = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):
@@ -557,7 +557,7 @@ class CanopenArm(Arm):
         if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
             raise PositionUnknown(self._zeros.lost(restarted))
 
-    def _through(self, buses: Buses, steps: Enabling | Resetting) -> None:
+    def _through(self, buses: Buses, steps: EnableSequence | Resetting) -> None:
         """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
         stops = self._stops
         while not steps.done:

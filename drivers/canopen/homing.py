@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.arm import Vector
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_monitor import LookingArm
+from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.cia402 import DriveState, drive_words, state_of
 from drivers.canopen.motor_units import unwrapped
 from drivers.canopen.sdo import TIMEOUT, Place
@@ -25,7 +25,7 @@ STILL = 0.005  # rad or m that an arm held by hand may move in between
 _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 
 
-class ZeroingArm(LookingArm):
+class ZeroingArm(MonitoringArm):
     """Observe drives, whether they have a zero or not, until `take_home`."""
 
     def _find_zero(self) -> None:

@@ -45,7 +45,7 @@ class SdoRefused(DriverError):
         self.code = code
 
 
-class NotHeld(DriverError):
+class WriteNotVerified(DriverError):
     """Report that an entry was set without an abort, but holds something else."""
 
 
@@ -140,7 +140,7 @@ class Objects:
         self.write(write)
         held = self.read(write.entry)
         if not write.same(held):
-            raise NotHeld(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
+            raise WriteNotVerified(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
 
     def _asked(self, what: str, ask: Callable[..., Any], *arguments: Any) -> Any:
         try:

@@ -309,7 +309,7 @@ _WAY = (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON, DriveState.OPERAT
 _FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION)
 
 
-class Enabling:
+class EnableSequence:
     """Lead drives from switched off to `operation enabled`."""
 
     def __init__(
@@ -407,7 +407,7 @@ class Resetting:
     """Lead drives out of the state `fault`: a rising edge of bit 7, nothing else; the drives stay off."""
 
     def __init__(self, drives: Sequence[Drive], names: Sequence[str], step: float, now_ns: int) -> None:
-        """Begin; arguments as for `Enabling`."""
+        """Begin; arguments as for `EnableSequence`."""
         self._drives, self._names = drives, names
         self._deadline_ns = now_ns + round(step * 1e9)
         self._edge: dict[int, int] = {}

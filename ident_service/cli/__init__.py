@@ -24,7 +24,7 @@ from ident_service.cli import (
     recovery_commands,
     remote,
 )
-from ident_service.cli.arguments import Parser, Verbs, WrongWords, asks_for_json
+from ident_service.cli.arguments import ArgumentsError, Parser, VerbList, asks_for_json
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -84,13 +84,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = parser().parse_args(words)
         arguments.asked_ns = time.monotonic_ns()
-    except WrongWords as wrong:
+    except ArgumentsError as wrong:
         if asks_for_json(words):
             print_error(UsageError.__name__, wrong.message, USAGE)
         raise
     try:
         _own_packages_only()
-        verb: Callable[[argparse.Namespace], Answer] = arguments.verb if arguments.server is None else remote.remotely
+        verb: Callable[[argparse.Namespace], Answer] = (
+            arguments.verb if arguments.server is None else remote.run_on_daemon
+        )
         code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
         # A second Ctrl-C: the person does not want to wait for what could be saved.
@@ -178,7 +180,7 @@ def parser() -> Parser:
         description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
     )
     top.add_argument("--version", action="version", version=f"ident-service {__version__}")
-    verbs = Verbs.of(top)
+    verbs = VerbList.of(top)
     for group in GROUPS:
         group.add(verbs)
     return top

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.arguments import Parser, Verbs, count
+from ident_service.cli.arguments import Parser, VerbList, count
 from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
 from ident_service.errors import IdentError, UsageError
 
@@ -24,7 +24,7 @@ def add_by(sub: Parser) -> None:
     sub.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in with)")
 
 
-def at_terminal(arguments: argparse.Namespace) -> str:
+def terminal_user(arguments: argparse.Namespace) -> str:
     """Return the audit-trail name `terminal:NAME` of the person at the terminal; no token has such a name.
 
     Raises:
@@ -42,7 +42,7 @@ def at_terminal(arguments: argparse.Namespace) -> str:
     return f"terminal:{name}"
 
 
-def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
+def audit_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
     """Enter an act that was done at a terminal in the audit trail, where the state folder has one.
 
     It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
@@ -64,19 +64,19 @@ def note_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any
         try:
             with Database(state, busy=_PATIENCE) as db:
                 enter_waiting(db, state)
-                note(db, at_terminal(arguments), what, about, **detail)
+                note(db, terminal_user(arguments), what, about, **detail)
         except sqlite3.Error as error:
             raise registry_error(state / FILE, error) from None
     except (IdentError, OSError) as error:
         try:
-            note_later(state, at_terminal(arguments), what, about, **detail)
+            note_later(state, terminal_user(arguments), what, about, **detail)
         except (IdentError, OSError) as refusal:
             print_to_person(f"ident: done, but not entered in the audit trail: {error}; {refusal}\n")
         else:
             print_to_person(f"ident: done, but not entered in the audit trail yet; its line follows: {error}\n")
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register `accept`, `rollback`, `import`, `prune`, `delete`, `backup` and `restore`."""
     sub = verbs.add("accept", _accept, "make a run's parameters the arm's current ones; earlier sets are kept")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
@@ -117,7 +117,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
 
     state = own_state_folder(arguments)
     with Database(state) as db:
-        act = accept(db, state, arguments.run.resolve(), arguments.note, at_terminal(arguments))
+        act = accept(db, state, arguments.run.resolve(), arguments.note, terminal_user(arguments))
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
     return DONE, f"{act.arm}: acceptance {act.number}; current: {path}\n", {**asdict(act), "current": str(path)}
 
@@ -129,7 +129,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
 
     state = own_state_folder(arguments)
     with Database(state) as db:
-        act = rollback(db, state, arguments.arm, arguments.note, at_terminal(arguments), arguments.to)
+        act = rollback(db, state, arguments.arm, arguments.note, terminal_user(arguments), arguments.to)
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
     text = f"{act.arm}: acceptance {act.number} is the set of {act.origin} ({act.run}); current: {path}\n"
     return DONE, text, {**asdict(act), "current": str(path)}
@@ -142,7 +142,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
 
     state = own_state_folder(arguments)
     with Database(state) as db:
-        row = import_run(db, state, arguments.run, at_terminal(arguments))
+        row = import_run(db, state, arguments.run, terminal_user(arguments))
     folder = state / RUNS / row["id"]
     return (
         DONE,
@@ -155,7 +155,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
 
 
 def _prune(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.run_archive import expendable, let_go
+    from ident_service.operations.run_archive import expendable, prune
     from ident_service.registry.database import Database
     from ident_service.registry.runs import rebuild_runs
 
@@ -163,7 +163,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
     with Database(state) as db:
         untold = rebuild_runs(db, state)
         gone = (
-            let_go(db, state, arguments.keep, at_terminal(arguments))
+            prune(db, state, arguments.keep, terminal_user(arguments))
             if arguments.yes
             else expendable(db, state, arguments.keep)
         )
@@ -183,7 +183,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
     kind, state = arguments.word.rpartition(" ")[2], own_state_folder(arguments)
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
     with Database(state) as db:
-        found = delete(db, state, arguments.name, at_terminal(arguments), anyway=arguments.anyway)
+        found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
     document = {"deleted": arguments.name, "dependents": [asdict(one) for one in found]}
     return DONE, deleted_text(document), document
 
@@ -192,7 +192,7 @@ def _backup(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.backup import back_up
 
     made = back_up(own_state_folder(arguments), arguments.file, recordings=not arguments.without_recordings)
-    note_act(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
+    audit_act(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
     return DONE, f"{made.file}: {made.files} files, {made.bytes / 2**20:.1f} MiB\n", asdict(made)
 
 
@@ -200,7 +200,7 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.backup import restore
 
     state = own_state_folder(arguments)
-    done = restore(arguments.file, state, at_terminal(arguments), replace=arguments.replace)
+    done = restore(arguments.file, state, terminal_user(arguments), replace=arguments.replace)
     when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
     text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"

@@ -16,7 +16,7 @@ from ident_service.errors import UsageError
 FEASIBLE_SETS = ("pseudo_inertia", "inertia")
 
 
-class WrongWords(SystemExit):
+class ArgumentsError(SystemExit):
     """Exit after arguments that no verb understands; usage and reason are on stderr already."""
 
     def __init__(self, message: str) -> None:
@@ -25,7 +25,7 @@ class WrongWords(SystemExit):
 
 
 class Parser(argparse.ArgumentParser):
-    """Argument parser that raises `WrongWords` where argparse only exits, so that JSON can state the reason too."""
+    """Argument parser that raises `ArgumentsError` where argparse only exits, so that JSON can state the reason too."""
 
     def error(self, message: str) -> NoReturn:
         """Print argparse's usage and message on stderr, and raise.
@@ -35,7 +35,7 @@ class Parser(argparse.ArgumentParser):
         """
         self.print_usage(sys.stderr)
         sys.stderr.write(f"{self.prog}: error: {message}\n")
-        raise WrongWords(message)
+        raise ArgumentsError(message)
 
 
 def asks_for_json(words: Sequence[str]) -> bool:
@@ -45,7 +45,7 @@ def asks_for_json(words: Sequence[str]) -> bool:
 
 
 @dataclass(frozen=True)
-class Verbs:
+class VerbList:
     """List of verbs that a group registers its own with.
 
     Attributes:
@@ -59,7 +59,7 @@ class Verbs:
     prefix: str = ""
 
     @classmethod
-    def of(cls, parser: Parser) -> Verbs:
+    def of(cls, parser: Parser) -> VerbList:
         """Create the list of verbs of a command."""
         common = Parser(add_help=False)
         common.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else")
@@ -83,10 +83,10 @@ class Verbs:
         parser.set_defaults(verb=run, word=f"{self.prefix}{name}", words=parser)
         return parser
 
-    def group(self, name: str, text: str) -> Verbs:
+    def group(self, name: str, text: str) -> VerbList:
         """Add a word that is followed by verbs of its own, as in `ident config check`."""
         parser = self.commands.add_parser(name, help=text)
-        return Verbs(parser.add_subparsers(required=True, metavar="VERB"), self.common, f"{self.prefix}{name} ")
+        return VerbList(parser.add_subparsers(required=True, metavar="VERB"), self.common, f"{self.prefix}{name} ")
 
 
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:

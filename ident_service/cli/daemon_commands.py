@@ -8,14 +8,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.archive_commands import add_by, at_terminal
-from ident_service.cli.arguments import Verbs
+from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.arguments import VerbList
 from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
 
 _PORT = 8470
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register `serve`, `token add`, `token list` and `token revoke`."""
     sub = verbs.add("serve", _serve, "the daemon: API, jobs and registry of the state folder")
     sub.add_argument("--host", default="127.0.0.1", help="address to listen on; any but a loopback one needs TLS")
@@ -67,7 +67,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.tokens import add_token
 
     with Database(own_state_folder(arguments)) as db:
-        secret = add_token(db, arguments.name, arguments.role, at_terminal(arguments))
+        secret = add_token(db, arguments.name, arguments.role, terminal_user(arguments))
     return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
 
 
@@ -95,7 +95,7 @@ def _revoke(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.tokens import revoke_token
 
     with Database(own_state_folder(arguments)) as db:
-        revoke_token(db, arguments.name, at_terminal(arguments))
+        revoke_token(db, arguments.name, terminal_user(arguments))
     return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
 
 

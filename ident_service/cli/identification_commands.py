@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, Verbs, columns_files, delay, replicates, seed, weight
+from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
 
 
-def _add_commission(verbs: Verbs) -> None:
+def _add_commission(verbs: VerbList) -> None:
     """Register `simulate` and `identify`."""
     sub = verbs.add("simulate", _simulate, "the whole job on a simulated arm, scored against the known truth")
     sub.add_argument("arm", nargs="?", default="wam7_sim", metavar="ARM", help="description with a simulated driver")
@@ -202,7 +202,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
     }
 
 
-def _add_comparing(verbs: Verbs) -> None:
+def _add_comparing(verbs: VerbList) -> None:
     """Register `compare` and `payload`."""
     sub = verbs.add("compare", _compare, "has the arm changed? (exit code 3: yes, or it cannot be said)")
     sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
@@ -251,7 +251,7 @@ def _payload(arguments: argparse.Namespace) -> Answer:
     return code, text, found.document | {"folder": str(folder), "files": list(found.files)}
 
 
-def _add_parameters(verbs: Verbs) -> None:
+def _add_parameters(verbs: VerbList) -> None:
     """Register `base`, `feasible`, `correct` and `verify`."""
     sub = verbs.add("base", _base, "base parameters and their expressions")
     sub.add_argument("arm", metavar="ARM")
@@ -368,7 +368,7 @@ def _verify(arguments: argparse.Namespace) -> Answer:
 _FORMATS = "urdf,mjcf,sdf,json,csv,c"
 
 
-def _add_exports(verbs: Verbs) -> None:
+def _add_exports(verbs: VerbList) -> None:
     """Register `export`."""
     sub = verbs.add("export", _export, "identified parameters for other tools, each file read back and checked")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of `identify` or `simulate`")
@@ -393,7 +393,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
     return DONE, "\n".join(lines) + "\n", {"folder": str(folder), "files": files}
 
 
-def _add_results(verbs: Verbs) -> None:
+def _add_results(verbs: VerbList) -> None:
     """Register `report` and `figures`."""
     sub = verbs.add("report", _report, "the report of a folder of results, as one page without network")
     sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
@@ -421,7 +421,7 @@ def _figures(arguments: argparse.Namespace) -> Answer:
     return DONE, text, {"folder": str(arguments.out), "files": names}
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register the verbs of this module."""
     for register in (_add_commission, _add_comparing, _add_parameters, _add_exports, _add_results):
         register(verbs)

@@ -11,15 +11,15 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.archive_commands import add_by, at_terminal
-from ident_service.cli.arguments import Parser, Verbs, count
+from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.arguments import Parser, VerbList, count
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, own_state_folder, state_folder
 
 if TYPE_CHECKING:
     from ident_service.registry.database import Database, Row
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register `schedule`, `maintenance`, `due` and `alarm`."""
     group = verbs.group("schedule", "when an arm is to be re-identified")
     sub = group.add("add", _add, "add a time or a trigger; what is due asks for a person")
@@ -82,12 +82,12 @@ def _known(db: Database, arguments: argparse.Namespace) -> str:
 
 
 def _add(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import When, add_schedule
+    from ident_service.operations.maintenance_schedule import DueRule, add_schedule
 
-    when = When(arguments.cron, arguments.hours, arguments.maintenance)
+    when = DueRule(arguments.cron, arguments.hours, arguments.maintenance)
     with registry(arguments) as db:
         name = _known(db, arguments)
-        row = add_schedule(db, name, when, at_terminal(arguments), time.time(), arguments.motion)
+        row = add_schedule(db, name, when, terminal_user(arguments), time.time(), arguments.motion)
     return DONE, schedule_line(row), _shown(row)
 
 
@@ -107,7 +107,7 @@ def _remove(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import remove_schedule
 
     with registry(arguments) as db:
-        remove_schedule(db, arguments.number, at_terminal(arguments))
+        remove_schedule(db, arguments.number, terminal_user(arguments))
     return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
 
 
@@ -123,17 +123,17 @@ def _enabled(arguments: argparse.Namespace, *, enabled: bool) -> Answer:
     from ident_service.operations.maintenance_schedule import enable_schedule
 
     with registry(arguments) as db:
-        row = enable_schedule(db, arguments.number, at_terminal(arguments), time.time(), enabled=enabled)
+        row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=enabled)
     return DONE, schedule_line(row), _shown(row)
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import add_event, dues
+    from ident_service.operations.maintenance_schedule import add_event, pending
 
     with registry(arguments) as db:
         name = _known(db, arguments)
-        row = add_event(db, name, arguments.what, arguments.note, at_terminal(arguments), time.time())
-        due = dues(db, name)
+        row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
+        due = pending(db, name)
     text = f"{name}: entered: {row['what']}\n" + "".join(due_line(one) for one in due)
     if not due:
         text += f"nothing is due by it; `ident schedule add {name} --maintenance` would make it so\n"
@@ -141,10 +141,10 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import dues
+    from ident_service.operations.maintenance_schedule import pending
 
     with registry(arguments) as db:
-        rows = dues(db, arguments.arm)
+        rows = pending(db, arguments.arm)
     return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": [dict(row) for row in rows]}
 
 
@@ -152,7 +152,7 @@ def _dismiss(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import dismiss
 
     with registry(arguments) as db:
-        dismiss(db, arguments.number, arguments.note, at_terminal(arguments), time.time())
+        dismiss(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
     return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
 
 
@@ -168,7 +168,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.drift_alarms import acknowledge_alarm
 
     with registry(arguments) as db:
-        row = acknowledge_alarm(db, arguments.number, arguments.note, at_terminal(arguments), time.time())
+        row = acknowledge_alarm(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
     return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", dict(row)
 
 

@@ -20,9 +20,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.archive_commands import add_by, note_act
-from ident_service.cli.arguments import Parser, Verbs, seconds, share, speed
-from ident_service.cli.operator_input import add_lease, asked_lease, until
+from ident_service.cli.archive_commands import add_by, audit_act
+from ident_service.cli.arguments import Parser, VerbList, seconds, share, speed
+from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -127,7 +127,7 @@ class HeldKey:
             return None
 
 
-def moved(
+def run_and_report(
     arguments: argparse.Namespace,
     config: ArmConfig,
     motion: Excitation | Destination,
@@ -283,7 +283,7 @@ _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot le
 _HELP_ARM = "description file, or the name of a shipped one"
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register `watch`, `check`, `run`, `rehearse`, `stop`, `pause`, `resume`, `finish`, `supported` and `ack`."""
     sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
@@ -359,13 +359,13 @@ def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
 def _watch(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.motion.arm_factory import make_arm
-    from ident_service.motion.command_channel import mover
+    from ident_service.motion.command_channel import controlling_pid
     from ident_service.motion.read_only_monitor import watch
     from ident_service.operations.arm_checks import watch_document, watch_text
     from ident_service.registry.state_folder import control_path
 
     config = load_arm(arguments.arm)
-    if (pid := mover(control_path(state_folder(arguments), config.name))) is not None:
+    if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
         raise DriverError(f"{config.name}: process {pid} moves the arm; its recording shows what it does")
     stopping = StopOnSignal()
     with stopping:
@@ -377,7 +377,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.arm_factory import make_arm
-    from ident_service.motion.command_channel import ControlFile, StoppableArm
+    from ident_service.motion.command_channel import ControlFile, InterruptibleArm
     from ident_service.motion.last_position import PositionFile
     from ident_service.motion.realtime import asked
     from ident_service.motion.ticket import Verdict
@@ -405,14 +405,14 @@ def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.confirm not in (None, config.name):
         raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
     arm, model = make_arm(config), arm_model(config)
-    lease, stopping = asked_lease(arguments, config), StopOnSignal()
+    lease, stopping = requested_lease(arguments, config), StopOnSignal()
     # `ident stop` finds this process as the one that moves the arm, and ends the preflight. A person's Ctrl-C
     # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
     with (
         interrupting() if lease is None else stopping,
         ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
     ):
-        stoppable = StoppableArm(arm, until(lambda: controls.stop or stopping.requested(), lease))
+        stoppable = InterruptibleArm(arm, stop_or_lapsed(lambda: controls.stop or stopping.requested(), lease))
         positions = PositionFile(arm_folder(state, config.name), config)
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
@@ -443,19 +443,19 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
-    lease = asked_lease(arguments, config, seconds)
+    lease = requested_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
     stopping = StopOnSignal()
     with stopping:
-        return moved(
+        return run_and_report(
             arguments,
             config,
             motion,
             sentence,
             speed=arguments.speed,
             lease=seconds,
-            stop_requested=until(stopping.requested, lease),
+            stop_requested=stop_or_lapsed(stopping.requested, lease),
             until=_target(arguments),
         )
 
@@ -491,7 +491,7 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
         tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
         if not key.wait(stopping.requested):
             raise MotionRefused("nobody held the key; nothing has moved")
-        return moved(
+        return run_and_report(
             arguments,
             config,
             motion,
@@ -524,14 +524,14 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
         reached = stop_arms(state, None)
         for name in known_arms(state):  # a file was made where there was none
             leave_to_owner(state, control_path(state, name))
-        note_act(arguments, "stop", "all arms", reached=reached)
+        audit_act(arguments, "stop", "all arms", reached=reached)
         text = f"stop asked of {', '.join(reached)}" if reached else "nobody moves an arm"
         text += "; no motion will begin that was asked for before now\n"
         return DONE, text, {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
     leave_to_owner(state, path)
-    note_act(arguments, "stop", name, reached=[] if pid is None else [name])
+    audit_act(arguments, "stop", name, reached=[] if pid is None else [name])
     text = f"{name}: stop asked of process {pid}" if pid is not None else f"nobody moves {name}"
     text += "" if pid is not None else "; no motion will begin that was asked for before now"
     return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
@@ -557,7 +557,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
                 controls.ask_finish()
             controls.ask_pause(arguments.asks == "pause")
         pid = controls.pid
-    note_act(arguments, arguments.asks, name, reached=[name])
+    audit_act(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
 
@@ -580,11 +580,11 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
 def _let_go(arguments: argparse.Namespace) -> Answer:
     """Switch off the drives that still hold an arm after the motion process has ended."""
     from ident_service.config.load import load_arm
-    from ident_service.operations.recovery import let_go
+    from ident_service.operations.recovery import release_held_drives
 
     config = load_arm(arguments.arm)
-    held = let_go(config, own_state_folder(arguments))
-    note_act(arguments, "supported", config.name, reached=[config.name])
+    held = release_held_drives(config, own_state_folder(arguments))
+    audit_act(arguments, "supported", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "supported", "let_go": list(held)}
     return DONE, f"{config.name}: drives have let go of {', '.join(held)}\n", document
 
@@ -594,7 +594,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 
     name = _name(arguments)
     cause = fault_file(own_state_folder(arguments), name).acknowledge(arguments.fault)
-    note_act(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
+    audit_act(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 
 

@@ -89,7 +89,9 @@ def add_lease(sub: Parser, *, confirm: bool = True) -> None:
     )
 
 
-def asked_lease(arguments: argparse.Namespace, config: ArmConfig, seconds: float | None = None) -> StdinLease | None:
+def requested_lease(
+    arguments: argparse.Namespace, config: ArmConfig, seconds: float | None = None
+) -> StdinLease | None:
     """Return the lease over standard input if the verb's arguments ask for one, else None.
 
     In virtual time silence does not count, as between our own processes; the end of the input
@@ -114,6 +116,6 @@ def asked_lease(arguments: argparse.Namespace, config: ArmConfig, seconds: float
     return StdinLease(math.inf if make_arm(config).clock.lock_step else lasts, sys.stdin.fileno())
 
 
-def until(stopping: Callable[[], bool], lease: StdinLease | None) -> Callable[[], bool]:
+def stop_or_lapsed(stopping: Callable[[], bool], lease: StdinLease | None) -> Callable[[], bool]:
     """Return a function that tells whether a stop was requested or the lease has ended."""
     return stopping if lease is None else lambda: stopping() or lease.over()

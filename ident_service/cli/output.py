@@ -174,7 +174,7 @@ class StopOnSignal:
 _OURS = frozenset({"exit_code", "error"})  # keys that the job's own lines show already
 
 
-def in_words(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
+def with_answer_lines(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
     """Return the answer with its command's JSON object appended to the text as lines."""
     code, text, document = answer
     said = {key: value for key, value in document["answer"].items() if key not in _OURS}

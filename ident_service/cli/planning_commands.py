@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import Parser, Verbs, count, frequency, seconds, seed, share, weight, workers
+from ident_service.cli.arguments import Parser, VerbList, count, frequency, seconds, seed, share, weight, workers
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, print_to_person, tell
 from ident_service.errors import UsageError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from ident_service.excitation.search import Progress
     from ident_service.motion.doctor import Finding, Held, Woken
-    from ident_service.operations.motion_design import Knowledge
+    from ident_service.operations.motion_design import PriorData
 
 
 _UNFINISHED = "the search ended before its first start was finished; more time will find a better motion"
@@ -28,7 +28,7 @@ _FAMILY = ("motion", "base_frequency", "harmonics", "periods", "ramp", "postures
 _MARGINS = ("criterion", "position_margin", "torque_margin")
 
 
-def _add_motions(verbs: Verbs) -> None:
+def _add_motions(verbs: VerbList) -> None:
     """Register `design` and `preview`."""
     sub = verbs.add("design", _design, "the most informative motion that the arm can safely make")
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
@@ -82,10 +82,10 @@ def _know(sub: Parser) -> None:
     )
 
 
-def _knowledge(arguments: argparse.Namespace) -> Knowledge:
-    from ident_service.operations.motion_design import Knowledge
+def _knowledge(arguments: argparse.Namespace) -> PriorData:
+    from ident_service.operations.motion_design import PriorData
 
-    return Knowledge(arguments.model, arguments.noise, tuple(arguments.after))
+    return PriorData(arguments.model, arguments.noise, tuple(arguments.after))
 
 
 def _design(arguments: argparse.Namespace) -> Answer:
@@ -174,7 +174,7 @@ def _preview(arguments: argparse.Namespace) -> Answer:
     return (VERDICT_NO if seen.objections else DONE), text, document
 
 
-def _add_configs(verbs: Verbs) -> None:
+def _add_configs(verbs: VerbList) -> None:
     """Register `new` and `config check`."""
     new = verbs.add("new", _new, "write a first description of an arm from its URDF, with a simulated arm to try it")
     new.add_argument("urdf", metavar="URDF", type=Path)
@@ -214,7 +214,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
 _HELP_ARM = "description file, or the name of a shipped one"
 
 
-def _add_bus(verbs: Verbs) -> None:
+def _add_bus(verbs: VerbList) -> None:
     """Register `bus load`, `bus scan` and `bus probe`."""
     bus = verbs.group("bus", "the fieldbus of an arm")
     load = bus.add("load", _load, "what every frame costs, and whether all of them fit (exit code 3: they do not)")
@@ -264,7 +264,7 @@ _DEFAULT_RATE = 1000.0  # Hz
 _DOUBT = 3.0  # events that a Poisson process of which none came has at most, with 95 %
 
 
-def _add_doctor(verbs: Verbs) -> None:
+def _add_doctor(verbs: VerbList) -> None:
     """Register the verb."""
     text = "is this computer fit to move an arm, and at which rates? (exit code 3: not at the described arm's)"
     sub = verbs.add("doctor", _doctor, text)
@@ -360,7 +360,7 @@ def _document(
     }
 
 
-def _add_emulate(verbs: Verbs) -> None:
+def _add_emulate(verbs: VerbList) -> None:
     """Register `emulate`."""
     sub = verbs.add(
         "emulate",
@@ -440,7 +440,7 @@ def _lines() -> Callable[[], str | None]:
     return take
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register the verbs of this module."""
     for register in (_add_motions, _add_configs, _add_bus, _add_doctor, _add_emulate):
         register(verbs)

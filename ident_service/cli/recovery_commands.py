@@ -13,11 +13,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from ident_service.cli.archive_commands import add_by, at_terminal
-from ident_service.cli.arguments import Verbs
+from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
-from ident_service.cli.motion_commands import add_can_log, moved
-from ident_service.cli.operator_input import add_lease, asked_lease, until
+from ident_service.cli.motion_commands import add_can_log, run_and_report
+from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -42,7 +42,7 @@ _HELP_ARM = "description file, or the name of a shipped one"
 _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 
-def _add_recovery(verbs: Verbs) -> None:
+def _add_recovery(verbs: VerbList) -> None:
     """Register `home` and `recover`."""
     sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
@@ -81,7 +81,7 @@ def _home(arguments: argparse.Namespace) -> Answer:
 
 def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | None:
     """Have the process that holds the arm after a stop move it home; return None where no process holds it."""
-    from ident_service.cli.archive_commands import note_act
+    from ident_service.cli.archive_commands import audit_act
     from ident_service.cli.output import state_folder
     from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile, Homing, in_use
     from ident_service.registry.state_folder import control_path
@@ -94,9 +94,9 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
             return None  # the arm is moving; starting another motion is refused later
     if arguments.out is not None or arguments.can_log:
         raise UsageError("--out and --can-log are for a motion of its own; the run that holds the arm has its folder")
-    lease, stopping = asked_lease(arguments, config), StopOnSignal()
+    lease, stopping = requested_lease(arguments, config), StopOnSignal()
     with stopping, ControlFile.reach(path) as controls:
-        asked, pid, stopped = until(stopping.requested, lease), controls.pid, False
+        asked, pid, stopped = stop_or_lapsed(stopping.requested, lease), controls.pid, False
         controls.ask_home()
         tell(arguments, f"{config.name}: keep out of its reach; process {pid} leads it home, slowly. Ctrl-C stops.")
         while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
@@ -105,7 +105,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
                 stopped = True
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)
-    note_act(arguments, "home", config.name, reached=[config.name])
+    audit_act(arguments, "home", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
         return DONE, f"{config.name}: led home; it is held there until `ident supported {arguments.arm}`\n", document
@@ -118,9 +118,9 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     from ident_service.config.canopen import CanopenDriver
-    from ident_service.operations.recovery import home_posture, take_home
+    from ident_service.operations.recovery import home_posture, set_home
 
-    posture, lease = home_posture(config), asked_lease(arguments, config)
+    posture, lease = home_posture(config), requested_lease(arguments, config)
     tell(arguments, f"{config.name}: nothing will move. From now on the arm stands, by what you say, in this posture:")
     for joint in posture:
         tell(arguments, f"  {joint}")
@@ -132,7 +132,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
-    done = take_home(config, own_state_folder(arguments), confirm)
+    done = set_home(config, own_state_folder(arguments), confirm)
     lines = [f"{done.arm}: zeroed, until its drives lose their power", *(f"  {words}" for words in done.drives)]
     lines += [f"  latched still: {fault.code}: {fault.cause}" for fault in done.faults]
     if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
@@ -184,13 +184,13 @@ def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Desti
         "hold": f"the arm is held until `ident supported {config.name}`, then lowered",
         "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
     }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
-    lease = asked_lease(arguments, config)
+    lease = requested_lease(arguments, config)
     tell(arguments, f"{config.name}: keep out of its reach; where the way ends")
     tell(arguments, f"{ends}. Ctrl-C stops.")
     stopping = StopOnSignal()
     with stopping:
-        asked = until(stopping.requested, lease)
-        return moved(arguments, config, destination, f"slowly {destination.value}", stop_requested=asked)
+        asked = stop_or_lapsed(stopping.requested, lease)
+        return run_and_report(arguments, config, destination, f"slowly {destination.value}", stop_requested=asked)
 
 
 def _text(found: Recovery) -> str:
@@ -227,7 +227,7 @@ EXIT_CODES: Final = {
 """Exit codes by the end of a re-identification; any other end is a failure."""
 
 
-def _add_reidentify(verbs: Verbs) -> None:
+def _add_reidentify(verbs: VerbList) -> None:
     """Register `reidentify`."""
     sub = verbs.add(
         "reidentify", _reidentify, "check, run, identify, compare with the accepted set (exit code 3: changed)"
@@ -247,7 +247,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.runs import RUNS, index_run
 
     state, config, begun = own_state_folder(arguments), load_arm(arguments.arm), time.time()
-    who = at_terminal(arguments)
+    who = terminal_user(arguments)
     with registry(arguments) as db:
         number = require_comparable(state, config)
         accepted = accepted_set(state, config.name, number)[1]
@@ -302,7 +302,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
     return answer
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register the verbs of this module."""
     for register in (_add_recovery, _add_reidentify):
         register(verbs)

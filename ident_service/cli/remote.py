@@ -14,7 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import Verbs, columns_files, count
+from ident_service.cli.arguments import VerbList, columns_files, count
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -23,9 +23,9 @@ from ident_service.cli.output import (
     VERDICT_NO,
     Answer,
     StopOnSignal,
-    in_words,
     state_folder,
     tell,
+    with_answer_lines,
 )
 from ident_service.cli.remote_recordings import file_of, recording, require_known
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
@@ -42,7 +42,7 @@ LIVE = ("queued", "running")
 _MOVE = ("check", "run", "home", "leave_limit", "zero")  # a rehearsal has its own way, `remote_watching.py`
 
 
-def add(verbs: Verbs) -> None:
+def add(verbs: VerbList) -> None:
     """Register `jobs list`, `jobs show`, `jobs watch` and `jobs cancel`."""
     jobs = verbs.group("jobs", "what a daemon does; without --server, that of the state folder")
     sub = jobs.add("list", _with_client(_list), "jobs, the newest first")
@@ -56,7 +56,7 @@ def add(verbs: Verbs) -> None:
         sub.add_argument("job", metavar="ID")
 
 
-def remotely(arguments: argparse.Namespace) -> Answer:
+def run_on_daemon(arguments: argparse.Namespace) -> Answer:
     """Run a verb on the daemon that `--server` names.
 
     Raises:
@@ -97,7 +97,9 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     return connected
 
 
-def asked(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = in_words) -> Verb:
+def job_verb(
+    make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = with_answer_lines
+) -> Verb:
     """A verb that is a job.
 
     Args:
@@ -247,25 +249,27 @@ def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return in_words(client, arguments, told(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE))
+    return with_answer_lines(
+        client, arguments, job_answer(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
+    )
 
 
 def _watch(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     job = client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}")
-    return in_words(client, arguments, _followed(client, arguments, job, moves=False, ours=False))
+    return with_answer_lines(client, arguments, _followed(client, arguments, job, moves=False, ours=False))
 
 
 def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return told(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
+    return job_answer(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
 
 
 REMOTE: dict[str, Verb] = {
-    "simulate": asked(_simulate),
-    "identify": asked(_identify),
-    "design": asked(_design),
-    "check": asked(_check),
-    "run": asked(_run),
-    "home": asked(_home),
+    "simulate": job_verb(_simulate),
+    "identify": job_verb(_identify),
+    "design": job_verb(_design),
+    "check": job_verb(_check),
+    "run": job_verb(_run),
+    "home": job_verb(_home),
     "stop": _stop,
     **dict.fromkeys(("pause", "resume", "finish"), _ask),
     "supported": _supported,
@@ -330,7 +334,7 @@ def _followed(
             if said != phase:
                 phase = said
                 tell(arguments, phase)
-    return told(client, job)
+    return job_answer(client, job)
 
 
 def renew(client: IdentClient, job: str) -> None:
@@ -342,7 +346,7 @@ def renew(client: IdentClient, job: str) -> None:
             raise
 
 
-def told(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
+def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
     """Return a job's state and its command's answer, with the exit code of that state unless one is given."""
     result = client.get(f"/api/v1/jobs/{job['id']}/result")["answer"]
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]

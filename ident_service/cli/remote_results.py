@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.archive_commands import deleted_text, pruned_text
 from ident_service.cli.daemon_commands import token_line
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, in_words
-from ident_service.cli.remote import Verb, asked, word_of_address
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, with_answer_lines
+from ident_service.cli.remote import Verb, job_verb, word_of_address
 from ident_service.cli.remote_recordings import recording
 from ident_service.errors import ArmError, UsageError
 
@@ -58,9 +58,9 @@ def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """Download the files of an export, where `--out` was given."""
-    from ident_service.results.manifest import appearing_folder
+    from ident_service.results.manifest import atomic_folder
 
-    code, text, document = in_words(client, arguments, answer)
+    code, text, document = with_answer_lines(client, arguments, answer)
     if code not in (DONE, VERDICT_NO):
         return code, text, document
     export = word_of_address(str(document["job"]["run"]))
@@ -70,7 +70,7 @@ def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer)
         return code, f"{text}files of {export}, fetched with --out:\n{listed}", document | {"export": export}
     if strange := [name for name in files if not _PLAIN.fullmatch(name)]:
         raise ArmError(f"the daemon names a file {strange[0]!r}, which is no plain name; nothing was written")
-    with appearing_folder(arguments.out) as folder:
+    with atomic_folder(arguments.out) as folder:
         for name in files:
             (folder / name).write_bytes(client.content(f"{_API}/exports/{export}/files/{name}"))
     listed = "".join(f"  {name}\n" for name in files)
@@ -79,7 +79,7 @@ def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer)
 
 def _corrected(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """Download the corrected parameters to the file that `--out` names."""
-    code, text, document = in_words(client, arguments, answer)
+    code, text, document = with_answer_lines(client, arguments, answer)
     if code != DONE:
         return code, text, document
     export = word_of_address(str(document["job"]["run"]))
@@ -142,14 +142,14 @@ def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 _DELETES = ("delete run", "delete motion", "delete arm")
 VERBS: dict[str, Verb] = {
-    "report": asked(_run, _reported),
-    "export": asked(_export, _fetched),
-    "figures": asked(_figures, _fetched),
-    "payload": asked(_payload, _fetched),
-    "compare": asked(_compare, in_words),
-    "verify": asked(_of_file, in_words),
-    "feasible": asked(_of_file, in_words),
-    "correct": asked(_of_file, _corrected),
+    "report": job_verb(_run, _reported),
+    "export": job_verb(_export, _fetched),
+    "figures": job_verb(_figures, _fetched),
+    "payload": job_verb(_payload, _fetched),
+    "compare": job_verb(_compare, with_answer_lines),
+    "verify": job_verb(_of_file, with_answer_lines),
+    "feasible": job_verb(_of_file, with_answer_lines),
+    "correct": job_verb(_of_file, _corrected),
     "accept": _accept,
     "rollback": _rollback,
     "prune": _prune,

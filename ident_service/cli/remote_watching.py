@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.motion_commands import RELEASED, HeldKey, require_terminal
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, in_words, tell
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.remote import (
     LIVE,
     Verb,
-    asked,
     confirmation,
+    job_answer,
+    job_verb,
     motion_id,
     renew,
-    told,
     typed,
     word_of_address,
 )
@@ -52,7 +52,7 @@ def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _recovered(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """The commands of the next steps are for the daemon, too."""
-    code, text, document = in_words(client, arguments, answer)
+    code, text, document = with_answer_lines(client, arguments, answer)
     return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
 
 
@@ -114,7 +114,7 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     """Send a description file to be checked; any other word is the name of an arm that the daemon knows."""
     path = Path(arguments.file)
     if not path.is_file():
-        return asked(_known, in_words)(client, arguments)
+        return job_verb(_known, with_answer_lines)(client, arguments)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -140,10 +140,10 @@ def _rehearse(client: IdentClient, arguments: argparse.Namespace) -> Answer:
         made = client.post(f"{_API}/jobs", body)
         tell(arguments, f"job {made['id']}")
         over = stopping.requested if key is None else lambda: stopping.requested() or key.released()
-        return told(client, held(client, arguments, made, over))
+        return job_answer(client, keep_rehearsal_lease(client, arguments, made, over))
 
 
-def held(
+def keep_rehearsal_lease(
     client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], over: Callable[[], bool]
 ) -> dict[str, Any]:
     """Renew the lease of a rehearsal until `over` says that it is not to go on, then have it stopped.
@@ -172,13 +172,13 @@ def held(
 
 
 VERBS: dict[str, Verb] = {
-    "watch": asked(_watch, in_words),
-    "recover": asked(_recover, _recovered),
-    "base": asked(_arm, in_words),
-    "preview": asked(_preview, in_words),
-    "bus load": asked(_bus_load, in_words),
-    "bus scan": asked(_bus_scan, in_words),
-    "bus probe": asked(_bus_probe, in_words),
+    "watch": job_verb(_watch, with_answer_lines),
+    "recover": job_verb(_recover, _recovered),
+    "base": job_verb(_arm, with_answer_lines),
+    "preview": job_verb(_preview, with_answer_lines),
+    "bus load": job_verb(_bus_load, with_answer_lines),
+    "bus scan": job_verb(_bus_scan, with_answer_lines),
+    "bus probe": job_verb(_bus_probe, with_answer_lines),
     "config check": _config_check,
     "rehearse": _rehearse,
 }

@@ -28,7 +28,7 @@ from ident_service.config.quantities import (
     UPLOAD,
     Angle,
     Count,
-    GrownSection,
+    ExtendedSection,
     Interval,
     NonNegative,
     Number,
@@ -121,7 +121,7 @@ class Body(Section):
     symmetry: tuple[Literal["xy", "yz", "xz"], ...] = ()
 
 
-class Joint(GrownSection):
+class Joint(ExtendedSection):
     """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
 
     `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
@@ -162,7 +162,7 @@ class Mass(Section):
     upper: Positive | None = None
 
 
-class Constraints(GrownSection):
+class Constraints(ExtendedSection):
     """Physical knowledge about the whole arm (eqs. 25, 28).
 
     `torque_constant` bounds, per joint, what its measured torque must be multiplied by to be true; 1 elsewhere.
@@ -253,7 +253,7 @@ class PriorPull(Section):
     weight: NonNegative | Literal["held_out"] = "held_out"
 
 
-class Identification(GrownSection):
+class Identification(ExtendedSection):
     """Settings that turn a recording into equations, and equations into an estimate.
 
     `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
@@ -322,7 +322,7 @@ class FourierMotion(Section):
         return self
 
 
-class SeededMotion(GrownSection):
+class SeededMotion(ExtendedSection):
     """Random Fourier motion, the same for the same seed, scaled into the arm's limits with a margin.
 
     It is about the middle of the position limits, or about home. About home the torque, of which gravity takes its part
@@ -365,7 +365,7 @@ _MOTION_DEPENDS_ON = (
 )
 
 
-class ArmConfig(GrownSection):
+class ArmConfig(ExtendedSection):
     """A whole arm as its YAML file describes it; the first thing that passes every door.
 
     WARNING: with `unattended_motion: allowed` a scheduled re-identification, or one after maintenance, moves the arm

@@ -18,7 +18,7 @@ from ident_service.config.eds import DataSheet, data_sheet
 from ident_service.config.quantities import (
     AnyTextBeside,
     Count,
-    GrownSection,
+    ExtendedSection,
     ParameterTable,
     PerJoint,
     Positive,
@@ -55,7 +55,7 @@ class WatchdogEntry(Section):
         return self
 
 
-class Heartbeats(GrownSection):
+class Heartbeats(ExtendedSection):
     """Heartbeats of host and drives: periods and timeouts [s] (1017h, 1016h).
 
     Drives whose watchdog it is wait for the host's for `host_timeout`, which is `timeout` where it is left out.
@@ -133,7 +133,7 @@ class DriveIdentity(Section):
     serial: Unsigned32 | None = None
 
 
-class CanopenDrive(GrownSection):
+class CanopenDrive(ExtendedSection):
     """One drive and its motor.
 
     `counts` are those of a motor turn (6064h); `rated_torque` [N m] at the motor is what 6076h is set to, or must be
@@ -225,7 +225,7 @@ class StatusReports(Section):
     inhibit: InhibitTime = 0.05
 
 
-class Emulation(GrownSection):
+class Emulation(ExtendedSection):
     """Simulated arm behind emulated drives, with true parameters, noise and faults, as `SimulatedDriver` has.
 
     A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`. `eds` are
@@ -242,7 +242,7 @@ class Emulation(GrownSection):
     faults: tuple[SimulatedFault, ...] = ()
 
 
-class CanopenDriver(GrownSection):
+class CanopenDriver(ExtendedSection):
     """CANopen drives in cyclic synchronous torque mode.
 
     `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.

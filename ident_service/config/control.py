@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ident_service.config.quantities import GrownSection, Number, Positive, Section
+from ident_service.config.quantities import ExtendedSection, Number, Positive, Section
 
 _FASTEST = 10_000.0  # Hz; no torque loop over a fieldbus is faster
 
 
-class Control(GrownSection):
+class Control(ExtendedSection):
     """Computed-torque loop (eq. 76): rate [Hz] and cut-off of the velocity low-pass [Hz].
 
     The cut-off is one number or one per joint: light joints need a fast loop, heavy ones a quiet torque.

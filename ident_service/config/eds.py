@@ -18,7 +18,7 @@ _MOST_SUBS = 0xFE
 
 
 @dataclass(frozen=True)
-class Listed:
+class DataSheetEntry:
     """One entry of a data sheet.
 
     Attributes:
@@ -62,7 +62,7 @@ class DataSheet:
         mistake: why the text is no EDS; None where it may be one.
     """
 
-    entries: Mapping[int, Listed] = field(default_factory=dict)
+    entries: Mapping[int, DataSheetEntry] = field(default_factory=dict)
     dummies: frozenset[int] = frozenset()
     identity: Mapping[int, int] = field(default_factory=dict)
     mistake: str | None = None
@@ -85,7 +85,7 @@ def data_sheet(text: str) -> DataSheet:
     except configparser.Error as error:
         return DataSheet(mistake=str(error).splitlines()[0].removesuffix(" file: '<string>'"))
     sections = {name.lower(): parser[name] for name in parser.sections()}
-    entries: dict[int, Listed] = {}
+    entries: dict[int, DataSheetEntry] = {}
     for name, section in sections.items():
         if match := _OBJECT.match(name):
             index, sub = int(match[1], 16), match[2]
@@ -101,7 +101,7 @@ def data_sheet(text: str) -> DataSheet:
     return DataSheet(entries, dummies, {sub: value for sub, value in identity.items() if value is not None}, mistake)
 
 
-def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, Listed]]:
+def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, DataSheetEntry]]:
     """Yield the entries of one section: one, or all elements of a compact array."""
     text = section.get("defaultvalue") or None
     own = section.get("parametervalue") or None
@@ -110,9 +110,9 @@ def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, Listed]
     low, high = (_number(section.get(key, ""), 0) for key in ("lowlimit", "highlimit"))
     kind = _number(section.get("datatype", ""), 0) or 0
     access = section.get("accesstype", "ro").strip().lower()
-    found = Listed(kind, access, bool(_number(section.get("pdomapping", ""), 0)), low, high, text)
+    found = DataSheetEntry(kind, access, bool(_number(section.get("pdomapping", ""), 0)), low, high, text)
     if many := min(_number(section.get("compactsubobj", ""), 0) or 0, _MOST_SUBS):
-        yield 0, Listed(_NUMBER_OF_ENTRIES, text=str(many))
+        yield 0, DataSheetEntry(_NUMBER_OF_ENTRIES, text=str(many))
         yield from ((number, found) for number in range(1, many + 1))
     else:
         yield sub, found

@@ -26,7 +26,7 @@ _ROUNDED = 2e-3  # rad; 3.14 for pi is 1.6e-3
 _RPY = re.compile(r"""(\brpy\s*=\s*)(["'])([^"']*)\2""")
 
 
-def snapped(urdf: str) -> str:
+def snap_angles(urdf: str) -> str:
     """Return the URDF with `rpy` angles that are nearly multiples of 15 degrees replaced by the exact multiples."""
 
     def angle(text: str) -> str:
@@ -94,7 +94,7 @@ class Kinematics(Section):
     def _snapped(cls, urdf: TextFile | None, info: ValidationInfo) -> TextFile | None:
         if urdf is None or not info.data.get("snap"):
             return urdf
-        return TextFile(name=urdf.name, text=snapped(urdf.text))
+        return TextFile(name=urdf.name, text=snap_angles(urdf.text))
 
     @model_validator(mode="after")
     def _one(self) -> Kinematics:

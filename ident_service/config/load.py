@@ -241,7 +241,7 @@ def folder_of(arm: str | Path, where: KeyPath) -> Path:
     return read_tree(path).problem(where, "", path).path.parent
 
 
-def mistake(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
+def config_error(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
     """Return the error for a mistake that only shows when a description is used, with its place in the file.
 
     Args:

@@ -45,7 +45,7 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class GrownSection(Section):
+class ExtendedSection(Section):
     """Section that got new keys after hashes of descriptions had been stored.
 
     Keys in `later` are left out of documents while they have their defaults, so that a description without them keeps

@@ -23,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 
-from ident_service.config.quantities import Angle, GrownSection, NonNegative, Number, Positive, Section
+from ident_service.config.quantities import Angle, ExtendedSection, NonNegative, Number, Positive, Section
 
 # Beyond it, rounding would lose half of the digits between motor and joint.
 _WORST_CONDITION = 1e8
@@ -127,7 +127,7 @@ class Column(Section):
         return self.factor * size
 
 
-class Transmission(GrownSection):
+class Transmission(ExtendedSection):
     """Gear ratios per joint (motor over joint, the sign tells the sense), coupling of joints, offsets of zero.
 
     `drive_terms` says whose drive inertia and friction are: those of the motors, which a coupling spreads over joints,
@@ -271,7 +271,7 @@ def _joints(columns: Mapping[str, Column]) -> int:
     return max((int(match[2]) for name in columns if (match := _NUMBERED.fullmatch(name))), default=0)
 
 
-def units_of_other_joints(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
+def mismatched_units(form: RecordingFormat, joints: Sequence[str], revolute: Sequence[bool]) -> Iterator[str]:
     """Yield columns with a unit of a prismatic joint where the arm's joint is revolute, or vice versa.
 
     Quantities measured at a motor are rotary whatever the joint is, and are not checked.

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from ident_service.config.quantities import (
     Count,
-    GrownSection,
+    ExtendedSection,
     NonNegative,
     Number,
     ParameterTable,
@@ -143,7 +143,7 @@ class SimulatedFault(Section):
         return self
 
 
-class SimulatedDriver(GrownSection):
+class SimulatedDriver(ExtendedSection):
     """Simulated arm: true parameters and imperfections, all per joint or one number for all.
 
     `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file

@@ -14,18 +14,18 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
 from ident_service import __version__
-from ident_service.daemon.authentication import Gate
+from ident_service.daemon.authentication import Authenticator
 from ident_service.daemon.connections import Connections
 from ident_service.daemon.dependencies import Service
 from ident_service.daemon.errors import answer_mistakes
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.live import LiveRuns
-from ident_service.daemon.maintenance.scheduler import Keeper
+from ident_service.daemon.maintenance.scheduler import MaintenanceScheduler
 from ident_service.daemon.maintenance.webhook import Webhook, read_secret
 from ident_service.daemon.metrics import Metrics
-from ident_service.daemon.news import Watch
+from ident_service.daemon.news import EventPoller
 from ident_service.daemon.openapi import describe
-from ident_service.daemon.request_guard import Doors
+from ident_service.daemon.request_guard import RequestGuardMiddleware
 from ident_service.daemon.routes import (
     about,
     access,
@@ -45,7 +45,7 @@ from ident_service.daemon.routes.checks import Checks
 from ident_service.daemon.settings import Settings
 from ident_service.daemon.uploads import delete_half_uploads
 from ident_service.daemon.web.routes import PAGES
-from ident_service.operations.acceptance import settle
+from ident_service.operations.acceptance import synchronise
 from ident_service.operations.deletion import remove_deleted
 from ident_service.registry.arms import know_shipped
 from ident_service.registry.database import Database, enter_waiting
@@ -92,12 +92,12 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         lease_factor=settings.lease_factor,
         metrics=metrics,
     )
-    keeper = Keeper(engine, _webhook(settings, db))
-    service = Service(settings, db, engine, Gate(db), metrics, keeper, Checks())
+    keeper = MaintenanceScheduler(engine, _webhook(settings, db))
+    service = Service(settings, db, engine, Authenticator(db), metrics, keeper, Checks())
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        settle(db, settings.state)
+        synchronise(db, settings.state)
         remove_deleted(settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
         keeper.start()
@@ -124,13 +124,13 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     )
     app.state.service = service
     app.state.live = LiveRuns()
-    app.state.watch = Watch(db, settings.state, lambda row: jobs.answer_of(service, row).model_dump(mode="json"))
+    app.state.watch = EventPoller(db, settings.state, lambda row: jobs.answer_of(service, row).model_dump(mode="json"))
     for router in ROUTERS:
         app.include_router(router)
     describe(app)
     answer_mistakes(app)
     book = Connections() if connections is None else connections
-    app.add_middleware(Doors, settings=settings, metrics=service.metrics, connections=book)
+    app.add_middleware(RequestGuardMiddleware, settings=settings, metrics=service.metrics, connections=book)
     return app
 
 

@@ -69,7 +69,7 @@ class _Challenge:
     until: float
 
 
-class Gate:
+class Authenticator:
     """Authenticator of callers by tokens, sessions and challenges."""
 
     def __init__(self, db: Database, now: Callable[[], float] = time.monotonic) -> None:

@@ -18,9 +18,9 @@ from fastapi import Depends, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.security import APIKeyCookie, HTTPAuthorizationCredentials, HTTPBearer
 
-from ident_service.daemon.authentication import Gate, Throttled
+from ident_service.daemon.authentication import Authenticator, Throttled
 from ident_service.daemon.jobs.queue import Engine
-from ident_service.daemon.maintenance.scheduler import Keeper
+from ident_service.daemon.maintenance.scheduler import MaintenanceScheduler
 from ident_service.daemon.metrics import Metrics
 from ident_service.daemon.routes.checks import Checks
 from ident_service.daemon.settings import Settings
@@ -41,9 +41,9 @@ class Service:
     settings: Settings
     db: Database
     engine: Engine
-    gate: Gate
+    gate: Authenticator
     metrics: Metrics
-    keeper: Keeper
+    keeper: MaintenanceScheduler
     checks: Checks
 
     @property
@@ -118,7 +118,7 @@ async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
     return found
 
 
-async def anybody_near(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
+async def local_or_authenticated(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> str:
     """Return the name of the caller of a stop: any token or session, and on this machine anybody at all.
 
     A stop does no harm, and whoever needs it may have no token at hand, or one that is out of date, or be throttled.
@@ -186,9 +186,9 @@ def _loopback(address: str) -> bool:
 
 
 Serving = Annotated[Service, Depends(serving)]
-Near = Annotated[str, Depends(anybody_near)]
+Near = Annotated[str, Depends(local_or_authenticated)]
 LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
 Viewer = Annotated[Access, Depends(viewer)]
-Told = Annotated[WhileKnown, Depends(while_known)]
+WhileAuthorized = Annotated[WhileKnown, Depends(while_known)]
 Operator = Annotated[Access, Depends(operator)]
 """Dependencies that routes declare."""

@@ -23,11 +23,11 @@ import numpy as np
 
 from ident_service.config.load import arm_from_json
 from ident_service.errors import IdentError, RecordingError
-from ident_service.recordings.mcap_follower import RecordingTail, Samples
+from ident_service.recordings.mcap_follower import RecordingFollower, Samples
 from ident_service.recordings.recording import Block
 
 if TYPE_CHECKING:  # the thread that needs estimation imports it, so that the service starts without
-    from ident_service.estimation.online import Doubt, GrowingInformation
+    from ident_service.estimation.online import ParameterUncertainty, SequentialLeastSquares
 
 ARM, RECORDING = "arm.json", "run.mcap"
 BIN_NS: Final = 20_000_000  # one point of the display
@@ -61,13 +61,13 @@ class LiveRun:
         """
         self._folder, self._now = folder, now
         self._lock = threading.Lock()
-        self._tail: RecordingTail | None = None
+        self._tail: RecordingFollower | None = None
         self._frames: deque[Frame] = deque(maxlen=_FRAMES)
         self._number, self._looked, self._seen = 0, -math.inf, now()
         self._first_ns: int | None = None
         self._waiting: deque[Samples] = deque(maxlen=_MOST_WAITING)
         self._worker: threading.Thread | None = None
-        self._growing: GrowingInformation | None = None
+        self._growing: SequentialLeastSquares | None = None
         self._lost = False
         self.broken = ""
 
@@ -99,7 +99,7 @@ class LiveRun:
         if self._tail is None:
             for name in (f"{RECORDING}.partial", RECORDING):
                 try:
-                    self._tail = RecordingTail(self._folder / name)
+                    self._tail = RecordingFollower(self._folder / name)
                     break
                 except FileNotFoundError:
                     continue
@@ -142,12 +142,12 @@ class LiveRun:
     # --- the thread that computes the deviations
 
     def _work(self) -> None:
-        from ident_service.estimation.online import GrowingInformation
+        from ident_service.estimation.online import SequentialLeastSquares
         from ident_service.model.arm_model import arm_model
 
         try:
             if self._growing is None:
-                self._growing = GrowingInformation(arm_model(arm_from_json(self._folder / ARM)))
+                self._growing = SequentialLeastSquares(arm_model(arm_from_json(self._folder / ARM)))
             while self._now() - self._seen < _PATIENCE:
                 time.sleep(_WORK)
                 # Samples were dropped: the deviations would be those of a run with a gap.
@@ -158,7 +158,7 @@ class LiveRun:
             self._lost = True
             _LOG.warning("doubt cannot be shown while the arm moves: %s", error)
 
-    def _one_step(self, growing: GrowingInformation) -> None:
+    def _one_step(self, growing: SequentialLeastSquares) -> None:
         while self._waiting:
             samples = self._waiting.popleft()
             growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
@@ -196,8 +196,8 @@ class LiveRuns:
             found.close()
 
 
-def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) -> dict[str, Any]:
-    from ident_service.estimation.uncertainty import shares
+def _told(doubt: ParameterUncertainty, expressions: tuple[str, ...], units: tuple[str, ...]) -> dict[str, Any]:
+    from ident_service.estimation.uncertainty import relative_deviations
 
     return {
         "seconds": round(doubt.seconds, 2),
@@ -215,7 +215,7 @@ def _told(doubt: Doubt, expressions: tuple[str, ...], units: tuple[str, ...]) ->
                 units,
                 doubt.beta,
                 doubt.deviations,
-                shares(doubt.beta, doubt.deviations, doubt.negligible),
+                relative_deviations(doubt.beta, doubt.deviations, doubt.negligible),
                 doubt.verdicts,
                 strict=True,
             )

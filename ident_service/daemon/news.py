@@ -32,7 +32,7 @@ _GONE = 30.0  # s that the end of a job is kept for those who watch
 
 
 @dataclass(frozen=True)
-class News:
+class ViewerEvent:
     """One event for viewers.
 
     Attributes:
@@ -47,7 +47,7 @@ class News:
 
 
 @dataclass
-class Seen:
+class ViewerPosition:
     """Position of one viewer in the events.
 
     Attributes:
@@ -66,7 +66,7 @@ class _Standing:
     gone: float | None = None  # when it ended [s]
 
 
-class Watch:
+class EventPoller:
     """Poller of registry and arms for all viewers; may be used from any thread."""
 
     def __init__(
@@ -86,12 +86,12 @@ class Watch:
         """
         self._db, self._state, self._shown, self._now = db, state, shown, now
         self._lock, self._looked, self._version = threading.Lock(), float("-inf"), 0
-        self._lines = deque[News](maxlen=_KEPT)
+        self._lines = deque[ViewerEvent](maxlen=_KEPT)
         self._line: int | None = None  # number of the last line that was read
         self._standing = dict[tuple[str, str], _Standing]()
         self._ending = set[str]()  # jobs whose end may not have been seen
 
-    def begin(self, after: int | None) -> Seen:
+    def begin(self, after: int | None) -> ViewerPosition:
         """Return the position of a new viewer.
 
         Args:
@@ -99,7 +99,7 @@ class Watch:
         """
         last = last_line(self._db)
         # A number beyond the last line comes from another state folder, or from before a restore.
-        return Seen(last if after is None or after > last else after)
+        return ViewerPosition(last if after is None or after > last else after)
 
     @property
     def due(self) -> bool:
@@ -119,25 +119,25 @@ class Watch:
         finally:
             self._lock.release()
 
-    def behind(self, seen: Seen) -> bool:
+    def behind(self, seen: ViewerPosition) -> bool:
         """Return whether a viewer misses lines that are no longer in memory."""
         return self._line is not None and seen.line < self._line and not self._remembers(seen.line)
 
-    def earlier(self, seen: Seen) -> list[News]:
+    def earlier(self, seen: ViewerPosition) -> list[ViewerEvent]:
         """Return a page of lines from the registry for a viewer who is behind."""
         found = [_line(row) for row in trail_after(self._db, seen.line, _PAGE)]
         # No lines: the registry has been restored to an earlier state.
         seen.line = (found[-1].number if found else self._line) or 0
         return found
 
-    def since(self, seen: Seen) -> list[News]:
+    def since(self, seen: ViewerPosition) -> list[ViewerEvent]:
         """Return the events in memory that are new to a viewer, without waiting."""
         found = [one for one in list(self._lines) if one.number is not None and one.number > seen.line]
         if found and found[-1].number is not None:
             seen.line = found[-1].number
         version, first = self._version, seen.version < 0
         standing = [
-            (one.version, News(kind, one.data))
+            (one.version, ViewerEvent(kind, one.data))
             for (kind, _), one in list(self._standing.items())
             if seen.version < one.version <= version and not (first and one.gone is not None)
         ]
@@ -191,5 +191,5 @@ class Watch:
             self._version += 1
 
 
-def _line(row: Row) -> News:
-    return News("happened", json.dumps(dict(row), allow_nan=False), row["id"])
+def _line(row: Row) -> ViewerEvent:
+    return ViewerEvent("happened", json.dumps(dict(row), allow_nan=False), row["id"])

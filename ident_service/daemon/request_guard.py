@@ -65,7 +65,7 @@ class _Busy(HTTPException):
         super().__init__(503, "too many requests are being answered; ask again", {"Retry-After": "1"})
 
 
-class Doors:
+class RequestGuardMiddleware:
     """ASGI middleware: check Host, Origin, body size and load; add security headers; count and log requests."""
 
     def __init__(self, app: App, settings: Settings, metrics: Metrics, connections: Connections) -> None:

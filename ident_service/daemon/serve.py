@@ -91,7 +91,7 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, default=str)
 
 
-class NotTooOften(logging.Filter):
+class RepeatFilter(logging.Filter):
     """Filter that drops lines repeated too often; the next one that passes has the number of dropped ones."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -114,7 +114,7 @@ class NotTooOften(logging.Filter):
         return count < _MOST_ALIKE
 
 
-class AsideHandler(logging.Handler):
+class QueuedHandler(logging.Handler):
     """Handler that passes lines to a thread of its own, which writes them; it never waits for that thread."""
 
     def __init__(self, stream: TextIO) -> None:
@@ -146,9 +146,9 @@ class AsideHandler(logging.Handler):
 
 def log_as_json(level: int = logging.INFO) -> None:
     """Write all logs of this process as lines of JSON from now on."""
-    handler = AsideHandler(sys.stderr)
+    handler = QueuedHandler(sys.stderr)
     handler.setFormatter(JsonLines())
-    handler.addFilter(NotTooOften())
+    handler.addFilter(RepeatFilter())
     atexit.register(handler.close)
     logging.basicConfig(level=level, handlers=[handler], force=True)
     # Each request has its line already (`request_guard.py`).

@@ -37,7 +37,7 @@ from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Database, note
 from ident_service.registry.motions import new_id
 from ident_service.registry.runs import COLUMNS, RUNS, UPLOAD, index_run
-from ident_service.results.manifest import appearing_folder, named_files, write_atomically, write_manifest
+from ident_service.results.manifest import atomic_folder, named_files, write_atomically, write_manifest
 
 if TYPE_CHECKING:
     from ident_service.config.arm import ArmConfig
@@ -325,7 +325,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
         if seen.received != announced.bytes:
             raise AlreadyThere(f"{upload}: has {seen.received} of {announced.bytes} bytes; send the rest first")
         run = new_id(arm.name)
-        with _deleted_if_wrong(folder), appearing_folder(state / RUNS / run) as built:
+        with _deleted_if_wrong(folder), atomic_folder(state / RUNS / run) as built:
             write_atomically(built / _ARM, arm.config.model_dump_json(indent=1))
             write_atomically(built / UPLOAD, json.dumps({"format": "ident-upload", "version": 1, **asdict(announced)}))
             if announced.columns:

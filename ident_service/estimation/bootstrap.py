@@ -112,7 +112,7 @@ def bootstrap(
     betas = np.empty((replicates, base.size))
     blind = ~np.isfinite(fit.standard_deviations)
     for number in range(replicates):
-        times = drawn(rng, count, length)
+        times = block_resample_counts(rng, count, length)
         least = _least_squares(factors, rows, times, fit)
         blind |= ~np.isfinite(least.standard_deviations)
         try:
@@ -187,7 +187,7 @@ def constrained_intervals(
     return np.where(seen[:, None], ends, [-np.inf, np.inf])
 
 
-def drawn(rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
+def block_resample_counts(rng: np.random.Generator, count: int, length: int) -> NDArray[np.int64]:
     """Return how often each of `count` blocks is drawn, in runs of `length` and `count` in all, shape (count,)."""
     starts = rng.integers(0, count, size=-(-count // length))
     chosen = ((starts[:, None] + np.arange(length)) % count).ravel()[:count]

@@ -296,7 +296,7 @@ def _centre(parts: Sequence[Part], c: Array, z: Array, normals: Array) -> Array 
     """
     identities = np.concatenate([identity(part) for part in parts])
     for _ in range(_NEWTON_STEPS):
-        maps = colouring(parts, z)
+        maps = congruence_maps(parts, z)
         if maps is None:
             return None
         slope = np.concatenate([P.T @ piece for P, piece in zip(maps, split(parts, c), strict=True)])
@@ -337,7 +337,7 @@ def _spectrum(part: Part, entries: Array) -> Array:
     return np.asarray(np.linalg.eigvalsh((part.duplication @ entries).reshape(len(part.rows), -1)), dtype=float)
 
 
-def colouring(parts: Sequence[Part], z: Array) -> list[Array] | None:
+def congruence_maps(parts: Sequence[Part], z: Array) -> list[Array] | None:
     """Return per part the map of entries X -> L X L^T with Z = L L^T; None outside the interior of the cone."""
     maps = []
     for part, piece in zip(parts, split(parts, z), strict=True):
@@ -462,7 +462,7 @@ def _most_interior(parts: Sequence[Part], A: Array, trace: Array) -> Array | Non
     if A.shape[1]:
         # The solver meets the equations to its tolerance; the path needs them to the last digit.
         z = z - A @ np.linalg.lstsq(A, z, rcond=None)[0]
-    if solution.x[-1] <= _INTERIOR or colouring(parts, z) is None:
+    if solution.x[-1] <= _INTERIOR or congruence_maps(parts, z) is None:
         return None
     return np.asarray(z / (trace @ z), dtype=float)
 
@@ -516,7 +516,7 @@ def certify(
     if conditions.names != base.names:
         raise ParameterError("the feasible set and the base parameters are about different link parameters")
     texts = base.expressions if expressions is None else expressions
-    arm = stated_arm("the arm", None, base, conditions, expressions=texts)
+    arm = certificate_arm("the arm", None, base, conditions, expressions=texts)
     statement = Statement(
         base.names,
         arm.K,
@@ -532,7 +532,7 @@ def certify(
     return _undecided(conditions, found.margin, f"the proof did not verify: {checked.message}")
 
 
-def stated_arm(
+def certificate_arm(
     name: str,
     sha256: str | None,
     base: BaseParameters,

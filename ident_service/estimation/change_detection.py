@@ -110,7 +110,7 @@ class Motion:
 
 
 @dataclass(frozen=True)
-class Identified:
+class ComparedEstimate:
     """Values and covariance, from one identification, of the base parameters that two identifications share.
 
     Attributes:
@@ -187,7 +187,7 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Drift:
+class ParameterChange:
     """Difference of two identifications, tested per parameter, per effect and as a whole.
 
     Attributes:
@@ -228,7 +228,7 @@ class Drift:
         return tuple(sorted(found, key=lambda effect: (-(effect.residual_share or 0.0), effect.p)))
 
 
-def drift(first: Identified, second: Identified) -> Drift:
+def detect_change(first: ComparedEstimate, second: ComparedEstimate) -> ParameterChange:
     """Compare two identifications of the same base parameters.
 
     Args:
@@ -262,7 +262,7 @@ def drift(first: Identified, second: Identified) -> Drift:
         effects.append(Effect(kind, number, places, test, p, worst, torque, residual, changed))
     whole = torque_shares(first, second, np.where(seen, difference, 0.0))
     drifted = any(effect.changed for effect in effects) or (corrected[0] < ALPHA and relevant(whole))
-    return Drift(
+    return ParameterChange(
         difference=difference,
         deviations=deviations,
         z=np.where(seen, difference / deviations, 0.0),
@@ -284,7 +284,7 @@ def holm(p: Sequence[float]) -> list[float]:
     return [float(value) for value in np.minimum(adjusted, 1.0)]
 
 
-def torque_shares(first: Identified, second: Identified, difference: Array) -> tuple[Array, Array] | None:
+def torque_shares(first: ComparedEstimate, second: ComparedEstimate, difference: Array) -> tuple[Array, Array] | None:
     """Return the relative change of predicted torques for a change of parameters, on the later known motion.
 
     Returns:
@@ -313,7 +313,7 @@ def _groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
     return {key: tuple(places) for key, places in groups.items()}
 
 
-def difference_test(first: Identified, second: Identified, places: Sequence[int]) -> Test:
+def difference_test(first: ComparedEstimate, second: ComparedEstimate, places: Sequence[int]) -> Test:
     """Test that these parameters are the same in both identifications.
 
     Args:
@@ -444,14 +444,14 @@ def meaning_of_cause(cause: Cause, links: int) -> str:
     return _MEANINGS["drive inertia"] if cause.kind == "drive inertia" else _MEANINGS[_direction(cause.changes)]
 
 
-def meaning_of_effect(effect: Effect, found: Drift, leading: Sequence[str], links: int) -> str:
+def meaning_of_effect(effect: Effect, found: ParameterChange, leading: Sequence[str], links: int) -> str:
     """Return the possible meaning of an effect that no single cause explains, in words for a person at the arm."""
     if effect.kind == "friction":
         return _MEANINGS[_direction({leading[place]: float(found.difference[place]) for place in effect.places})]
     return _MEANINGS["last" if effect.number == links and effect.kind != "drive inertia" else effect.kind]
 
 
-def friction_ratio(first: Identified, second: Identified, joint: int) -> tuple[float, float] | None:
+def friction_ratio(first: ComparedEstimate, second: ComparedEstimate, joint: int) -> tuple[float, float] | None:
     """Return the friction of a joint, second over first, at the root mean square of its speed.
 
     Args:

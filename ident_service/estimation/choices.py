@@ -48,14 +48,14 @@ class Choice:
         return f"{self.option} {self.value}; torque error on held-out thirds of the recordings: {others}"
 
 
-def chosen(option: str, held_out: Mapping[str, float]) -> Choice:
+def best_choice(option: str, held_out: Mapping[str, float]) -> Choice:
     """Choose the alternative with the smallest held-out error; the first, unless another is better by a hundredth."""
     usual = next(iter(held_out))
     best = min(held_out, key=lambda name: held_out[name])
     return Choice(option, best if held_out[best] < _WORTH * held_out[usual] else usual, dict(held_out))
 
 
-def clearly_chosen(option: str, held_out: Mapping[str, Array]) -> Choice:
+def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
     """Choose the first alternative, unless another predicts every third better, by more than the thirds differ.
 
     Args:

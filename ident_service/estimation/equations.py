@@ -18,12 +18,12 @@ from ident_service.config.arm import Identification
 from ident_service.errors import RecordingError
 from ident_service.estimation.repeats import Label, Stretches, stretches
 from ident_service.estimation.signal_processing import Motion, averaged, smoothed, windows
-from ident_service.estimation.spectra import settled
+from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
-from ident_service.model.information import Information, information_of, supports
+from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.zero_phase import low_pass
 from ident_service.recordings.recording import Recording
@@ -142,7 +142,7 @@ def equations(
         RecordingError: a recording does not fit the arm, or some joint does not move in it.
     """
     whole = tuple(recordings) if isinstance(recordings, Sequence) else (recordings,)
-    felt = supports(model.chain, model.layout, base.base)
+    felt = sparsity(model.chain, model.layout, base.base)
     return equations_of(whole, model, felt, lambda recording: equation_rows(recording, model, base), row_weights)
 
 
@@ -178,7 +178,7 @@ def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tupl
     Raises:
         RecordingError: a recording cannot be read.
     """
-    lengths = [_block_seconds(recording, settled(model, [recording])) for recording in recordings]
+    lengths = [_block_seconds(recording, with_chosen_cutoff(model, [recording])) for recording in recordings]
     if model.config.identification.period is not None:
         return tuple(Stretches(length, recording=index) for index, length in enumerate(lengths))
     return stretches(recordings, lengths, model.config.recording, phases=LEAST_BLOCKS)
@@ -251,7 +251,7 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -
         raise RecordingError(
             recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"
         )
-    model = settled(model, [recording])
+    model = with_chosen_cutoff(model, [recording])
     options = model.config.identification
     if options.smoothing.regressor_cutoff is not None:
         yield from _filtered_rows(recording, model, base, options.smoothing.regressor_cutoff)
@@ -296,7 +296,7 @@ def _filtered_rows(recording: Recording, model: ArmModel, base: BaseParameters, 
         offset += len(range(len(motion.time))[window.inner])
         H = _regressor(motion, model, base)
         filtered = np.zeros((*H.shape[:2], len(inner)))
-        for joint, support in enumerate(supports(model.chain, model.layout, base.base)):
+        for joint, support in enumerate(sparsity(model.chain, model.layout, base.base)):
             columns = low_pass(H[joint, support].T, options.smoothing.order, cutoff, rate)
             filtered[joint, support] = columns[inner].T
         torque = low_pass(motion.torque, options.smoothing.order, cutoff, rate)

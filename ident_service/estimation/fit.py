@@ -15,19 +15,19 @@ import numpy as np
 from ident_service.config.arm import Method
 from ident_service.estimation import instrumental_variables as instruments
 from ident_service.estimation import robust_regression
-from ident_service.estimation.choices import Choice, chosen, held_out_error
+from ident_service.estimation.choices import Choice, best_choice, held_out_error
 from ident_service.estimation.equations import Equations, equations
-from ident_service.estimation.feasible.central import Near
+from ident_service.estimation.feasible.central import ChangeEllipsoid
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import residual_deviation
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
-from ident_service.estimation.friction_fit import fit_friction, friction_trials, to_be_fitted
+from ident_service.estimation.friction_fit import fit_friction, free_friction_numbers, friction_trials
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
-from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_shares
+from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
 from ident_service.estimation.shape_uncertainty import shape_covariance
-from ident_service.estimation.spectra import settled
+from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.estimation.torque_delay import Delay, choose_delay, estimate_delay, with_delay
 from ident_service.estimation.uncertainty import uncertainty, widening
 from ident_service.model.arm_model import ArmModel
@@ -129,9 +129,9 @@ def prepare(
             choices += () if choice is None else (choice,)
         model = with_delay(model, seconds)
         trials = trials if seconds == 0.0 else None
-    if trials is None and to_be_fitted(model):
+    if trials is None and free_friction_numbers(model):
         trials = friction_trials(recordings, model, base)
-    fitted = to_be_fitted(model)
+    fitted = free_friction_numbers(model)
     model, shapes = fit_friction(trials, model, base, conditions)
     choices += shapes
     gathered = gather(recordings, model, base)
@@ -152,14 +152,14 @@ def _with_velocity(
     """
     options = model.config.identification
     if options.smoothing.velocity != "choose":
-        return settled(model, recordings), ()
+        return with_chosen_cutoff(model, recordings), ()
 
     def of(velocity: str, **more: object) -> ArmModel:
         smoothing = options.smoothing.model_copy(update={"velocity": velocity, **more})
         update = {"identification": options.model_copy(update={"smoothing": smoothing})}
         return replace(model, config=model.config.model_copy(update=update))
 
-    usual = settled(of("position"), recordings)
+    usual = with_chosen_cutoff(of("position"), recordings)
     there = all(
         not one.torque_held and all(block.velocity is not None for block in one.blocks())
         for one in (*recordings, *validation)
@@ -168,12 +168,12 @@ def _with_velocity(
         return usual, ()
     # Through the same filter, so that the same torque is predicted.
     filtered = usual.config.identification.smoothing
-    own = settled(of("measured", cutoff=filtered.cutoff, decimate=filtered.decimate), recordings)
+    own = with_chosen_cutoff(of("measured", cutoff=filtered.cutoff, decimate=filtered.decimate), recordings)
     ways = {name: gather(recordings, one, base) for name, one in (("position", usual), ("measured", own))}
     weights = weighted_least_squares(ways["position"].total).weights
     errors = {name: held_out_error(found.blocks, weights) for name, found in ways.items()}
-    choice = chosen("smoothing.velocity", errors)
-    return (usual if choice.value == "position" else settled(of("measured"), recordings)), (choice,)
+    choice = best_choice("smoothing.velocity", errors)
+    return (usual if choice.value == "position" else with_chosen_cutoff(of("measured"), recordings)), (choice,)
 
 
 def gather(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Equations:
@@ -224,7 +224,7 @@ def _with_known_shape(
     conditions: FeasibleSet,
 ) -> Fit:
     model = prepared.model
-    shares = standstill_shares(prepared.equations)
+    shares = standstill_weights(prepared.equations)
     gathered = prepared.equations.with_near(shares)
     if method == "ols":
         return _doubted("ols", ordinary_least_squares(gathered.total), gathered, shares)
@@ -233,7 +233,9 @@ def _with_known_shape(
         return _doubted("wls", fit, gathered, shares)
     choices: tuple[Choice, ...] = ()
     if method == "choose":
-        choices = (chosen("method", held_out_errors(recordings, model, base, fit, prepared.torque_scales, shares)),)
+        choices = (
+            best_choice("method", held_out_errors(recordings, model, base, fit, prepared.torque_scales, shares)),
+        )
         if choices[0].value == "wls":
             return replace(_doubted("wls", fit, gathered, shares), choices=choices)
     if method != "iv":
@@ -264,7 +266,7 @@ def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Ar
     return Fit(fit, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method)
 
 
-def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> Near | None:
+def allowed_change(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> ChangeEllipsoid | None:
     """Return N of `central.py`: base-parameter changes of the links below a hundredth of their deviations.
 
     In the metric of eq. 81 a change of length 1 moves each parameter by at most its white deviation, which is no
@@ -285,4 +287,4 @@ def as_good_as_the_same(fit: LeastSquares, base: BaseParameters, deviations: Arr
         return None
     moves = np.array([base.names[column].rstrip("0123456789") in (*INERTIAL, "Ia") for column in base.base])
     least = float(np.min(deviations[seen] / white[seen]))
-    return Near(beta, fit.R1 / (SAME * least * residual_deviation(fit)), moves)
+    return ChangeEllipsoid(beta, fit.R1 / (SAME * least * residual_deviation(fit)), moves)

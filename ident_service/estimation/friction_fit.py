@@ -29,17 +29,17 @@ from numpy.typing import NDArray
 
 from ident_service.config.arm import FrictionShape, JointTerm
 from ident_service.errors import RecordingError
-from ident_service.estimation.choices import Choice, clearly_chosen, held_out_thirds
+from ident_service.estimation.choices import Choice, held_out_thirds, significant_choice
 from ident_service.estimation.equations import Equations, Rows, equation_rows
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import Moments, ridge, weighted_least_squares
-from ident_service.estimation.robust_regression import standstill_shares
+from ident_service.estimation.robust_regression import standstill_weights
 from ident_service.estimation.signal_processing import windows
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
-from ident_service.model.information import Information, supports, triangle
+from ident_service.model.information import Information, sparsity, triangle
 from ident_service.model.parameter_layout import INERTIAL, NO_STRIBECK
 from ident_service.model.zero_phase import low_pass
 from ident_service.recordings.recording import Recording
@@ -122,7 +122,7 @@ class FrictionTrials:
             RecordingError: a recording cannot be used, or no joint moves enough to give an equation.
         """
         self._coupling, joints = model.chain.coupling, model.chain.joints
-        self._supports = supports(model.chain, model.layout, base.base)
+        self._supports = sparsity(model.chain, model.layout, base.base)
         self._size = base.size
         # Per term, the base column of each drive.
         place = {int(column): number for number, column in enumerate(base.base)}
@@ -441,7 +441,7 @@ def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: Base
     return FrictionTrials(recordings, _thinned(model, recordings), base)
 
 
-def to_be_fitted(model: ArmModel) -> tuple[str, ...]:
+def free_friction_numbers(model: ArmModel) -> tuple[str, ...]:
     """Return the names of the friction numbers that are left to be fitted and apply to this arm."""
     shape, terms = model.config.identification.friction, set(model.layout.terms)
     if not {"coulomb", "stribeck"} & terms:
@@ -472,7 +472,7 @@ def fit_friction(
         The arm with its numbers, and for each kind whether it was fitted or left out.
     """
     shape = model.config.identification.friction
-    wanted = to_be_fitted(model)
+    wanted = free_friction_numbers(model)
     joints = model.chain.joints
     values = {
         key: np.full(joints, 0.1 if key == "stribeck_velocity" else 0.0)
@@ -492,7 +492,7 @@ def fit_friction(
     return with_friction(model, _shape(values)), tuple(choices)
 
 
-def at_the_edge(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
+def at_search_bounds(shape: FrictionShape, joints: Sequence[str], terms: Sequence[str]) -> tuple[str, ...]:
     """Describe the fitted numbers that lie at an end of the search: the true value may lie beyond, or not exist.
 
     Args:
@@ -581,7 +581,7 @@ class _Search:
         """Leave out each kind, refit the others, and keep it out where held-out thirds are clearly better without."""
         values, choices = fitted, []
         gathered = self._equations(fitted)
-        shares = standstill_shares(gathered)
+        shares = standstill_weights(gathered)
         weights = weighted_least_squares(gathered.with_near(shares).total).weights
         for key in wanted:
             if np.all(values[key] <= _NONE[key]):
@@ -593,7 +593,7 @@ class _Search:
                 name: held_out_thirds(self._equations(way).with_near(shares).blocks, weights, self.base, conditions)
                 for name, way in (("fit", values), ("none", without))
             }
-            choices.append(clearly_chosen(f"friction.{key}", errors))
+            choices.append(significant_choice(f"friction.{key}", errors))
             values = values if choices[-1].value == "fit" else without
         return values, choices
 

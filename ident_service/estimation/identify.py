@@ -16,7 +16,7 @@ from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.convex import SOLVER, convex_least_squares, require_solver
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
-from ident_service.estimation.feasible.priors import Prior, choose_weight, roomier
+from ident_service.estimation.feasible.priors import Prior, choose_weight, move_off_boundary
 from ident_service.estimation.feasible.problems import (
     FeasibilityTest,
     FeasibleEstimate,
@@ -24,8 +24,8 @@ from ident_service.estimation.feasible.problems import (
     feasibility_correction,
     feasibility_test,
 )
-from ident_service.estimation.fit import Fit, Prepared, as_good_as_the_same, prepare, unconstrained
-from ident_service.estimation.friction_fit import at_the_edge
+from ident_service.estimation.fit import Fit, Prepared, allowed_change, prepare, unconstrained
+from ident_service.estimation.friction_fit import at_search_bounds
 from ident_service.estimation.least_squares import (
     LeastSquares,
     TorqueError,
@@ -249,8 +249,8 @@ def identify(
     if prior is None and custom is None:
         likely = likely_bodies(prepared.model)
         nearest_to = likely.source
-        near = as_good_as_the_same(found.fit, base, deviations, held[kind].beta) if held[kind].tight else None
-        begin = held[kind] if near is None else roomier(held[kind], base, conditions, likely, near)
+        near = allowed_change(found.fit, base, deviations, held[kind].beta) if held[kind].tight else None
+        begin = held[kind] if near is None else move_off_boundary(held[kind], base, conditions, likely, near)
         held[kind] = begin.centred(base, conditions, likely, near)
 
     everything, moving = prepared.equations.everything, prepared.equations.moving
@@ -327,7 +327,7 @@ def _remarks_on_friction(described: ArmModel, fitted: ArmModel) -> tuple[str, ..
     wanted, shape = described.config.identification.friction, fitted.config.identification.friction
     asked = {key: getattr(shape, key) for key in type(shape).model_fields if getattr(wanted, key) == "fit"}
     given = {key: 0.0 if key == "presliding" else 0.1 for key in type(shape).model_fields}
-    return at_the_edge(type(shape)(**(given | asked)), fitted.chain.names, fitted.layout.terms)
+    return at_search_bounds(type(shape)(**(given | asked)), fitted.chain.names, fitted.layout.terms)
 
 
 def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Recording]) -> None:

@@ -37,12 +37,12 @@ from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.estimation.repeats import Label, Stretches
-from ident_service.estimation.spectra import settled
+from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.expected_friction import friction_feedforward
-from ident_service.model.information import supports
+from ident_service.model.information import sparsity
 from ident_service.model.zero_phase import low_pass
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
 from ident_service.recordings.resampling import grid, uniform
@@ -126,7 +126,7 @@ def instrumental_variables(
     if not recordings or len(follow) != len(recordings):
         raise ModelError(f"{len(recordings)} recordings and {len(follow)} references; each recording needs its own")
     # The arms that are simulated below are smoothed as the recordings are.
-    model = settled(model, recordings)
+    model = with_chosen_cutoff(model, recordings)
     smoothed = float(model.config.identification.smoothing.cutoff)
     frequency = cutoff or (smoothed if references is not None else max(0.25 * smoothed, _SLOWEST))
     cut = cut_into_stretches(recordings, model)
@@ -184,7 +184,7 @@ def _blocks(
     weights: Array,
     cut: Stretches,
 ) -> Iterator[tuple[Label, _Sums]]:
-    joint_supports = supports(model.chain, model.layout, base.base)
+    joint_supports = sparsity(model.chain, model.layout, base.base)
     origin = cut.origin
     # The stamps are the same, so the chunks are too.
     pairs = zip(equation_rows(recording, model, base), equation_rows(instruments, model, base), strict=True)

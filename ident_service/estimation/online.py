@@ -26,7 +26,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
-from ident_service.model.information import empty_information, information_of, supports
+from ident_service.model.information import empty_information, information_of, sparsity
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Stamps, cut, join
 
 _FIRST = 2.0  # s, length of the first window; it grows where the filter needs more
@@ -35,7 +35,7 @@ _MOST = 10.0  # s beyond the shortest window that are worked on in one step
 
 
 @dataclass(frozen=True)
-class Doubt:
+class ParameterUncertainty:
     """Parameter uncertainty after the samples processed so far.
 
     Attributes:
@@ -58,7 +58,7 @@ class Doubt:
     until_ns: int = 0
 
 
-class GrowingInformation:
+class SequentialLeastSquares:
     """Sequential least squares over the samples of one run.
 
     Attributes:
@@ -82,7 +82,7 @@ class GrowingInformation:
         config = model.config.model_copy(update={"identification": options, "recording": RecordingFormat()})
         self._model = replace(model, config=config)
         self.base = base_parameters(model.chain, model.layout)
-        self._supports = supports(model.chain, model.layout, self.base.base)
+        self._supports = sparsity(model.chain, model.layout, self.base.base)
         self._information = empty_information(self._supports, self.base.size)
         self._blocks = Equations((), 0) if in_blocks else None
         self._phases = max(LEAST_BLOCKS, round(period / options.block)) if period else 0
@@ -153,7 +153,7 @@ class GrowingInformation:
         return bounded(Equations(tuple(blocks), 0, (), tuple(labels)))
 
     @one_blas_thread()
-    def doubt(self) -> Doubt | None:
+    def doubt(self) -> ParameterUncertainty | None:
         """Return the parameter uncertainty so far; None before there are more rows than parameters."""
         information = self._information
         if int(information.rows.sum()) <= self.base.size:
@@ -169,7 +169,7 @@ class GrowingInformation:
             deviations = np.maximum(deviations, found.deviations)
         as_zero = negligible(information)
         words = verdicts(fit.beta, deviations, as_zero)
-        return Doubt(self._seconds, fit.beta, deviations, as_zero, words, clusters, self._done_ns)
+        return ParameterUncertainty(self._seconds, fit.beta, deviations, as_zero, words, clusters, self._done_ns)
 
 
 class _Window:

@@ -31,7 +31,7 @@ from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.change_detection import (
     ALPHA,
     RELEVANT_TORQUE,
-    Identified,
+    ComparedEstimate,
     Motion,
     Test,
     difference_test,
@@ -42,7 +42,7 @@ from ident_service.estimation.change_detection import (
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
-from ident_service.estimation.feasible.formulation import EPSILON, Lift, constrain
+from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap, constrain
 from ident_service.estimation.feasible.nearest import nearest
 from ident_service.estimation.least_squares import LeastSquares, TorqueError, torque_error, weighted_least_squares
 from ident_service.estimation.uncertainty import Verdict, uncertainty, verdicts
@@ -189,9 +189,9 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     measured = np.sqrt(total.squared_torques() / np.maximum(total.rows, 1))
     motion = Motion(responses.responses, measured, responses.residual)
     leading = tuple(base.names[column] for column in base.base)
-    arm_side = Identified(leading, np.zeros(base.size), doubt, arm.blocks)
+    arm_side = ComparedEstimate(leading, np.zeros(base.size), doubt, arm.blocks)
     blocks = len(reduced.clusters)
-    new_side = Identified(leading, fit.beta, noise, blocks, motion)
+    new_side = ComparedEstimate(leading, fit.beta, noise, blocks, motion)
     test = difference_test(arm_side, new_side, own)
     only = np.zeros(base.size)
     only[own] = np.where(seen, fit.beta, 0.0)[own]
@@ -313,7 +313,7 @@ def _body(
     conditions: FeasibleSet,
     sign: float,
     whole: Test,
-    sides: tuple[Identified, Identified],
+    sides: tuple[ComparedEstimate, ComparedEstimate],
 ) -> Body:
     metric = _metric(covariance)
     # The sign applies to the offsets too, and is undone below.
@@ -335,7 +335,7 @@ def _smallest(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Ar
     """
     if not len(base.dependent):
         return delta
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     fixed = lift.of_beta @ (base.K @ delta)
     problem = ConicProblem(len(base.dependent))
     for block in conditions.blocks:

@@ -24,7 +24,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
-from ident_service.model.information import Information, supports
+from ident_service.model.information import Information, sparsity
 from ident_service.recordings.recording import Recording
 
 _TUNING = 1.345  # 95 % efficiency where the noise is normal after all
@@ -192,7 +192,7 @@ def _spread(
     Raises:
         RecordingError: a recording cannot be used.
     """
-    felt = supports(model.chain, model.layout, base.base)
+    felt = sparsity(model.chain, model.layout, base.base)
     kept: list[tuple[Array, ...]] = []
     every, samples, seen = 1, 0, 0
     for recording in recordings:
@@ -220,7 +220,7 @@ _SETTLED = 1e-3  # change of a share that counts as settled
 _MOST_WEIGHINGS = 100
 
 
-def standstill_shares(gathered: Equations) -> Array:
+def standstill_weights(gathered: Equations) -> Array:
     """Return the factors of the rows near standstill, shape (joints,), at most one.
 
     Args:

@@ -23,7 +23,7 @@ from ident_service.estimation.uncertainty import uncertainty
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.information import supports
+from ident_service.model.information import sparsity
 from ident_service.recordings.recording import Recording
 
 _STEP = 1e-3  # of a number's logarithm
@@ -74,7 +74,7 @@ def shape_covariance(
     further = np.arange(len(fitted) * drives)
     felt = tuple(
         np.concatenate([support, size + further[np.tile(model.chain.coupling[:, joint] != 0.0, len(fitted))]])
-        for joint, support in enumerate(supports(model.chain, model.layout, base.base))
+        for joint, support in enumerate(sparsity(model.chain, model.layout, base.base))
     )
     gathered = equations_of(recordings, model, felt, rows_of).with_torques_times(torque_scales).with_near(shares)
     fit = ordinary_least_squares(gathered.total, weights)

@@ -25,11 +25,11 @@ from ident_service.config.arm import Identification
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
 from ident_service.estimation.spectra import with_filter
-from ident_service.model.friction_state import direction
+from ident_service.model.friction_state import friction_direction
 from ident_service.model.zero_phase import local_polynomial, low_pass, widened
 from ident_service.recordings.cached_recording import memory_of
 from ident_service.recordings.recording import Block, Recording, cut, join
-from ident_service.recordings.resampling import Grid, Piece, grid, uniform
+from ident_service.recordings.resampling import Grid, UniformRun, grid, uniform
 
 Array = NDArray[np.float64]
 _WINDOW = 16384
@@ -296,12 +296,12 @@ class _Way:
         # What the window before knew better, because it had both sides to look at, stands.
         known = self._direction[:0] if smooth.opens else self._direction
         start = known[-1] if len(known) else None
-        way = np.vstack([known, direction(rate[len(known) :], self._period, self._presliding, start)])
+        way = np.vstack([known, friction_direction(rate[len(known) :], self._period, self._presliding, start)])
         self._direction = way[again]
         return Motion(smooth.time, smooth.position, smooth.velocity, smooth.acceleration, smooth.torque, keep, way)
 
 
-def _overlapping(pieces: Iterable[Piece], margin: int) -> Iterator[tuple[Block, int, int, bool, bool]]:
+def _overlapping(pieces: Iterable[UniformRun], margin: int) -> Iterator[tuple[Block, int, int, bool, bool]]:
     """Yield windows of the stretches in order: block, inner start and stop, whether it opens or closes a stretch."""
     held: list[Block] = []
     length, left, opens = 0, 0, True
@@ -424,7 +424,7 @@ def _motion(
     shape = options.friction.presliding
     presliding = np.broadcast_to(np.asarray(0.0 if shape == "fit" else shape, dtype=float), (joints,))
     # One pass over the period first, for the friction direction that it begins with.
-    once = direction(rate, step, presliding)
+    once = friction_direction(rate, step, presliding)
     return Motion(
         np.arange(length, dtype=np.float64) * step,
         position,
@@ -432,5 +432,5 @@ def _motion(
         acceleration,
         torque,
         ~(near @ (C != 0.0)),
-        direction(rate, step, presliding, once[-1]),
+        friction_direction(rate, step, presliding, once[-1]),
     )

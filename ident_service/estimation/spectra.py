@@ -82,7 +82,7 @@ def with_filter(
     return options.model_copy(update={"smoothing": chosen, "edge": edge})
 
 
-def settled(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
+def with_chosen_cutoff(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
     """Return the arm with its filter's free settings chosen from the recordings.
 
     Raises:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import UsageError
-from ident_service.estimation.uncertainty import shares
+from ident_service.estimation.uncertainty import relative_deviations
 
 if TYPE_CHECKING:  # a run whose target another process watches loads no estimator
-    from ident_service.estimation.online import Doubt
+    from ident_service.estimation.online import ParameterUncertainty
     from ident_service.model.base_parameters import BaseParameters
 
 LEAST_BLOCKS = 10
@@ -51,9 +51,9 @@ class Target:
         return np.array(chosen, dtype=np.intp)
 
 
-def worst_share(doubt: Doubt, places: NDArray[np.intp]) -> float:
+def worst_share(doubt: ParameterUncertainty, places: NDArray[np.intp]) -> float:
     """Return the largest relative deviation of the chosen parameters; infinite before there are enough blocks."""
     if doubt.blocks < LEAST_BLOCKS:
         return np.inf
-    worst = float(shares(doubt.beta, doubt.deviations, doubt.negligible)[places].max())
+    worst = float(relative_deviations(doubt.beta, doubt.deviations, doubt.negligible)[places].max())
     return worst if np.isfinite(worst) else np.inf

@@ -17,16 +17,16 @@ import numpy as np
 
 from ident_service.config.arm import Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation.choices import Choice, clearly_chosen, held_out_thirds
+from ident_service.estimation.choices import Choice, held_out_thirds, significant_choice
 from ident_service.estimation.equations import equation_rows, equations
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.friction_fit import FrictionTrials
 from ident_service.estimation.least_squares import weighted_least_squares
-from ident_service.estimation.spectra import settled
+from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.information import Information, supports, triangle
+from ident_service.model.information import Information, sparsity, triangle
 from ident_service.recordings.recording import Recording
 
 _SETTLED = 1e-6  # s
@@ -68,7 +68,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
     """
     # Where a joint turns round its friction jumps, and a jump has no rate: those rows are left out here, always. Noise
     # that a controller answers looks like a delay at high frequencies: both channels are filtered to half the cut-off.
-    options = settled(model, recordings).config.identification
+    options = with_chosen_cutoff(model, recordings).config.identification
     cutoff = 0.5 * float(options.smoothing.cutoff)
     slow = options.smoothing.model_copy(update={"cutoff": cutoff, "filter_torque": True, "decimate": 1})
     apart = options.model_copy(update={"reversal": Reversal(), "smoothing": slow})
@@ -127,14 +127,14 @@ def choose_delay(
         if abs(vertex) > _FINEST:
             found = min((found, found + vertex), key=error)
     ways = {f"{1e3 * steps * step:.3g} ms": steps for steps in (0.0, found or min((-1.0, 1.0), key=error))}
-    choice = clearly_chosen("delay", {name: tried[steps] for name, steps in ways.items()})
+    choice = significant_choice("delay", {name: tried[steps] for name, steps in ways.items()})
     return step * ways[choice.value], choice
 
 
 def _first_order(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> tuple[float, float]:
     """Return the remaining delay [s] and its standard deviation [s], to first order."""
     fit = weighted_least_squares(equations(recordings, model, base).total)
-    joint_supports = supports(model.chain, model.layout, base.base)
+    joint_supports = sparsity(model.chain, model.layout, base.base)
     factor: Array | None = None
     count = 0
     for recording in recordings:

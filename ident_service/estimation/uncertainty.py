@@ -210,11 +210,11 @@ def verdicts(beta: Array, deviations: Array, as_zero: Array) -> tuple[Verdict, .
     """
     return tuple(
         "identified" if share < IDENTIFIED_BELOW else "weak" if share < WEAK_BELOW else "unidentified"
-        for share in shares(beta, deviations, as_zero)
+        for share in relative_deviations(beta, deviations, as_zero)
     )
 
 
-def shares(beta: Array, deviations: Array, as_zero: Array) -> Array:
+def relative_deviations(beta: Array, deviations: Array, as_zero: Array) -> Array:
     """Return each deviation as a share of the larger of the parameter's size and what is as good as zero."""
     sizes = np.maximum(np.maximum(np.abs(beta), as_zero), np.finfo(float).tiny)
     # Parameters that no joint feels have infinite negligible sizes.

@@ -38,7 +38,7 @@ _NOT_WORTH_IT = 1.05  # times the gain: what is below is not proposed
 
 
 @dataclass(frozen=True)
-class Binding:
+class ActiveLimit:
     """Active limit of a motion, with its multiplier.
 
     Attributes:
@@ -54,7 +54,7 @@ class Binding:
     by_gain: float = 0.0
 
 
-def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, ...]:
+def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLimit, ...]:
     """Return the limits that constrain a motion, the costliest first.
 
     Args:
@@ -90,7 +90,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[Binding, 
         cost, stiffer = total.get(owner, (0.0, 0.0))
         total[owner] = cost + force, stiffer + force * part
     return tuple(
-        Binding(*owner, *costs)
+        ActiveLimit(*owner, *costs)
         for owner, costs in sorted(total.items(), key=lambda item: -item[1][0])
         if costs[0] > 0.0
     )
@@ -109,7 +109,7 @@ def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:
 
 
 def binding_words(
-    found: Sequence[Binding],
+    found: Sequence[ActiveLimit],
     task: Task,
     limits: MotionLimits,
     velocity: Array,
@@ -151,7 +151,7 @@ def binding_words(
 
 
 def stiffer_gains(
-    found: Sequence[Binding],
+    found: Sequence[ActiveLimit],
     late: NDArray[np.bool_],
     needed: Array,
     limits: MotionLimits,

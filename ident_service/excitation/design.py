@@ -16,7 +16,7 @@ from ident_service.config.motion_design import Criterion, Design
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.active_limits import (
-    Binding,
+    ActiveLimit,
     binding,
     binding_words,
     gain_words,
@@ -35,7 +35,7 @@ from ident_service.excitation.prediction import (
     information,
     seconds_of_information,
 )
-from ident_service.excitation.search import Budget, Candidate, Found, Progress, search
+from ident_service.excitation.search import Budget, Candidate, Progress, SearchResult, search
 from ident_service.excitation.trajectory import Basis, FourierBasis, FourierPath, PostureBasis, PosturePath
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters, static_base_parameters
@@ -67,7 +67,7 @@ class Designed:
     excitation: Excitation
     proof: Proof
     condition_number: float
-    found: Found
+    found: SearchResult
     binding: tuple[str, ...] = ()
 
 
@@ -81,7 +81,7 @@ def family(design: Design, model: ArmModel) -> tuple[Basis, BaseParameters]:
     return PostureBasis(design.postures, times, design.dwell), static_base_parameters(model.chain, model.layout)
 
 
-def settled(
+def complete_task(
     model: ArmModel,
     design: Design,
     basis: Basis,
@@ -177,7 +177,7 @@ def design_motion(
     base: BaseParameters | None = None,
     noise: Array | None = None,
     added: Array | None = None,
-    earlier: Found | None = None,
+    earlier: SearchResult | None = None,
     veto: Callable[[FourierPath | PosturePath], str | None] = lambda _: None,
     stable: Callable[[Array, Array], bool] = lambda kp, kd: True,
     tell: Callable[[Progress], None] = lambda _: None,
@@ -205,9 +205,9 @@ def design_motion(
         UsageError: parameters that are none.
     """
     asked = family(design, model)
-    require_bearable(asked[0] if basis is None else basis)
+    require_storable(asked[0] if basis is None else basis)
     basis, base = asked[0] if basis is None else basis, asked[1] if base is None else base
-    task = settled(model, design, basis, base, noise, added)
+    task = complete_task(model, design, basis, base, noise, added)
     collision = CollisionModel(model)
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
@@ -252,8 +252,8 @@ def _searched(
     budget: Budget,
     tell: Callable[[Progress], None],
     cancelled: Callable[[], bool],
-    earlier: Found | None,
-) -> tuple[Found, Attempt]:
+    earlier: SearchResult | None,
+) -> tuple[SearchResult, Attempt]:
     """Search, prove, and spend what time is left on what the proof objects to, or else on searching on."""
     begun, per = time.monotonic(), per_period(task.basis)
 
@@ -292,7 +292,7 @@ def _searched(
 
 def _gains(
     attempt: Attempt,
-    bound: Sequence[Binding],
+    bound: Sequence[ActiveLimit],
     limits: MotionLimits,
     stable: Callable[[Array, Array], bool],
 ) -> dict[int, str]:
@@ -313,7 +313,7 @@ def _shrunk_words(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     return f"made smaller until everything could be proven; whole, it would give about {gain}: {attempt.why}"
 
 
-def require_bearable(basis: Basis) -> None:
+def require_storable(basis: Basis) -> None:
     """Refuse a family of motions longer than a file may hold.
 
     Raises:
@@ -365,7 +365,7 @@ def _require_free_home(model: ArmModel, limits: MotionLimits, collision: Collisi
 
 
 def _made(
-    model: ArmModel, design: Design, seed: int, found: Found, kappa: float, value: float, proof: Proof
+    model: ArmModel, design: Design, seed: int, found: SearchResult, kappa: float, value: float, proof: Proof
 ) -> dict[str, object]:
     """Return the provenance of a motion as JSON values: how it was found and what was proven of it."""
     asked = proof.demands

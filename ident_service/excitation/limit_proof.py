@@ -40,13 +40,13 @@ from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel
 from ident_service.model.regressor import traced_regressor
-from ident_service.model.symbolic import Taylor, Value, enclose
+from ident_service.model.symbolic import TaylorModel, Value, enclose
 
 _PER_CYCLE = 400  # stretches per period of the highest frequency; its half length is then 0.008 of that phase
 
 
 @dataclass(frozen=True)
-class Stretches:
+class TimeIntervals:
     """Enclosed motion on consecutive stretches of time.
 
     Attributes:
@@ -61,17 +61,17 @@ class Stretches:
     values: list[Array]
     crackle: Array
 
-    def of(self, order: int) -> list[Taylor]:
+    def of(self, order: int) -> list[TaylorModel]:
         """Return enclosures of position (order 0), velocity, acceleration or jerk (3), one per joint."""
         h = self.half
         rest = self.crackle * (h ** (5 - order) / factorial(5 - order))[:, None]
         for i in range(2, 5 - order):
             rest = rest + np.abs(self.values[order + i]) * (h**i / factorial(i))[:, None]
         middle, slope = self.values[order], self.values[order + 1]
-        return [Taylor(middle[:, k], slope[:, k], rest[:, k], h) for k in range(middle.shape[1])]
+        return [TaylorModel(middle[:, k], slope[:, k], rest[:, k], h) for k in range(middle.shape[1])]
 
 
-def stretches(path: Path, longest: float | None = None) -> Stretches:
+def stretches(path: Path, longest: float | None = None) -> TimeIntervals:
     """Return stretches of time that cover one instance of every distinct part of a motion.
 
     Args:
@@ -88,14 +88,14 @@ def stretches(path: Path, longest: float | None = None) -> Stretches:
             edges.append(np.column_stack([points[:-1], points[1:]]))
     pairs = np.concatenate(edges)
     time, half = pairs.mean(axis=1), 0.5 * (pairs[:, 1] - pairs[:, 0])
-    return Stretches(time, half, path.derivatives(time, 4), path.crackle)
+    return TimeIntervals(time, half, path.derivatives(time, 4), path.crackle)
 
 
 _KINDS = ("velocity", "acceleration", "jerk", "torque")
 
 
 @dataclass(frozen=True)
-class Demands:
+class PeakBounds:
     """Peak bounds over a whole motion, each of shape (joints,) unless said otherwise.
 
     Attributes:
@@ -152,7 +152,7 @@ class Demands:
         return found
 
 
-def demands(path: Path, model: ArmModel) -> Demands:
+def demands(path: Path, model: ArmModel) -> PeakBounds:
     """Return the peak bounds of a motion, over all time.
 
     Args:
@@ -191,7 +191,7 @@ def demands(path: Path, model: ArmModel) -> Demands:
         drawn = power_bounds(enclosed["torque"], enclosed["velocity"], model.config.supply, model.chain.coupling)
         power = float(drawn.max())
         when["power"] = cells.time[drawn.argmax()]
-    return Demands(
+    return PeakBounds(
         lowest=-bounds["lowest"],
         highest=bounds["highest"],
         velocity=bounds["velocity"],
@@ -205,7 +205,7 @@ def demands(path: Path, model: ArmModel) -> Demands:
     )
 
 
-def torque_enclosures(cells: Stretches, model: ArmModel, delta: Array) -> list[Taylor]:
+def torque_enclosures(cells: TimeIntervals, model: ArmModel, delta: Array) -> list[TaylorModel]:
     """Return enclosures of every joint's torque with link parameters `delta`, shape (layout.size,), per stretch."""
     tape, entries = traced_regressor(model.chain, model.layout)
     n = model.chain.joints
@@ -218,7 +218,7 @@ def torque_enclosures(cells: Stretches, model: ArmModel, delta: Array) -> list[T
     return enclose(tape, [*cells.of(0), *velocity, *cells.of(2), *direction], torque)
 
 
-def _drive_rates(velocity: list[Taylor], coupling: Array) -> list[Taylor]:
+def _drive_rates(velocity: list[TaylorModel], coupling: Array) -> list[TaylorModel]:
     rates = []
     for share in coupling:
         terms = [value.scaled(float(factor)) for value, factor in zip(velocity, share, strict=True) if factor]
@@ -229,7 +229,7 @@ def _drive_rates(velocity: list[Taylor], coupling: Array) -> list[Taylor]:
     return rates
 
 
-def power_bounds(torque: list[Taylor], velocity: list[Taylor], supply: Supply, coupling: Array) -> Array:
+def power_bounds(torque: list[TaylorModel], velocity: list[TaylorModel], supply: Supply, coupling: Array) -> Array:
     """Return the most power that is drawn from the supply [W], shape (stretches,), as `Supply` counts it.
 
     Torque and velocity of the joints are handed to the drives that move them, `tau_drive = C^-T tau`.
@@ -243,7 +243,7 @@ def power_bounds(torque: list[Taylor], velocity: list[Taylor], supply: Supply, c
     return total
 
 
-def require_within_limits(path: Path, model: ArmModel, limits: MotionLimits) -> Demands:
+def require_within_limits(path: Path, model: ArmModel, limits: MotionLimits) -> PeakBounds:
     """Return the motion's peak bounds, and refuse a motion that exceeds the limits.
 
     Raises:
@@ -424,10 +424,10 @@ class Proof:
             then, and else the reference's.
     """
 
-    demands: Demands
+    demands: PeakBounds
     clearance: Clearance | None
     approach: Clearance | None
-    ways: Demands
+    ways: PeakBounds
     tracking: Tracking | None = None
 
 
@@ -449,25 +449,25 @@ def proof_of(
             description's when None.
     """
     margin = model.config.design.torque_margin if torque_margin is None else torque_margin
-    ways = _ways(path, limits)
+    ways = _approach_paths(path, limits)
 
     def clear(one: Path, tube: Tube | None = None) -> Clearance | None:
         return certified_clearance(collision, one, model.config.workspace.clearance, tube) if collision.pairs else None
 
     proof = Proof(demands(path, model), clear(path), clear(ways), demands(ways, model))
-    if model.prior is None or objections(proof, model, limits):
+    if model.prior is None or violations(proof, model, limits):
         return proof
     tracking = track(path, model, margin)
     proof = replace(proof, tracking=tracking)
-    if not collision.pairs or objections(proof, model, limits):
+    if not collision.pairs or violations(proof, model, limits):
         return proof
     proof = replace(proof, clearance=clear(path, tracking.width))
-    if objections(proof, model, limits):
+    if violations(proof, model, limits):
         return proof
     return replace(proof, approach=clear(ways, way_width(ways, model, margin)))
 
 
-def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
+def _approach_paths(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
     """Return straight segments from home to a motion's beginning, back, and to its end, at half of the limits."""
     points = np.array([limits.home, path.at(0.0)[0], limits.home, path.at(path.duration)[0]])
     far = np.abs(np.diff(points, axis=0))
@@ -478,7 +478,7 @@ def _ways(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
     return PosturePath(points, np.maximum(np.max(needed, axis=(0, 2)), _SHORTEST), 0.0)
 
 
-def objections(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
+def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
     """Return every limit that is not proven to be kept, in words; empty when all are."""
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
     forces = proof.ways.forces_beyond(model.chain.names, limits, model.config.supply)
@@ -522,7 +522,7 @@ def tightened(task: Task, proof: Proof, limits: MotionLimits) -> Task | None:
     return None if same and extra == task.extra_clearance else mended
 
 
-def largest_proven(
+def scale_to_verified(
     basis: Basis,
     coefficients: Array,
     safe: Array,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.limit_proof import Proof, largest_proven, objections, proof_of, tightened
+from ident_service.excitation.limit_proof import Proof, proof_of, scale_to_verified, tightened, violations
 from ident_service.excitation.optimal_design import Task
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import Candidate, polished
@@ -81,7 +81,7 @@ class Prover:
         """Return the proof of a motion, and what speaks against the motion in words, empty where nothing does."""
         path, limits = self._task.basis.path(coefficients), self._task.limits
         proof = proof_of(path, self._model, limits, self._collision, self._margin)
-        why = "; ".join(objections(proof, self._model, limits))
+        why = "; ".join(violations(proof, self._model, limits))
         return proof, why or self._veto(path) or ""
 
     def best_of(
@@ -179,7 +179,7 @@ class Prover:
             proof, refused = self.proof(coefficients)
             return None if refused else proof
 
-        result = largest_proven(basis, whole, basis.standing(self._safe), proven)
+        result = scale_to_verified(basis, whole, basis.standing(self._safe), proven)
         value = np.inf if result is None else self._value(result[0])
         return replace(attempt, result=result, value=value, refused=refused)
 

@@ -198,7 +198,7 @@ def rate_of_change(times: Array) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.concatenate([weight, -weight]), (rows, np.concatenate([after, before]))), (n, n))
 
 
-def forecast(
+def predict_following_error(
     model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, position: Array, velocity: Array
 ) -> Array:
     """Return the largest predicted following error of every joint over a motion [rad or m], shape (joints,).

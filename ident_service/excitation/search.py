@@ -85,7 +85,7 @@ def random_variables(problem: Problem, rng: np.random.Generator, safe: Array) ->
     return x + np.where(basis.moving, noise, 0.0).ravel()
 
 
-def climbed(
+def local_search(
     problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None], *, polish: bool = False
 ) -> Candidate:
     """Improve a motion by local search, and return the best candidate that keeps all limits at the samples.
@@ -132,8 +132,10 @@ def climbed(
                 break  # caught on the wrong side of an obstacle; another start will do better
     except Interrupted:
         # An interrupted round may be far outside the limits; earlier points may be better.
-        raise Stopped(_best_of([kept(problem, one, safe, start) for one in (*reached, *latest)])) from None
-    return kept(problem, x, safe, start)
+        raise InterruptedWithResult(
+            _best_of([best_feasible(problem, one, safe, start) for one in (*reached, *latest)])
+        ) from None
+    return best_feasible(problem, x, safe, start)
 
 
 def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callable[[], None]) -> Candidate:
@@ -142,7 +144,7 @@ def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callab
     Raises:
         Stopped: as `climbed`.
     """
-    best = kept(problem, x, safe, start)
+    best = best_feasible(problem, x, safe, start)
     peaks = problem.linear_peaks(x, _NEAR)
     state = problem.no_multipliers(_WEIGHT)
     latest = [x]
@@ -159,7 +161,7 @@ def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callab
             A, b = problem.linear_rows(sorted(peaks))
             x = _stepped(objective, x, sharpness, A, b)
             here = problem.state(x, sharpness)
-            best = _best_of([best, kept(problem, x, safe, start)])
+            best = _best_of([best, best_feasible(problem, x, safe, start)])
             if before - best.value < _SETTLED and number >= 2:
                 break
             before = best.value
@@ -168,7 +170,7 @@ def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callab
             state = state.tightened(others, _HARDER)
             peaks |= problem.linear_peaks(x, _NEARER)
     except Interrupted:
-        raise Stopped(_best_of([best, kept(problem, latest[0], safe, start)])) from None
+        raise InterruptedWithResult(_best_of([best, best_feasible(problem, latest[0], safe, start)])) from None
     return best
 
 
@@ -194,7 +196,7 @@ def _best_of(candidates: list[Candidate]) -> Candidate:
     return min(candidates, key=lambda candidate: candidate.value)
 
 
-class Stopped(Interrupted):
+class InterruptedWithResult(Interrupted):
     """Report an interrupted local search, with the best candidate so far."""
 
     def __init__(self, candidate: Candidate) -> None:
@@ -202,25 +204,25 @@ class Stopped(Interrupted):
         super().__init__()
 
 
-def kept(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
+def best_feasible(problem: Problem, x: Array, safe: Array, start: int) -> Candidate:
     """Return the best motion between x and standing still that keeps all limits at the samples.
 
     Standing still means in the motion's own middle, where that keeps the limits, or in the safe posture.
     """
     X = problem.coefficients(x)
     middle = problem.task.basis.still(X)
-    anchors = [middle, safe] if keeps(problem, middle) else [safe]
+    anchors = [middle, safe] if within_limits(problem, middle) else [safe]
     return _best_of([_largest(problem, X, anchor, start) for anchor in anchors])
 
 
 def _largest(problem: Problem, X: Array, anchor: Array, start: int) -> Candidate:
     """Return the largest motion between an anchor and X that keeps all limits."""
     share = 1.0
-    if not keeps(problem, X):
+    if not within_limits(problem, X):
         low, high = 0.0, 1.0
         for _ in range(_HALVINGS):
             share = 0.5 * (low + high)
-            low, high = (share, high) if keeps(problem, anchor + share * (X - anchor)) else (low, share)
+            low, high = (share, high) if within_limits(problem, anchor + share * (X - anchor)) else (low, share)
             if high - low < 1e-3 * high:
                 break
         share = low
@@ -229,7 +231,7 @@ def _largest(problem: Problem, X: Array, anchor: Array, start: int) -> Candidate
     return Candidate(start, value, coefficients)
 
 
-def keeps(problem: Problem, coefficients: Array) -> bool:
+def within_limits(problem: Problem, coefficients: Array) -> bool:
     """Return whether a motion keeps all limits at the samples."""
     return problem.state(problem.variables(coefficients), 1.0).worst <= 0.0
 
@@ -285,7 +287,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """Result of a search, from which it can be resumed.
 
     Attributes:
@@ -309,8 +311,8 @@ def search(
     per_period: int,
     tell: Callable[[Progress], None] = lambda _: None,
     cancelled: Callable[[], bool] = lambda: False,
-    earlier: Found | None = None,
-) -> Found:
+    earlier: SearchResult | None = None,
+) -> SearchResult:
     """Search for the best motion until the budget is used up, or the search is cancelled.
 
     Args:
@@ -362,13 +364,13 @@ def polished(
     with one_blas_thread():
         try:
             x = problem.variables(coefficients)
-            return climbed(problem, x, task.basis.standing(safe), start, check, polish=True)
-        except Stopped as ended:
+            return local_search(problem, x, task.basis.standing(safe), start, check, polish=True)
+        except InterruptedWithResult as ended:
             return ended.candidate
 
 
 @dataclass(frozen=True)
-class _Crew:
+class _WorkerPool:
     """Worker pool: submits a start or a polish, and interrupts running ones."""
 
     submit: Callable[[int, Candidate | None, float | None], Future[Candidate]]
@@ -385,7 +387,7 @@ class _Run:
         begun: float,
         tell: Callable[[Progress], None],
         cancelled: Callable[[], bool],
-        earlier: Found | None,
+        earlier: SearchResult | None,
     ) -> None:
         self._budget, self._begun, self._tell, self._cancelled = budget, begun, tell, cancelled
         self._seed = seed
@@ -397,16 +399,16 @@ class _Run:
         self._number = self._first  # of the next start
         self._polished: set[int] = set()
 
-    def found(self) -> Found:
+    def found(self) -> SearchResult:
         elapsed = self._before + time.monotonic() - self._begun
-        return Found(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
+        return SearchResult(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
     def goes_on(self) -> bool:
         """Return whether there is time for further starts, and the budget allows them."""
         seconds, starts = self._budget.seconds, self._budget.starts
         return seconds is not None and starts is None and not self._over(self._begun + seconds)
 
-    def starts(self, crew: _Crew) -> None:
+    def starts(self, crew: _WorkerPool) -> None:
         """Run starts in a share of the time that is left, or as many as are asked for."""
         seconds, now = self._budget.seconds, time.monotonic()
         until = None if seconds is None else now + _STARTS_SHARE * (self._begun + seconds - now)
@@ -424,7 +426,7 @@ class _Run:
                 self._finished += 1
                 self._take(candidate)
 
-    def polish(self, crew: _Crew) -> None:
+    def polish(self, crew: _WorkerPool) -> None:
         until = None if self._budget.seconds is None else self._begun + self._budget.seconds
         running: set[Future[Candidate]] = set()
         waiting = [one for one in self._best if one.start not in self._polished][:_POLISHED]
@@ -440,7 +442,7 @@ class _Run:
     def _over(self, until: float | None) -> bool:
         return self._broken or self._cancelled() or (until is not None and time.monotonic() >= until)
 
-    def _finished_of(self, crew: _Crew, running: set[Future[Candidate]], phase: str) -> list[Candidate]:
+    def _finished_of(self, crew: _WorkerPool, running: set[Future[Candidate]], phase: str) -> list[Candidate]:
         if self._cancelled():
             crew.interrupt()
         done, _ = wait(running, timeout=_TICK, return_when=FIRST_COMPLETED)
@@ -476,7 +478,7 @@ class _Run:
 @contextmanager
 def _crew(
     task: Task, safe: Array, seed: int, budget: Budget, per_period: int, cancelled: Callable[[], bool]
-) -> Iterator[_Crew]:
+) -> Iterator[_WorkerPool]:
     if budget.workers == 1:
         worker = _Worker(task, safe, seed, per_period, cancelled)
 
@@ -485,7 +487,7 @@ def _crew(
             future.set_result(worker.work(number, candidate, until))
             return future
 
-        yield _Crew(here, lambda: None)
+        yield _WorkerPool(here, lambda: None)
         return
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -493,7 +495,7 @@ def _crew(
         budget.workers, mp_context=context, initializer=_begin, initargs=(task, safe, seed, per_period, stop)
     )
     try:
-        yield _Crew(lambda number, candidate, until: pool.submit(_work, number, candidate, until), stop.set)
+        yield _WorkerPool(lambda number, candidate, until: pool.submit(_work, number, candidate, until), stop.set)
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)
@@ -521,8 +523,8 @@ class _Worker:
             x = problem.variables(candidate.coefficients)
         with one_blas_thread():
             try:
-                return climbed(problem, x, self._safe, number, check, polish=candidate is not None)
-            except Stopped as stopped:
+                return local_search(problem, x, self._safe, number, check, polish=candidate is not None)
+            except InterruptedWithResult as stopped:
                 return stopped.candidate
 
 
@@ -564,7 +566,7 @@ def fingerprint(task: Task, seed: int) -> str:
     return digest.hexdigest()
 
 
-def found_to_json(found: Found, task: Task) -> str:
+def found_to_json(found: SearchResult, task: Task) -> str:
     """Return the results of a search as one JSON object."""
     return json.dumps(
         {
@@ -585,7 +587,7 @@ def found_to_json(found: Found, task: Task) -> str:
     )
 
 
-def read_found(file: Path, task: Task, seed: int) -> Found:
+def read_found(file: Path, task: Task, seed: int) -> SearchResult:
     """Read a search that is to be resumed.
 
     Args:
@@ -623,4 +625,4 @@ def read_found(file: Path, task: Task, seed: int) -> Found:
         raise UsageError(f"{file}: not a search: a number that no arm can mean")
     if finished < 0 or any(one.coefficients.shape != shape for one in candidates):
         raise UsageError(f"{file}: not a search for motions of {shape[0]} joints with {shape[1]} coefficients")
-    return Found(seed, finished, seconds, candidates)
+    return SearchResult(seed, finished, seconds, candidates)

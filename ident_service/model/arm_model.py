@@ -8,7 +8,7 @@ import numpy as np
 
 from ident_service.config.arm import ArmConfig
 from ident_service.config.quantities import TextFile
-from ident_service.config.recording import units_of_other_joints
+from ident_service.config.recording import mismatched_units
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain, chain_from_dh
 from ident_service.model.parameter_layout import Layout
@@ -74,7 +74,7 @@ def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:
             f"{config.name}: joints are configured as {', '.join(config.joints)} "
             f"but the mechanism has {', '.join(chain.names)}, in this order"
         )
-    if wrong := list(units_of_other_joints(config.recording, chain.names, chain.revolute)):
+    if wrong := list(mismatched_units(config.recording, chain.names, chain.revolute)):
         raise ModelError(f"{config.name}: {'; '.join(wrong)}")
     gears = config.transmission
     if gears is not None and gears.coupling is not None and gears.drive_terms == "motors":

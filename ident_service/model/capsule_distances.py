@@ -28,7 +28,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.collision import scene
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace
-from ident_service.model.symbolic import Differentiable, Symbol, Tape, Value
+from ident_service.model.symbolic import Differentiable, ExpressionGraph, Symbol, Value
 
 _BISECTIONS = 36
 _TOUCH = 1e-9  # m; what comes nearer to a box may as well be inside it
@@ -203,7 +203,7 @@ class CapsuleModel:
         round_bodies = [index for index in used if not _stays(around.bodies[index])]
         place = {index: number for number, index in enumerate(round_bodies)}
         capsules = [containing_capsule(around.bodies[index]) for index in round_bodies]
-        tape = Tape()
+        tape = ExpressionGraph()
         q = [tape.input() for _ in range(self.joints)]
         frames = _frames(tape, around.chain, q)
         ends: list[list[_Vector]] = [
@@ -403,7 +403,7 @@ class _BoxPairs(_Family):
         return np.asarray(distance - self._radius)
 
 
-def _frames(tape: Tape, chain: Chain, q: Sequence[Symbol]) -> list[tuple[list[_Vector], _Vector]]:
+def _frames(tape: ExpressionGraph, chain: Chain, q: Sequence[Symbol]) -> list[tuple[list[_Vector], _Vector]]:
     """Return rotation (rows) and origin of every joint frame in the base frame."""
     frames: list[tuple[list[_Vector], _Vector]] = []
     for k in range(chain.joints):

@@ -39,7 +39,7 @@ from ident_service.config.motion_design import BASE
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace, Solid, turned
+from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace, Solid, rotation_rpy
 from ident_service.model.urdf import urdf_solids
 
 
@@ -139,7 +139,7 @@ def _obstacles(workspace: given.Workspace) -> Iterator[Body]:
 def _obstacle(obstacle: given.Obstacle) -> Solid:
     if obstacle.box is not None:
         box = obstacle.box
-        return Box(turned(*box.rpy), np.array(box.center), 0.5 * np.array(box.size))
+        return Box(rotation_rpy(*box.rpy), np.array(box.center), 0.5 * np.array(box.size))
     if obstacle.capsule is not None:
         capsule = obstacle.capsule
         return Capsule(np.array(capsule.start), np.array(capsule.end), capsule.radius)
@@ -177,7 +177,7 @@ class _Hull:
     ball: float
 
 
-def reach(scene: Scene) -> tuple[Array, ...]:
+def distance_lipschitz_constants(scene: Scene) -> tuple[Array, ...]:
     """Return per pair constants L with `|d(q) - d(p)| <= sum_k L_k |q_k - p_k|`.
 
     Sliding joints are taken to stay within their position limits; where one has none, the joints that carry it have
@@ -293,7 +293,7 @@ class CollisionModel:
         """
         around = scene(model)
         self.pairs = around.pairs
-        self.reach = reach(around)
+        self.reach = distance_lipschitz_constants(around)
         self.joints = around.chain.joints
         self._model = kinematics(around.chain)
         self._data = self._model.createData()

@@ -17,7 +17,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.friction_state import presliding_ways, turned
+from ident_service.model.friction_state import advance_dahl_state, presliding_ways
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.parameter_layout import WrittenArm, joint_drives
 from ident_service.model.pinocchio_models import chain_of, pinocchio_model
@@ -77,7 +77,7 @@ class DynamicModel:
         Returns:
             Shape (..., joints).
         """
-        return turned(direction, np.asarray(step, dtype=float) @ self.arm.chain.coupling.T, self.presliding)
+        return advance_dahl_state(direction, np.asarray(step, dtype=float) @ self.arm.chain.coupling.T, self.presliding)
 
     def friction(self, velocity: Array, direction: Array | None = None) -> Array:
         """Return the friction torque, offsets included.

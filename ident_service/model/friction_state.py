@@ -35,7 +35,7 @@ def presliding_ways(model: ArmModel) -> Array:
     return np.array(np.broadcast_to(np.asarray(given, dtype=float), (model.chain.joints,)))
 
 
-def turned(direction: Array, step: Array, ways: Array) -> Array:
+def advance_dahl_state(direction: Array, step: Array, ways: Array) -> Array:
     """Return the direction of dry friction after a step.
 
     Args:
@@ -51,7 +51,7 @@ def turned(direction: Array, step: Array, ways: Array) -> Array:
     return np.asarray(sign + np.where(ways > 0.0, (direction - sign) * left, 0.0))
 
 
-def direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
+def friction_direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:
     """Return the direction of friction of each drive, between -1 and 1.
 
     Args:

@@ -15,7 +15,7 @@ from ident_service.model.chain import Array, Chain
 from ident_service.model.parameter_layout import Layout
 from ident_service.model.pinocchio_models import ForwardDynamics
 from ident_service.model.regressor import traced_rigid_torque
-from ident_service.model.symbolic import Differentiable, Tape
+from ident_service.model.symbolic import Differentiable, ExpressionGraph
 
 
 class InertiaResponse:
@@ -28,7 +28,7 @@ class InertiaResponse:
             ModelError: a link without positive mass.
         """
         n = chain.joints
-        tape = Tape()
+        tape = ExpressionGraph()
         q, y = [tape.input() for _ in range(n)], [tape.input() for _ in range(n)]
         torque = traced_rigid_torque(tape, replace(chain, gravity=np.zeros(3)), layout, delta, q, [0.0] * n, list(y))
         self._torque = Differentiable(tape, q, torque)

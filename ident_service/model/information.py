@@ -149,7 +149,7 @@ def triangle(rows: Array) -> Array:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def supports(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
+def sparsity(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
     """Return per joint the base columns of the links that it carries and the joint terms of drives that move it."""
     links = base_columns // layout.per_link
     own_term = base_columns % layout.per_link >= len(INERTIAL)

@@ -161,7 +161,7 @@ def _is_body(parameters: Array) -> bool:
     return bool(np.linalg.eigvalsh(spread)[0] > 1e-8 * size**2)
 
 
-def drawn_about(parameters: Array, rng: np.random.Generator) -> Array:
+def perturbed_body(parameters: Array, rng: np.random.Generator) -> Array:
     """Draw a real body about another one: A P A^T with A near the identity, so masses within about a tenth.
 
     Args:

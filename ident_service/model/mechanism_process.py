@@ -33,7 +33,7 @@ _OUTSIDE = 1e-6  # rad or m; what a value may be beyond a limit by rounding
 
 
 @dataclass(frozen=True)
-class Part:
+class ArmSelection:
     """Part of a mechanism that is the arm: `base`, `tip` and `lock` of `config.kinematics.Kinematics`."""
 
     base: str | None = None
@@ -72,7 +72,7 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
 
 
 def arm_part(
-    model: pin.Model, part: Part, followers: Mapping[str, Mimic], file: str
+    model: pin.Model, part: ArmSelection, followers: Mapping[str, Mimic], file: str
 ) -> tuple[pin.Model, dict[str, float]]:
     """Reduce a mechanism to the arm.
 
@@ -142,7 +142,7 @@ def _require_agreement(name: str, follower: Mimic, held: Mapping[str, float], fi
         )
 
 
-def _between(model: pin.Model, part: Part, file: str) -> set[str]:
+def _between(model: pin.Model, part: ArmSelection, file: str) -> set[str]:
     """Return the joints between base and tip, without those on the way to the base or off the way to the tip."""
     ids = set(range(1, model.njoints))
     if part.base is not None:
@@ -231,7 +231,7 @@ def _document(
     try:
         model = build()
         if part is not None:
-            model, held = arm_part(model, Part(**json.loads(part)), followers(), "")
+            model, held = arm_part(model, ArmSelection(**json.loads(part)), followers(), "")
     except ModelError as error:
         return {"error": str(error).removeprefix(": ")}
     except MemoryError:

@@ -22,14 +22,14 @@ import numpy as np
 from ident_service.config.arm import JointTerm
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.parameter_layout import INERTIAL, Layout
-from ident_service.model.symbolic import Symbol, Tape, Value
+from ident_service.model.symbolic import ExpressionGraph, Symbol, Value
 
 Vector = list[Value]
 Rotation = list[list[Value]]
 ZERO: Vector = [0.0, 0.0, 0.0]
 
 
-def constant(values: Array) -> Vector:
+def to_vector(values: Array) -> Vector:
     """Return numbers as a vector, shape (3,)."""
     return [float(value) for value in values]
 
@@ -83,7 +83,12 @@ class _Body:
 
 
 def rigid_torque(
-    tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol], *rates: Sequence[Value]
+    tape: ExpressionGraph,
+    chain: Chain,
+    layout: Layout,
+    parameters: Parameters,
+    q: Sequence[Symbol],
+    *rates: Sequence[Value],
 ) -> list[Value]:
     """Return the torque of the links: M(q) ddq + c(q, dq) + g(q) without drives.
 
@@ -115,14 +120,14 @@ def rigid_torque(
 
 
 def mass_matrix(
-    tape: Tape, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol]
+    tape: ExpressionGraph, chain: Chain, layout: Layout, parameters: Parameters, q: Sequence[Symbol]
 ) -> list[list[Value]]:
     """Return M(q), drive inertia included, by composite bodies, which every joint towards the base carries."""
     n = chain.joints
     steps = [_Step(tape, chain, k, q) for k in range(n)]
     composite = [
         _seen_from(
-            _link_body(layout, parameters, k), _rows(chain.link_rotation[k]), constant(chain.link_translation[k])
+            _link_body(layout, parameters, k), _rows(chain.link_rotation[k]), to_vector(chain.link_translation[k])
         )
         for k in range(n)
     ]
@@ -143,7 +148,7 @@ def mass_matrix(
             composite[parent] = _sum(composite[parent], _seen_from(body, _transposed(step.rotation), step.arm))
     for drive, column in enumerate(layout.term_columns("drive_inertia")):
         inertia = parameters.get(int(column), 0.0)
-        share = constant(chain.coupling[drive])
+        share = to_vector(chain.coupling[drive])
         for i in range(n):
             for j in range(n):
                 M[i][j] = M[i][j] + inertia * (share[i] * share[j])
@@ -154,14 +159,14 @@ def drive_torque(chain: Chain, layout: Layout, parameters: Parameters, ddq: Sequ
     """Return the torque that accelerates the drives, in the rows of the joints they move."""
     torque: list[Value] = [0.0] * chain.joints
     for drive, column in enumerate(layout.term_columns("drive_inertia")):
-        share = constant(chain.coupling[drive])
+        share = to_vector(chain.coupling[drive])
         taken = parameters.get(int(column), 0.0) * _weighted(share, ddq)
         torque = [t + s * taken for t, s in zip(torque, share, strict=True)]
     return torque
 
 
 def friction_torque(
-    tape: Tape,
+    tape: ExpressionGraph,
     chain: Chain,
     layout: Layout,
     parameters: Parameters,
@@ -172,19 +177,19 @@ def friction_torque(
     torque: list[Value] = [0.0] * chain.joints
     columns = {term: layout.term_columns(term) for term in layout.terms}
     for drive in range(chain.joints):
-        share = constant(chain.coupling[drive])
+        share = to_vector(chain.coupling[drive])
         rate = _weighted(share, dq)
         taken: Value = 0.0
         for term, places in columns.items():
             if term != "drive_inertia" and (column := int(places[drive])) in parameters:
                 turned = None if direction is None else direction[drive]
-                taken = taken + parameters[column] * _shape(tape, layout, term, drive, rate, turned)
+                taken = taken + parameters[column] * _friction_factor(tape, layout, term, drive, rate, turned)
         torque = [t + s * taken for t, s in zip(torque, share, strict=True)]
     return torque
 
 
-def _shape(
-    tape: Tape, layout: Layout, term: JointTerm, drive: int, rate: Value, direction: Symbol | None = None
+def _friction_factor(
+    tape: ExpressionGraph, layout: Layout, term: JointTerm, drive: int, rate: Value, direction: Symbol | None = None
 ) -> Value:
     """Return the factor of a friction parameter."""
     if not isinstance(rate, Symbol):
@@ -206,17 +211,17 @@ def _shape(
 class _Step:
     """Transform from the parent's joint frame to a joint's: `arm` in the parent's, then `rotation` into the joint's."""
 
-    def __init__(self, tape: Tape, chain: Chain, k: int, q: Sequence[Symbol]) -> None:
+    def __init__(self, tape: ExpressionGraph, chain: Chain, k: int, q: Sequence[Symbol]) -> None:
         self.parent = chain.parents[k]
         self.revolute = chain.revolute[k]
-        self.axis = constant(chain.axes[k])
-        self.arm = constant(chain.translation[k])
+        self.axis = to_vector(chain.axes[k])
+        self.arm = to_vector(chain.translation[k])
         if self.revolute:
             cosine, sine = tape.apply("cos", q[k]), tape.apply("sin", q[k])
             self.rotation = turned(chain.rotation[k], chain.axes[k], cosine, sine)
         else:
             self.rotation = _rows(chain.rotation[k].T)
-            self.arm = add(self.arm, scaled(constant(chain.rotation[k] @ chain.axes[k]), q[k]))
+            self.arm = add(self.arm, scaled(to_vector(chain.rotation[k] @ chain.axes[k]), q[k]))
 
     def outwards(
         self, motion: tuple[Vector, Vector, Vector], rate: Value, acceleration: Value
@@ -250,7 +255,7 @@ def _link_body(layout: Layout, parameters: Parameters, link: int) -> _Body:
 def _link_wrench(chain: Chain, link: int, motion: tuple[Vector, Vector, Vector], body: _Body) -> tuple[Vector, Vector]:
     """Return the wrench that moves a link: force, and moment about the joint frame's origin, in the joint frame."""
     w, e, a = motion
-    arm, out = constant(chain.link_translation[link]), _rows(chain.link_rotation[link].T)
+    arm, out = to_vector(chain.link_translation[link]), _rows(chain.link_rotation[link].T)
     a = rotate(out, add(a, add(cross(e, arm), cross(w, cross(w, arm)))))
     w, e = rotate(out, w), rotate(out, e)
     force = add(scaled(a, body.m), add(cross(e, body.first), cross(w, cross(w, body.first))))
@@ -274,7 +279,7 @@ def _seen_from(body: _Body, rotation: Rotation, arm: Vector) -> _Body:
 
 
 def _rows(matrix: Array) -> Rotation:
-    return [constant(row) for row in matrix]
+    return [to_vector(row) for row in matrix]
 
 
 def _transposed(rotation: Rotation) -> Rotation:

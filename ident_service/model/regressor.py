@@ -29,9 +29,9 @@ from numpy.typing import NDArray
 from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.newton_euler import ZERO, Rotation, Vector, add, constant, cross, dot, rotate, scaled, turned
+from ident_service.model.newton_euler import ZERO, Rotation, Vector, add, cross, dot, rotate, scaled, to_vector, turned
 from ident_service.model.parameter_layout import INERTIAL, Layout
-from ident_service.model.symbolic import Differentiable, Program, Symbol, Tape, Value
+from ident_service.model.symbolic import Differentiable, ExpressionGraph, Program, Symbol, Value
 
 _Screw = tuple[Vector, Vector]
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -94,14 +94,14 @@ def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Pr
     return Program(tape, list(kept.values())), list(kept)
 
 
-def traced_regressor(chain: Chain, layout: Layout) -> tuple[Tape, dict[tuple[int, int], Value]]:
+def traced_regressor(chain: Chain, layout: Layout) -> tuple[ExpressionGraph, dict[tuple[int, int], Value]]:
     """Return the formulas of H on a fresh tape, for programs of other kinds than the one here.
 
     Returns:
         The tape, whose inputs are position, velocity, acceleration and direction of every joint, in this order, and
         the entries of H by (joint, column of delta); those that are not there are zero.
     """
-    tape = Tape()
+    tape = ExpressionGraph()
     q, dq, ddq, direction = ([tape.input() for _ in range(chain.joints)] for _ in range(4))
     entries = _joint_terms(tape, chain, layout, dq, ddq, direction)
     states = _Forward(tape, chain, q, dq, ddq)
@@ -112,7 +112,13 @@ def traced_regressor(chain: Chain, layout: Layout) -> tuple[Tape, dict[tuple[int
 
 
 def traced_rigid_torque(
-    tape: Tape, chain: Chain, layout: Layout, delta: Array, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]
+    tape: ExpressionGraph,
+    chain: Chain,
+    layout: Layout,
+    delta: Array,
+    q: list[Symbol],
+    dq: Sequence[Value],
+    ddq: Sequence[Value],
 ) -> list[Value]:
     """Return the links' share of every joint's torque for known parameters; numbers in `dq` and `ddq` are folded."""
     torque: list[Value] = [0.0] * chain.joints
@@ -136,12 +142,12 @@ def entries_of(entries: dict[tuple[int, int], Value], columns: Sequence[int]) ->
 
 
 def _joint_terms(
-    tape: Tape, chain: Chain, layout: Layout, dq: list[Symbol], ddq: list[Symbol], direction: list[Symbol]
+    tape: ExpressionGraph, chain: Chain, layout: Layout, dq: list[Symbol], ddq: list[Symbol], direction: list[Symbol]
 ) -> dict[tuple[int, int], Value]:
     """Return drive inertia and friction: each drive's columns, in the rows of the joints it moves."""
     entries: dict[tuple[int, int], Value] = {}
     for drive in range(chain.joints):
-        share = constant(chain.coupling[drive])
+        share = to_vector(chain.coupling[drive])
         rate = sum((c * x for c, x in zip(share, dq, strict=True)), 0.0)
         if not isinstance(rate, Symbol):
             raise ModelError(f"drive {drive + 1} moves no joint")
@@ -162,14 +168,16 @@ def _joint_terms(
     return entries
 
 
-def _exp(tape: Tape, value: Value) -> Value:
+def _exp(tape: ExpressionGraph, value: Value) -> Value:
     return tape.apply("exp", value) if isinstance(value, Symbol) else float(np.exp(value))
 
 
 class _Forward:
     """Motion of every link frame, and the unit screws of its ancestors seen from it."""
 
-    def __init__(self, tape: Tape, chain: Chain, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]) -> None:
+    def __init__(
+        self, tape: ExpressionGraph, chain: Chain, q: list[Symbol], dq: Sequence[Value], ddq: Sequence[Value]
+    ) -> None:
         self.screws: list[dict[int, _Screw]] = []
         self.motion: list[tuple[Vector, Vector, Vector]] = []
         base: Vector = [-float(g) for g in chain.gravity]
@@ -178,13 +186,13 @@ class _Forward:
         for k in range(chain.joints):
             parent = chain.parents[k]
             w, e, a = (ZERO, ZERO, base) if parent == WORLD else in_joint[parent]
-            axis = constant(chain.axes[k])
-            arm = constant(chain.translation[k])
+            axis = to_vector(chain.axes[k])
+            arm = to_vector(chain.translation[k])
             if chain.revolute[k]:
                 rotation = turned(chain.rotation[k], chain.axes[k], tape.apply("cos", q[k]), tape.apply("sin", q[k]))
             else:
-                rotation = [constant(row) for row in chain.rotation[k].T]
-                arm = add(arm, scaled(constant(chain.rotation[k] @ chain.axes[k]), q[k]))
+                rotation = [to_vector(row) for row in chain.rotation[k].T]
+                arm = add(arm, scaled(to_vector(chain.rotation[k] @ chain.axes[k]), q[k]))
             # Carried along by the parent to the joint frame's origin, then everything in the joint frame.
             a = rotate(rotation, add(a, add(cross(e, arm), cross(w, cross(w, arm)))))
             screws = _carried({} if parent == WORLD else joint_screws[parent], arm, rotation)
@@ -203,8 +211,8 @@ class _Forward:
 
     def _to_link(self, chain: Chain, k: int, motion: tuple[Vector, Vector, Vector], screws: dict[int, _Screw]) -> None:
         w, e, a = motion
-        arm = constant(chain.link_translation[k])
-        rotation = [constant(row) for row in chain.link_rotation[k].T]
+        arm = to_vector(chain.link_translation[k])
+        rotation = [to_vector(row) for row in chain.link_rotation[k].T]
         a = add(a, add(cross(e, arm), cross(w, cross(w, arm))))
         self.motion.append((rotate(rotation, w), rotate(rotation, e), rotate(rotation, a)))
         self.screws.append(_carried(screws, arm, rotation))

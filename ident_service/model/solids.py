@@ -66,7 +66,7 @@ class Body:
     solid: Solid
 
 
-def turned(roll: float, pitch: float, yaw: float) -> Array:
+def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Return the rotation by roll, pitch and yaw about fixed axes [rad], `Rz(yaw) Ry(pitch) Rx(roll)`, shape (3, 3)."""
     # About y as about x, with the axes renamed: x -> y -> z -> x.
     rename = np.eye(3)[[1, 2, 0]]

@@ -23,7 +23,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.parameter_layout import joint_drives
-from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, turned
+from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, rotation_rpy
 
 BASE_LINK = "base_link"
 
@@ -191,7 +191,7 @@ def origin_of(origin: ET.Element | None, where: str) -> pin.SE3:
     if origin is None:
         return pin.SE3.Identity()
     return pin.SE3(
-        turned(*_attribute_numbers(origin.get("rpy", "0 0 0"), 3, where)),
+        rotation_rpy(*_attribute_numbers(origin.get("rpy", "0 0 0"), 3, where)),
         np.array(_attribute_numbers(origin.get("xyz", "0 0 0"), 3, where)),
     )
 

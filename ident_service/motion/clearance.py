@@ -28,7 +28,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.capsule_distances import CapsuleModel
 from ident_service.model.collision import CollisionModel
 from ident_service.motion.stop_trajectory import stop
-from ident_service.motion.trajectory import Reference, Setpoint, at_once
+from ident_service.motion.trajectory import Reference, Setpoint, run_to_end
 
 _BEGINS, _POINTS = 0.05, 8  # s between stops, points on each
 _AT_ONCE = 4  # postures checked in one slice, while the loop goes on
@@ -51,7 +51,7 @@ class Nearest:
     time: float
 
 
-class Surroundings:
+class ClearanceChecker:
     """Check that references which are found while the arm is energised keep clear of the surroundings."""
 
     def __init__(self, model: ArmModel, limits: MotionLimits) -> None:
@@ -208,7 +208,7 @@ def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], l
     least = model.config.workspace.clearance
     for what, way in ways:
         _require_proven(what, way_clearance(collision, way, limits, least), least)
-        if touching := at_once(stops_touching(collision, way, limits)):
+        if touching := run_to_end(stops_touching(collision, way, limits)):
             raise MotionRefused(touching)
 
 
@@ -223,7 +223,7 @@ def _require_proven(what: str, clearance: Clearance, least: float) -> None:
 SAG = 0.25  # of the following error, that an arm may give way outwards when its torque begins, and lands inside at last
 
 
-def outside(position: Vector, limits: MotionLimits, names: Sequence[str]) -> list[str]:
+def position_limit_violations(position: Vector, limits: MotionLimits, names: Sequence[str]) -> list[str]:
     """Describe in words which joints stand outside their position limits; empty where none does.
 
     Args:
@@ -238,7 +238,7 @@ def outside(position: Vector, limits: MotionLimits, names: Sequence[str]) -> lis
     ]
 
 
-def reachable(limits: MotionLimits) -> MotionLimits:
+def recoverable_limits(limits: MotionLimits) -> MotionLimits:
     """Return the position limits widened to where an arm may still be led back from."""
     more = limits.following_error
     return replace(limits, lower=limits.lower - more, upper=limits.upper + more)
@@ -250,15 +250,15 @@ def require_near(position: Vector, limits: MotionLimits, names: Sequence[str]) -
     Raises:
         MotionRefused: naming every such joint.
     """
-    if outside(position, reachable(limits), names):
+    if position_limit_violations(position, recoverable_limits(limits), names):
         raise MotionRefused(
             "farther outside the position limits than a following error: "
-            f"{'; '.join(outside(position, limits, names))}; its zero may be wrong: compare the numbers with the arm, "
-            "and bring it back by hand"
+            f"{'; '.join(position_limit_violations(position, limits, names))}; its zero may be wrong: compare the "
+            "numbers with the arm, and bring it back by hand"
         )
 
 
-def admitting(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
+def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -> MotionLimits:
     """Return limits for a trajectory that begins outside: just wide enough to include the start.
 
     Args:

@@ -105,7 +105,7 @@ class Controls(Protocol):
         """Return whether the requester of the motion is still alive, at this time of the loop's clock [ns]."""
 
 
-class StopWhen:
+class StopCondition:
     """Provide controls that neither pause nor finish early: the arm stops when a function returns true.
 
     A second function tells whether the arm, held after that stop, is supported.
@@ -141,7 +141,7 @@ class StopWhen:
         return True
 
 
-class Switches:
+class LocalCommands:
     """Hold controls as attributes for use within this process, each written and read whole.
 
     Attributes:
@@ -418,7 +418,7 @@ class ControlFile:
         self.close()
 
 
-def mover(path: Path) -> int | None:
+def controlling_pid(path: Path) -> int | None:
     """Return the id of the process that moves the arm of a control file, None when no process does."""
     try:
         with ControlFile.reach(path) as controls:
@@ -472,7 +472,7 @@ def _pid_in(fd: int) -> int:
     return int(struct.unpack_from("<I", head, _PID)[0]) if len(head) == 16 else 0
 
 
-class Lifeline:
+class SupervisedCommands:
     """Implement the loop's `Controls` in a process of its own, supervised by pipe and lease."""
 
     def __init__(self, controls: ControlFile, pipe: int, *, lock_step: bool) -> None:
@@ -536,7 +536,7 @@ class Lifeline:
         return not self.cut and (self._lock_step or self._controls.lease_ok(now_ns))
 
 
-class StoppableArm(Arm):
+class InterruptibleArm(Arm):
     """Wrap an arm and refuse to enable it, or to send a torque, once a stop was asked for."""
 
     def __init__(self, arm: Arm, asked: Callable[[], bool]) -> None:

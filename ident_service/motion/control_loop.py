@@ -24,11 +24,11 @@ from ident_service.motion.after_stop import HOME_AFTER, AfterStop
 from ident_service.motion.command_channel import Controls, Homing
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines
-from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Fault, Latch, Reaction, Severity
+from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, ActiveFaults, Fault, Reaction, Severity
 from ident_service.motion.lowering import MEANT, Anchor, Lowering
-from ident_service.motion.safety_monitor import Guard
-from ident_service.motion.sequencer import Course
-from ident_service.motion.state_machine import State, States
+from ident_service.motion.safety_monitor import SafetyMonitor
+from ident_service.motion.sequencer import TrajectorySequencer
+from ident_service.motion.state_machine import State, StateMachine
 from ident_service.motion.trajectory import Setpoint, rest
 from ident_service.recordings.cycle import Cycle
 
@@ -76,14 +76,14 @@ class Loop:
     """
 
     arm: Arm
-    guard: Guard
+    guard: SafetyMonitor
     control: ComputedTorque
-    course: Course
-    states: States
+    course: TrajectorySequencer
+    states: StateMachine
     deadlines: Deadlines
     controls: Controls
     sink: Sink
-    latch: Latch
+    latch: ActiveFaults
     limits: MotionLimits
     hold_seconds: float
     peaks: Peaks

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from drivers.arm import Watchdog
-from ident_service.motion.faults import Fault, Findings
+from ident_service.motion.faults import Fault, FaultCounter
 
 _EDGES_US = (1, 2, 5, 10, 20, 50, 100, 150, 200, 300, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 
@@ -139,7 +139,7 @@ class Deadlines:
 
     def __init__(
         self,
-        findings: Findings,
+        findings: FaultCounter,
         period: float,
         *,
         scheduled_stamps: bool = False,

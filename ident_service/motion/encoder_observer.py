@@ -34,7 +34,7 @@ SLID = 20  # cycles within which a second step in the same direction shows that 
 OWED, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
 
 
-class Owed:
+class FrozenEncoderObserver:
     """Observe joints whose encoders may be frozen: integrate the motion that each joint's push should have caused."""
 
     def __init__(
@@ -125,11 +125,13 @@ class Owed:
             self._speed, self._way, self._owing = np.zeros_like(self._speed), np.zeros_like(self._way), False
 
 
-def owed_ways(
+def frozen_encoder_observer(
     dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, resolution: Vector
-) -> Owed:
+) -> FrozenEncoderObserver:
     """Create the frozen-encoder observer of an arm; dry friction is the prior's, at least the configuration's guess."""
     guess = model.config.design.friction_guess
     expected = expected_friction(model, limits, guess).at_joints(model.chain).coulomb
     least = None if model.prior is None else InverseDynamics(model.chain, model.layout, model.prior)
-    return Owed(dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution, least)
+    return FrozenEncoderObserver(
+        dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution, least
+    )

@@ -26,7 +26,7 @@ UNFINISHED: Final = "motion_process"
 
 
 @dataclass(frozen=True)
-class Remembered:
+class StoredFault:
     """Represent an unacknowledged fault on disk.
 
     Attributes:
@@ -40,7 +40,7 @@ class Remembered:
     since: float
 
 
-class FaultFile:
+class FaultStore:
     """Store the faults that ended runs of one arm."""
 
     def __init__(self, folder: Path) -> None:
@@ -52,7 +52,7 @@ class FaultFile:
         """Return the cause of each stored fault by code, the earliest first; raises as `remembered`."""
         return {one.code: one.cause for one in self.remembered()}
 
-    def remembered(self) -> tuple[Remembered, ...]:
+    def remembered(self) -> tuple[StoredFault, ...]:
         """Return all stored faults, the earliest first.
 
         Raises:
@@ -95,7 +95,7 @@ class FaultFile:
         with self._alone():
             rows = self._rows()
             if all(row.code != code for row in rows):
-                self._write((*rows, Remembered(code, cause, time.time())))
+                self._write((*rows, StoredFault(code, cause, time.time())))
 
     def acknowledge(self, code: str) -> str:
         """Remove a fault from the store; returns its cause.
@@ -137,7 +137,7 @@ class FaultFile:
             fcntl.flock(fd, fcntl.LOCK_UN)  # a process that is being started has the open folder, too
             os.close(fd)
 
-    def _remembered(self, *, moving: bool) -> tuple[Remembered, ...]:
+    def _remembered(self, *, moving: bool) -> tuple[StoredFault, ...]:
         rows = self._rows()
         if moving or (mark := self._read(self._mark)) is None or any(row.code == UNFINISHED for row in rows):
             return rows
@@ -145,13 +145,13 @@ class FaultFile:
             pid, run, began = int(mark["pid"]), str(mark["run"]), float(mark["began"])
         except (KeyError, TypeError, ValueError) as error:
             raise self._damaged(self._mark, error) from None
-        return *rows, Remembered(UNFINISHED, f"process {pid} died while it had the arm, in the run {run}", began)
+        return *rows, StoredFault(UNFINISHED, f"process {pid} died while it had the arm, in the run {run}", began)
 
-    def _rows(self) -> tuple[Remembered, ...]:
+    def _rows(self) -> tuple[StoredFault, ...]:
         content = self._read(self._faults)
         try:
             rows = [] if content is None else content["faults"]
-            return tuple(Remembered(str(row["code"]), str(row["cause"]), float(row["written"])) for row in rows)
+            return tuple(StoredFault(str(row["code"]), str(row["cause"]), float(row["written"])) for row in rows)
         except (KeyError, TypeError, ValueError) as error:
             raise self._damaged(self._faults, error) from None
 
@@ -167,7 +167,7 @@ class FaultFile:
     def _damaged(self, path: Path, error: Exception) -> UsageError:
         return UsageError(f"{path}: cannot be read ({error}); look at the arm, then remove the file")
 
-    def _write(self, faults: tuple[Remembered, ...]) -> None:
+    def _write(self, faults: tuple[StoredFault, ...]) -> None:
         self._faults.parent.mkdir(parents=True, exist_ok=True)
         rows = [{"code": one.code, "cause": one.cause, "written": one.since} for one in faults]
         write_atomically(self._faults, json.dumps({"faults": rows}, indent=1) + "\n")

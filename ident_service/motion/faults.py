@@ -170,7 +170,7 @@ class Fault:
         return FAULTS[self.code].severity
 
 
-class Findings:
+class FaultCounter:
     """Create faults from the table, and turn repeated warnings into a fault.
 
     Attributes:
@@ -203,7 +203,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Latched:
+class ActiveFault:
     """Represent an unacknowledged fault in memory.
 
     Attributes:
@@ -217,22 +217,22 @@ class Latched:
     since_ns: int
 
 
-class Latch:
+class ActiveFaults:
     """Hold the unacknowledged faults of one arm, the earliest first, beyond the single run."""
 
     def __init__(self) -> None:
-        self._faults: dict[str, Latched] = {}
+        self._faults: dict[str, ActiveFault] = {}
 
     @property
-    def faults(self) -> tuple[Latched, ...]:
+    def faults(self) -> tuple[ActiveFault, ...]:
         """Return the active faults, the earliest first."""
         return tuple(self._faults.values())
 
     def set(self, code: str, cause: str, since_ns: int) -> None:
         """Latch a fault; one that is latched already keeps its first cause and time."""
-        self._faults.setdefault(code, Latched(code, cause, since_ns))
+        self._faults.setdefault(code, ActiveFault(code, cause, since_ns))
 
-    def acknowledge(self, code: str) -> Latched:
+    def acknowledge(self, code: str) -> ActiveFault:
         """Acknowledge one fault: remove and return it.
 
         Raises:

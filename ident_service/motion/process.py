@@ -28,16 +28,16 @@ from ident_service.errors import ArmFault, IdentError, MotionRefused, UsageError
 from ident_service.excitation.motion_file import excitation_from_json
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
-from ident_service.motion.command_channel import ControlFile, Lifeline
+from ident_service.motion.command_channel import ControlFile, SupervisedCommands
 from ident_service.motion.control_loop import LOWERS, WAITS
 from ident_service.motion.cycle_timing import Histogram
 from ident_service.motion.ending import write_ending
-from ident_service.motion.fault_store import CONTROLS, FaultFile
-from ident_service.motion.faults import Latch, Severity
+from ident_service.motion.fault_store import CONTROLS, FaultStore
+from ident_service.motion.faults import ActiveFaults, Severity
 from ident_service.motion.last_position import PositionFile
 from ident_service.motion.realtime import ask
 from ident_service.motion.run import RunReport, follow
-from ident_service.motion.run_plan import Destination, Excite, GoTo, Plan
+from ident_service.motion.run_plan import Destination, ExcitationPlan, Plan, PointToPointPlan
 from ident_service.motion.state_machine import State
 from ident_service.motion.ticket import subject_of, ticket_from_json
 from ident_service.recordings.cycle import Cycle
@@ -73,15 +73,17 @@ class TimedSink:
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
         """Record one line of the story; states, faults, and what is done with a held arm are told to the parent too."""
         if level >= Severity.ERROR:
-            say({"fault": message})  # which is latched at the end, and an arm without brakes may be held until then
+            send_line(
+                {"fault": message}
+            )  # which is latched at the end, and an arm without brakes may be held until then
         elif message in _STATES:
-            say({"state": message})
+            send_line({"state": message})
         elif message in (WAITS, LOWERS):
-            say({"held": message})
+            send_line({"held": message})
         return self._sink.event(stamp_ns, level, message)
 
 
-def say(line: dict[str, Any]) -> None:
+def send_line(line: dict[str, Any]) -> None:
     """Write one line of JSON to standard output, or nothing where it does not fit at once."""
     with suppress(OSError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
@@ -103,7 +105,7 @@ def main() -> int:
             Path(request["folder"]), answer["report"] if "report" in answer else {"error": answer["error"]["message"]}
         )
     os.set_blocking(sys.stdout.fileno(), True)
-    say(answer)
+    send_line(answer)
     return code
 
 
@@ -113,8 +115,8 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
         place = Path(request["arm_folder"]) / CONTROLS
         with ControlFile.take(place, request["lease"], asked_ns=request["asked_ns"]) as controls:
             signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
-            say({"pid": os.getpid()})
-            return 0, {"report": _latching(request, controls)}
+            send_line({"pid": os.getpid()})
+            return 0, {"report": _run_with_fault_store(request, controls)}
     except ArmFault as fault:
         return 4, {"error": {"kind": "ArmFault", "code": fault.code, "message": _words(fault)}}
     except IdentError as error:
@@ -129,9 +131,9 @@ def _words(error: IdentError) -> str:
     return "; ".join((str(error), *getattr(error, "__notes__", ())))
 
 
-def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
+def _run_with_fault_store(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
     """Move the arm; whatever happens to this process or its parent, faults are stored on the disk."""
-    faults, latch = FaultFile(Path(request["arm_folder"])), Latch()
+    faults, latch = FaultStore(Path(request["arm_folder"])), ActiveFaults()
     faults.began(Path(request["folder"]))
     try:
         report = _moved(request, controls, latch)
@@ -145,25 +147,29 @@ def _latching(request: dict[str, Any], controls: ControlFile) -> dict[str, Any]:
     return report
 
 
-def _remember(faults: FaultFile, latch: Latch) -> None:
+def _remember(faults: FaultStore, latch: ActiveFaults) -> None:
     """Store the faults on the disk, and only then remove the mark of a moving arm."""
     for fault in latch.faults:
         faults.latch(fault.code, fault.cause)
     faults.ended()
 
 
-def _moved(request: dict[str, Any], controls: ControlFile, latch: Latch) -> dict[str, Any]:
+def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) -> dict[str, Any]:
     """Move the arm and record it; returns the report as JSON values."""
     config = ArmConfig.model_validate(request["config"])
     motion = None if request["excitation"] is None else excitation_from_json(request["excitation"])
-    plan: Plan = GoTo(Destination(request["destination"])) if motion is None else Excite(motion, request["speed"])
+    plan: Plan = (
+        PointToPointPlan(Destination(request["destination"]))
+        if motion is None
+        else ExcitationPlan(motion, request["speed"])
+    )
     model = arm_model(config)
     arm = make_arm(config)
     if request["log_frames"]:
         arm.log_frames(Path(request["folder"]) / FRAMES)
     ring = RingSink(SinkEnds(*request["ends"]), request["recording"], lock_step=arm.clock.lock_step)
     sink = TimedSink(ring)
-    lifeline = Lifeline(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
+    lifeline = SupervisedCommands(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
     # Last, so that everything it freezes and locks is loaded.
     granted = None if arm.clock.lock_step else ask(settings=config.realtime)
     sentence = "virtual time" if granted is None else granted.sentence()

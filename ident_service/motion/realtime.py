@@ -31,7 +31,7 @@ STACK = 512 << 10  # bytes, likewise
 
 
 @dataclass(frozen=True)
-class Granted:
+class RealtimePrivileges:
     """Represent the real-time privileges that were granted, and why the others were refused.
 
     Attributes:
@@ -71,7 +71,7 @@ class Granted:
         return f"real time: got {', '.join(got) or 'nothing'}" + "".join(f"; {reason}" for reason in self.refusals)
 
 
-def ask(core_from_last: int = 0, settings: Realtime | None = None) -> Granted:
+def ask(core_from_last: int = 0, settings: Realtime | None = None) -> RealtimePrivileges:
     """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
 
     Args:
@@ -98,11 +98,11 @@ def ask(core_from_last: int = 0, settings: Realtime | None = None) -> Granted:
     gc.collect()
     gc.freeze()
     gc.disable()
-    return Granted(scheduling, memory, core, True, tuple(refusals), awake, prefaulted, held)
+    return RealtimePrivileges(scheduling, memory, core, True, tuple(refusals), awake, prefaulted, held)
 
 
 @contextmanager
-def asked(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[Granted]:
+def asked(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[RealtimePrivileges]:
     """The same for a while, for a loop in a process that does other things afterwards.
 
     Args:
@@ -111,7 +111,7 @@ def asked(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator
     """
     policy, cores, collecting = os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled()
     parameter = os.sched_getparam(0)
-    granted: Granted | None = None
+    granted: RealtimePrivileges | None = None
     try:
         granted = ask(core_from_last, settings)
         yield granted

@@ -29,20 +29,20 @@ from ident_service.model.collision import Contact
 from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop
-from ident_service.motion.clearance import Surroundings
-from ident_service.motion.command_channel import Controls, StopWhen
+from ident_service.motion.clearance import ClearanceChecker
+from ident_service.motion.command_channel import Controls, StopCondition
 from ident_service.motion.control_loop import REST_CYCLES, REST_SPEED, Loop, Peaks
 from ident_service.motion.control_loop import Sink as Sink
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines, longest_stall
-from ident_service.motion.encoder_observer import owed_ways
-from ident_service.motion.faults import FAULTS, HOLD, Latch
+from ident_service.motion.encoder_observer import frozen_encoder_observer
+from ident_service.motion.faults import FAULTS, HOLD, ActiveFaults
 from ident_service.motion.lowering import lowest_point
-from ident_service.motion.run_plan import Excite, Plan
-from ident_service.motion.safety_monitor import Guard
-from ident_service.motion.sequencer import Course
+from ident_service.motion.run_plan import ExcitationPlan, Plan
+from ident_service.motion.safety_monitor import SafetyMonitor
+from ident_service.motion.sequencer import TrajectorySequencer
 from ident_service.motion.speed_scaling import require_factor, slowed_limits
-from ident_service.motion.state_machine import LAWFUL, State, States
+from ident_service.motion.state_machine import TRANSITIONS, State, StateMachine
 from ident_service.motion.trajectory import rest
 
 _SWITCH = 2e-4  # s after which the cycles get the interpreter from the other thread, instead of 5 ms
@@ -51,7 +51,7 @@ _FIRST = -20  # of the nice values
 
 
 @contextmanager
-def attended(arm: Arm) -> Iterator[None]:
+def keep_host_alive(arm: Arm) -> Iterator[None]:
     """Exchange cycles without torque in a background thread for as long as the block lasts, which must not use the arm.
 
     Args:
@@ -165,7 +165,7 @@ def run(
     controls: Controls | None = None,
     *,
     speed: float = 1.0,
-    latch: Latch | None = None,
+    latch: ActiveFaults | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
     """Move an open arm along an excitation and back to where it stood.
@@ -190,7 +190,7 @@ def run(
         ArmFault: a fault stopped the motion; the arm is without torque, and the fault latched.
         DriverError: the arm refused to be enabled.
     """
-    return follow(arm, model, Excite(excitation, speed), sink, controls, latch=latch, hold_seconds=hold_seconds)
+    return follow(arm, model, ExcitationPlan(excitation, speed), sink, controls, latch=latch, hold_seconds=hold_seconds)
 
 
 def follow(
@@ -200,7 +200,7 @@ def follow(
     sink: Sink,
     controls: Controls | None = None,
     *,
-    latch: Latch | None = None,
+    latch: ActiveFaults | None = None,
     hold_seconds: float = HOLD,
 ) -> RunReport:
     """Follow a plan with an open arm; `run` does this for an excitation.
@@ -221,7 +221,7 @@ def follow(
         UsageError, MotionRefused, ArmFault, DriverError: as `run`.
     """
     require_factor(plan.speed)
-    return _Run(arm, model, plan, sink, controls or StopWhen(), latch or Latch(), hold_seconds).run()
+    return _Run(arm, model, plan, sink, controls or StopCondition(), latch or ActiveFaults(), hold_seconds).run()
 
 
 @dataclass
@@ -231,7 +231,7 @@ class _Run:
     plan: Plan
     sink: Sink
     controls: Controls
-    latch: Latch
+    latch: ActiveFaults
     hold_seconds: float
 
     def run(self) -> RunReport:
@@ -287,11 +287,11 @@ class _Run:
                 f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
                 f"the description {', '.join(chain.names)}"
             )
-        with attended(arm):  # what is worked out takes longer than drives wait for their host
+        with keep_host_alive(arm):  # what is worked out takes longer than drives wait for their host
             self.plan.require_possible(model, limits)
         period = 1.0 / described.rate
         sample = self._look(limits, period)
-        with attended(arm):
+        with keep_host_alive(arm):
             dynamics = InverseDynamics(chain, model.layout, prior)
             loop, torque = self._planned(dynamics, sample, limits, described)
         self._loop = loop
@@ -305,9 +305,9 @@ class _Run:
         home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
-        owed = owed_ways(dynamics, model, limits, period, described.position_resolution)
+        owed = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
         contact = Contact(model)
-        guard = Guard(
+        guard = SafetyMonitor(
             chain.names,
             limits,
             period,
@@ -322,18 +322,18 @@ class _Run:
         torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
         if cannot_hold is not None:
             raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")
-        self.states = States(self.latch, self._entered)
+        self.states = StateMachine(self.latch, self._entered)
         loop = Loop(
             self.arm,
             guard,
             control,
-            Course(
+            TrajectorySequencer(
                 self.states,
                 legs,
                 rest(home),
                 limits,
                 slowed_limits(limits, self.plan.speed),
-                Surroundings(model, limits),
+                ClearanceChecker(model, limits),
                 held=self.plan.held,
             ),
             self.states,
@@ -390,7 +390,7 @@ class _Run:
         cause = str(error) or type(error).__name__
         now_ns = self.arm.clock.now_ns()
         self.latch.set(code, cause.removeprefix(f"{code}: "), now_ns)
-        if State.FAULTED in LAWFUL[self.states.state]:
+        if State.FAULTED in TRANSITIONS[self.states.state]:
             self.states.enter(State.FAULTED)
             loop.tell(rule.severity, now_ns, cause)
 

@@ -17,9 +17,9 @@ from ident_service.excitation.limit_proof import require_within_limits
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.clearance import (
-    admitting,
     just_inside,
-    outside,
+    position_limit_violations,
+    relaxed_limits,
     require_clear,
     require_near,
     require_ways_clear,
@@ -27,7 +27,7 @@ from ident_service.motion.clearance import (
 from ident_service.motion.speed_scaling import Slowed
 from ident_service.motion.state_machine import State
 from ident_service.motion.stop_trajectory import require_stops_within_limits
-from ident_service.motion.trajectory import PathReference, Reference, calm_way, rest
+from ident_service.motion.trajectory import PathReference, Reference, plan_reduced_trajectory, rest
 
 HOMING_SPEED = 0.2  # of a calm way's speed, which is half of the limits: so at most a tenth of every velocity limit
 
@@ -56,7 +56,7 @@ class Plan(Protocol):
 
 
 @dataclass(frozen=True)
-class Excite:
+class ExcitationPlan:
     """Plan to move to an excitation, along it, and back to where the arm stood, all at one share of its speed."""
 
     excitation: Excitation
@@ -72,7 +72,7 @@ class Excite:
 
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return the limits unchanged; the run may begin inside the position limits only."""
-        if found := outside(position, limits, model.chain.names):
+        if found := position_limit_violations(position, limits, model.chain.names):
             raise MotionRefused(f"outside the position limits: {'; '.join(found)}; `ident recover` says what to do")
         return limits
 
@@ -80,7 +80,10 @@ class Excite:
         """Return the approach, the excitation and the return."""
         exciting = PathReference(self.excitation.path)
         begin, end = exciting.at(0.0), exciting.at(exciting.duration)
-        there, back = calm_way(rest(start), begin, limits), calm_way(end, rest(start), limits)
+        there, back = (
+            plan_reduced_trajectory(rest(start), begin, limits),
+            plan_reduced_trajectory(end, rest(start), limits),
+        )
         slowed = [Slowed(way, self.speed) for way in (there, exciting, back)]
         require_clear(model, self.excitation.path, [slowed[0], slowed[-1]], limits)
         return list(zip((State.APPROACHING, State.EXCITING, State.RETURNING), slowed, strict=True))
@@ -94,7 +97,7 @@ class Destination(Enum):
 
 
 @dataclass(frozen=True)
-class GoTo:
+class PointToPointPlan:
     """Plan a slow straight motion in joint space from rest to rest; it may begin a little outside the position limits.
 
     All joints share one time profile, so that each moves from its start towards its end without turning
@@ -111,14 +114,16 @@ class GoTo:
     def admits(self, model: ArmModel, position: Vector, limits: MotionLimits) -> MotionLimits:
         """Return limits that begin where the arm stands; it may stand no farther outside than a following error."""
         require_near(position, limits, model.chain.names)
-        if self.destination is Destination.INSIDE and not outside(position, limits, model.chain.names):
+        if self.destination is Destination.INSIDE and not position_limit_violations(
+            position, limits, model.chain.names
+        ):
             raise MotionRefused("the arm stands inside all its position limits; there is nothing to leave")
-        return admitting(position, limits)
+        return relaxed_limits(position, limits)
 
     def legs(self, model: ArmModel, start: Vector, limits: MotionLimits) -> Sequence[Leg]:
         """Return the one reference to the destination."""
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
-        way = calm_way(rest(start), rest(end), admitting(start, limits))
+        way = plan_reduced_trajectory(rest(start), rest(end), relaxed_limits(start, limits))
         try:
             require_ways_clear(model, [(f"the way {self.destination.value}", way)], limits)
         except MotionRefused as error:

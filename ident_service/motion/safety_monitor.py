@@ -17,13 +17,13 @@ from drivers.arm import Counts, Flags, Sample, Vector
 from drivers.axis_status import TRIPPED, AxisEvent, AxisStatus
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.collision import Contact
-from ident_service.motion.encoder_observer import Owed
-from ident_service.motion.faults import Fault, Findings
+from ident_service.motion.encoder_observer import FrozenEncoderObserver
+from ident_service.motion.faults import Fault, FaultCounter
 from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.trajectory import Setpoint
 
 
-def told(events: Sequence[AxisEvent], names: Sequence[str], findings: Findings) -> Fault | None:
+def fault_from_events(events: Sequence[AxisEvent], names: Sequence[str], findings: FaultCounter) -> Fault | None:
     """Return the most severe fault among the events of one sample.
 
     Args:
@@ -81,7 +81,7 @@ class Check:
 
 
 @dataclass(frozen=True)
-class Seen:
+class MonitoredSample:
     """Hold a sample together with the state known from the samples before it.
 
     Attributes:
@@ -117,7 +117,7 @@ class Seen:
     pairs: tuple[str, ...]
 
 
-def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Yield all checks of a sample, ordered by how far the data they need can be believed."""
     yield from _what_cannot_be_believed(seen, limits)
     yield from _what_has_failed(seen)
@@ -125,7 +125,7 @@ def checks(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
     yield from _what_can_be_bridged(seen, limits)
 
 
-def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+def _what_cannot_be_believed(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Check for faults that take the torque off: feedback that is not credible, an emergency stop, a runaway."""
     sample, position, speed = seen.sample, seen.position, np.abs(seen.velocity)
     bad = sample.valid & ~np.isfinite(sample.position)
@@ -133,7 +133,7 @@ def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check
     if sample.velocity is not None:
         yield Check("feedback_not_finite", sample.valid & ~np.isfinite(sample.velocity), "velocity is not a number")
     yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "torque that acts is not a number")
-    yield Check("emergency_stop", _says(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
+    yield Check("emergency_stop", _has_status(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
     what = "position unchanged to the last bit although the joint moved or was pushed"
     yield Check("frozen_encoder", seen.frozen, what)
     beyond, limit = _beyond(position, limits)
@@ -143,16 +143,16 @@ def _what_cannot_be_believed(seen: Seen, limits: MotionLimits) -> Iterator[Check
     yield Check("runaway", speed > VELOCITY_OFF * limits.velocity, what, (seen.velocity, limits.velocity))
 
 
-def _what_has_failed(seen: Seen) -> Iterator[Check]:
+def _what_has_failed(seen: MonitoredSample) -> Iterator[Check]:
     """Check for faults that lead to a quick stop."""
-    yield Check("drive_fault", _says(seen, AxisStatus.FAULT), "the drive reports a fault")
-    yield Check("drive_watchdog", _says(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
-    unpowered = seen.was_powered & ~_says(seen, AxisStatus.POWERED) & bool(seen.sample.status)
+    yield Check("drive_fault", _has_status(seen, AxisStatus.FAULT), "the drive reports a fault")
+    yield Check("drive_watchdog", _has_status(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
+    unpowered = seen.was_powered & ~_has_status(seen, AxisStatus.POWERED) & bool(seen.sample.status)
     yield Check("drive_fault", unpowered, "the drive is no longer energised")
     yield Check("feedback_gone", seen.age >= seen.max_age, f"no usable feedback for {seen.max_age} cycles")
 
 
-def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+def _what_must_end(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Check for faults that lead to damped lowering, then for those that lead to a controlled stop."""
     position, velocity, speed = seen.position, seen.velocity, np.abs(seen.velocity)
     away, allowed = np.abs(seen.wanted - position), limits.following_error
@@ -171,7 +171,7 @@ def _what_must_end(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
     yield Check("workspace", seen.depths > 0.0, "touch, {} m deep", (seen.depths,), seen.pairs)
 
 
-def _what_can_be_bridged(seen: Seen, limits: MotionLimits) -> Iterator[Check]:
+def _what_can_be_bridged(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Check for warnings."""
     jumped_to = seen.sample.position
     yield Check("encoder_jump", seen.jumped, "position jumped to {} {u} from {} {u}", (jumped_to, seen.position))
@@ -199,7 +199,7 @@ def approach_speed(distance: Vector, limits: MotionLimits) -> Vector:
     return np.asarray(np.sqrt(squared + (ENVELOPE_SLACK * limits.velocity) ** 2))
 
 
-def in_words(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
+def describe_check(check: Check, names: Sequence[str], units: Sequence[str]) -> str:
     """Describe a violated check in words: the joints concerned, and what was measured.
 
     Args:
@@ -221,7 +221,7 @@ def _beyond(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
     return np.maximum(above, below), np.where(above > below, limits.upper, limits.lower)
 
 
-def _says(seen: Seen, bit: AxisStatus) -> Flags:
+def _has_status(seen: MonitoredSample, bit: AxisStatus) -> Flags:
     """Return which axes' status words have a bit set, shape (joints,)."""
     status = seen.sample.status or (0,) * len(seen.position)
     return np.array([bool(word & bit) for word in status])
@@ -232,7 +232,7 @@ ABSURD = 3.0  # times the torque limit: no controller here asks for that
 TORQUE_RATE, TORQUE_RATE_SHARE = 1000.0, 100.0  # N m/s or N/s; times the torque limit per second
 
 
-class Guard:
+class SafetyMonitor:
     """Check every sample and every torque of one motion.
 
     Attributes:
@@ -249,7 +249,7 @@ class Guard:
         *,
         revolute: tuple[bool, ...] | None = None,
         contact: Contact | None = None,
-        owed: Owed | None = None,
+        owed: FrozenEncoderObserver | None = None,
         max_age: int = MAX_AGE,
     ) -> None:
         """Start with the arm standing at a position.
@@ -266,7 +266,7 @@ class Guard:
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
         """
         joints = len(position)
-        self.findings = Findings()
+        self.findings = FaultCounter()
         self.rate = np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * period
         self._names, self._limits, self._period = joint_names, limits, period
         self._elapsed, self._known, self._max_age = period, True, max_age
@@ -349,7 +349,7 @@ class Guard:
             with np.errstate(all="ignore"):
                 usable, fault = self._judged(sample, reference.position, velocity)
         if sample.events:
-            event = told(sample.events, self._names, self.findings)
+            event = fault_from_events(sample.events, self._names, self.findings)
             # Of equally severe faults, a drive's event tells more than its status word.
             if event is not None and (fault is None or event.reaction >= fault.reaction):
                 fault = event
@@ -483,7 +483,7 @@ class Guard:
             self._all_well(sample.status)
         if self._contact is not None and bool(np.isfinite(self._position).all()):
             self._depths = self._contact.depths(self._position)
-        seen = Seen(
+        seen = MonitoredSample(
             sample,
             wanted,
             self._position,
@@ -533,4 +533,4 @@ class Guard:
         return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES)) | self._owes
 
     def _found(self, check: Check) -> Fault:
-        return self.findings.found(check.code, in_words(check, self._names, self._units))
+        return self.findings.found(check.code, describe_check(check, self._names, self._units))

@@ -13,19 +13,19 @@ from collections.abc import Generator, Iterator, Sequence
 
 from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import MotionRefused
-from ident_service.motion.clearance import Surroundings
+from ident_service.motion.clearance import ClearanceChecker
 from ident_service.motion.run_plan import HOMING_SPEED
 from ident_service.motion.speed_scaling import slowed_limits
-from ident_service.motion.state_machine import MOVING, STOPPABLE, State, States
+from ident_service.motion.state_machine import MOVING, STOPPABLE, State, StateMachine
 from ident_service.motion.stop_trajectory import stop
 from ident_service.motion.trajectory import (
     Reference,
     RuckigReference,
     Setpoint,
-    at_once,
     calm_way_in_slices,
     hold,
     rest,
+    run_to_end,
     way_in_slices,
 )
 
@@ -73,10 +73,10 @@ class Paused:
         Raises:
             MotionRefused: not even the motion's beginning can be reached from here.
         """
-        return at_once(self.resume_in_slices(limits))
+        return run_to_end(self.resume_in_slices(limits))
 
     def resume_in_slices(
-        self, limits: MotionLimits | None = None, surroundings: Surroundings | None = None
+        self, limits: MotionLimits | None = None, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, Resumed]:
         """Plan as `resume` does, in slices short enough for a control cycle; the generator returns the resumed motion.
 
@@ -99,7 +99,7 @@ class Paused:
         raise MotionRefused(f"no way leads from here back onto the motion: {refusal}") from refusal
 
     def leave_in_slices(
-        self, end: Setpoint, limits: MotionLimits, surroundings: Surroundings | None = None
+        self, end: Setpoint, limits: MotionLimits, surroundings: ClearanceChecker | None = None
     ) -> Generator[None, None, RuckigReference]:
         """Plan a straight trajectory at reduced speed to another setpoint at rest, to be followed after the pause.
 
@@ -150,7 +150,7 @@ def _joining_times(left: float, duration: float) -> Iterator[float]:
 _UNDER_WAY = (*MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 
 
-class Course:
+class TrajectorySequencer:
     """Sequence the reference trajectories of a run, state by state.
 
     Attributes:
@@ -164,12 +164,12 @@ class Course:
 
     def __init__(
         self,
-        states: States,
+        states: StateMachine,
         legs: Sequence[tuple[State, Reference]],
         start: Setpoint,
         limits: MotionLimits,
         resuming: MotionLimits,
-        surroundings: Surroundings | None = None,
+        surroundings: ClearanceChecker | None = None,
         *,
         held: bool = False,
     ) -> None:

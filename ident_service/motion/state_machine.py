@@ -6,7 +6,7 @@ from collections.abc import Callable
 from enum import Enum
 
 from ident_service.errors import ArmError
-from ident_service.motion.faults import Latch
+from ident_service.motion.faults import ActiveFaults
 
 
 class State(Enum):
@@ -34,7 +34,7 @@ STOPPABLE = (State.ARMED, *MOVING, State.PAUSING, State.PAUSED, State.RESUMING)
 # ends as a stop does, held at rest, and is done after that. Out of a pause a run that is finished early returns, and
 # out of a stop an arm that is held and led home. Out of the ends leads only the way to the next run, out of a fault
 # only when nothing is latched any more.
-LAWFUL: dict[State, tuple[State, ...]] = {
+TRANSITIONS: dict[State, tuple[State, ...]] = {
     State.IDLE: (State.CHECKED, State.FAULTED),
     State.CHECKED: (State.ARMED, State.IDLE, State.FAULTED),
     State.ARMED: (State.APPROACHING, State.RETURNING, State.STOPPING, State.FAULTED),
@@ -51,14 +51,14 @@ LAWFUL: dict[State, tuple[State, ...]] = {
 }
 
 
-class States:
+class StateMachine:
     """Hold the present state of one motion, and allow lawful transitions only.
 
     Attributes:
         state: present.
     """
 
-    def __init__(self, latch: Latch, told: Callable[[State], None] = lambda state: None) -> None:
+    def __init__(self, latch: ActiveFaults, told: Callable[[State], None] = lambda state: None) -> None:
         """Start in IDLE.
 
         Args:
@@ -75,7 +75,7 @@ class States:
         ArmError: no transition leads there, a mistake of the program; or an unacknowledged fault forbids it.
             ArmError: no lawful way leads there, a mistake of the program; or a latched fault stands in it.
         """
-        if wanted not in LAWFUL[self.state]:
+        if wanted not in TRANSITIONS[self.state]:
             raise ArmError(f"no way from {self.state.value} to {wanted.value}")
         waits = wanted is State.ARMED or (self.state is State.FAULTED and wanted is State.IDLE)
         if waits and self._latch.faults:

@@ -38,7 +38,7 @@ from ident_service.motion.trajectory import Setpoint
 Piece = tuple[Vector, Vector]
 
 
-class ToRest:
+class StopProfile:
     """Represent a motion to rest, in pieces of constant jerk.
 
     Attributes:
@@ -101,7 +101,7 @@ _STEP = 5e-3  # s
 _BLOCK = 4096  # samples judged at once, so that a long motion needs no more memory than a short one
 
 
-def stop(start: Setpoint, limits: MotionLimits) -> ToRest:
+def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
     """Return the controlled stop from any state to rest; never raises.
 
     Args:
@@ -180,7 +180,7 @@ def _sampled(path: Path) -> Iterator[Vector]:
             yield begin + share * (end - begin)
 
 
-def _judged(start: Setpoint, limits: MotionLimits, side: Vector) -> tuple[ToRest, Vector, Vector]:
+def _judged(start: Setpoint, limits: MotionLimits, side: Vector) -> tuple[StopProfile, Vector, Vector]:
     """Return a stop, how far it leaves the position limits [rad or m], and on which side (-1 or 1)."""
     braked = _braked(start, limits, side)
     lowest, highest = braked.extent()
@@ -188,14 +188,14 @@ def _judged(start: Setpoint, limits: MotionLimits, side: Vector) -> tuple[ToRest
     return braked, np.maximum(above, below), np.where(above >= below, 1.0, -1.0)
 
 
-def _braked(start: Setpoint, limits: MotionLimits, side: Vector) -> ToRest:
+def _braked(start: Setpoint, limits: MotionLimits, side: Vector) -> StopProfile:
     """Return the quickest stop; where `side` is 1 or -1, the hardest braking before that position limit comes first."""
     pieces: list[Piece] = []
     state = start
     for piece in (_led_back, _ramped, _held):
         pieces.append(piece(state, limits, side))
         state = after(state, *pieces[-1])
-    return ToRest(start, [*pieces, *_settled(state, limits)])
+    return StopProfile(start, [*pieces, *_settled(state, limits)])
 
 
 def _led_back(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:

@@ -151,7 +151,7 @@ def measures(
     )
 
 
-def judged(code: str, found: Sequence[Measure], remedy: str) -> Check:
+def check_from_measures(code: str, found: Sequence[Measure], remedy: str) -> Check:
     """Return a check that passed where every measure keeps its limits, else failed, naming each that does not."""
     broken = [str(one) for one in found if not one.kept]
     if broken:

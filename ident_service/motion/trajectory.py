@@ -115,7 +115,7 @@ class RuckigReference:
 
     def extent(self) -> tuple[Vector, Vector]:
         """Return the lowest and highest position, each of shape (joints,), sampled every `_EXTENT_STEP`."""
-        return at_once(self.extent_in_slices())
+        return run_to_end(self.extent_in_slices())
 
     def extent_in_slices(self) -> Generator[None, None, tuple[Vector, Vector]]:
         """Compute `extent` in slices short enough for a control cycle; the generator returns both positions."""
@@ -134,7 +134,7 @@ class RuckigReference:
 _CALM = 0.5  # of the limits, on the way to a motion and back
 
 
-def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
+def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
     """Plan a trajectory to a motion or back, within half of the velocity and acceleration limits where its ends allow.
 
     A trajectory at the full limits leaves no margin for errors of the model, and a second more does not matter.
@@ -142,7 +142,7 @@ def calm_way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigRefe
     Raises:
         MotionRefused: as `way`.
     """
-    return at_once(calm_way_in_slices(start, end, limits))
+    return run_to_end(calm_way_in_slices(start, end, limits))
 
 
 def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
@@ -161,13 +161,13 @@ def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> 
     return (yield from way_in_slices(start, end, calm))
 
 
-def way(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
+def plan_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
     """Plan a trajectory from one moving or resting state to another, all joints arriving together.
 
     Raises:
         MotionRefused: no such way exists within the limits, or it would leave the position limits.
     """
-    return at_once(way_in_slices(start, end, limits))
+    return run_to_end(way_in_slices(start, end, limits))
 
 
 def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
@@ -200,7 +200,7 @@ def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Gener
     return reference
 
 
-def at_once(slices: Generator[None, None, _Result]) -> _Result:
+def run_to_end(slices: Generator[None, None, _Result]) -> _Result:
     """Run a generator to its end and return its result."""
     while True:
         try:

@@ -27,7 +27,7 @@ from ident_service.operations.drift_alarms import end_alarms
 from ident_service.registry.database import Database
 from ident_service.registry.database import note as audit
 from ident_service.registry.state_folder import arm_folder
-from ident_service.results.manifest import appearing_folder, file_sha256, write_atomically
+from ident_service.results.manifest import atomic_folder, file_sha256, write_atomically
 
 PARAMETERS, URDF, ARM = "parameters.json", "identified.urdf", "arm.json"
 ACCEPTED, CURRENT, ACT = "accepted", "current", "acceptance.json"
@@ -171,7 +171,7 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
     return act, folder
 
 
-def settle(db: Database, state: Path) -> None:
+def synchronise(db: Database, state: Path) -> None:
     """Bring `current` and the registry up to date with the accepted sets of every arm; after a kill, for example."""
     place = state / "arms"
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
@@ -231,7 +231,7 @@ def _folder(state: Path, arm: str, number: int) -> Path:
 
 
 def _write(state: Path, act: Acceptance, source: Path) -> None:
-    with appearing_folder(_folder(state, act.arm, act.number)) as folder:
+    with atomic_folder(_folder(state, act.arm, act.number)) as folder:
         for name in (PARAMETERS, ARM, URDF):
             if (source / name).is_file():
                 _copied(source / name, folder / name)

@@ -170,7 +170,7 @@ _SAMPLES = 5
 
 
 @dataclass(frozen=True)
-class Turned:
+class ScaleCheck:
     """Scale check of one joint that was turned by hand.
 
     Attributes:
@@ -188,7 +188,7 @@ class Turned:
     words: str
 
 
-def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: Arm | None = None) -> list[Turned]:
+def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: Arm | None = None) -> list[ScaleCheck]:
     """Ask for a turn of each joint, compare it with the drives' positions, and keep the answers in `scale.json`.
 
     Args:
@@ -223,7 +223,7 @@ def check_scale(config: ArmConfig, state: Path, ask: Callable[[str], str], arm: 
     return found
 
 
-def _turned(name: str, answer: str, scale: float, revolute: bool, measured: float) -> Turned:
+def _turned(name: str, answer: str, scale: float, revolute: bool, measured: float) -> ScaleCheck:
     try:
         typed = float(answer) * scale
     except ValueError:
@@ -246,7 +246,7 @@ def _turned(name: str, answer: str, scale: float, revolute: bool, measured: floa
             if ratio > 1e-3
             else ": its encoder does not count, or is another joint's"
         )
-    return Turned(name, typed, measured, good, words)
+    return ScaleCheck(name, typed, measured, good, words)
 
 
 def _position(arm: Arm, number: int) -> float:
@@ -257,7 +257,7 @@ def _position(arm: Arm, number: int) -> float:
     return float(sample.position[number])
 
 
-def _keep(path: Path, config: ArmConfig, found: list[Turned]) -> None:
+def _keep(path: Path, config: ArmConfig, found: list[ScaleCheck]) -> None:
     """Write the results, together with earlier ones of other joints of the same description."""
     kept: dict[str, object] = {}
     try:

@@ -28,16 +28,16 @@ from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.arm_factory import make_arm
-from ident_service.motion.command_channel import StopWhen
+from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.run import RunReport, run
-from ident_service.motion.run_plan import Excite
+from ident_service.motion.run_plan import ExcitationPlan
 from ident_service.motion.state_machine import State
 from ident_service.operations.identification import unusable_because
 from ident_service.operations.recordings import recording_quality
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recorder import RecorderProcess
-from ident_service.results.manifest import appearing_folder, write_atomically
+from ident_service.results.manifest import atomic_folder, write_atomically
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import write_manifest, write_results
 from sim_backend.arm import SimulatedArm, Truth
@@ -179,7 +179,7 @@ def record_motion(
         lock_step=arm.clock.lock_step,
     )
     with arm, recorder:
-        return run(arm, model, motion, recorder, StopWhen(stop_requested))
+        return run(arm, model, motion, recorder, StopCondition(stop_requested))
 
 
 def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
@@ -188,7 +188,7 @@ def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
     Raises:
         MotionRefused: it would leave limits, or come too near to something.
     """
-    limits, plan = motion_limits(model.config), Excite(motion)
+    limits, plan = motion_limits(model.config), ExcitationPlan(motion)
     plan.require_possible(model, limits)
     plan.legs(model, limits.home, limits)
 
@@ -234,7 +234,7 @@ def simulate(
     for planned in motions[1:]:  # the first is checked when it begins; a later refusal would waste it
         require_clear_from_home(model, planned)
     reports, observed = [], list[Truth]()
-    with appearing_folder(folder) as staging:
+    with atomic_folder(folder) as staging:
         paths = [staging / f"{planned.name}.mcap" for planned in motions]
         for planned, path in zip(motions, paths, strict=True):
             tell(f"{planned.name} motion: {planned.duration:g} s at {config.control.rate:g} Hz")
@@ -249,7 +249,7 @@ def simulate(
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
-        recordings = [KeptRecording(open_recording(path, model.chain.names)) for path in paths]
+        recordings = [CachedRecording(open_recording(path, model.chain.names)) for path in paths]
         estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name, custom=custom)
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.canopen.bus_load import Budget
-from ident_service.config.load import load_arm, mistake
+from ident_service.config.load import config_error, load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ModelError, MotionRefused, ParameterError
@@ -60,7 +60,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     try:
         model = arm_model(config)
     except (ModelError, ParameterError) as error:
-        raise mistake(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
+        raise config_error(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         _require_names(arm, model, where)
     budget = require_budget(arm, model.config)
@@ -98,7 +98,7 @@ def _require_names(arm: str | Path, model: ArmModel, where: tuple[str, ...]) -> 
         try:
             model.layout.vector(section)
         except ParameterError as error:
-            raise mistake(arm, where, str(error)) from None
+            raise config_error(arm, where, str(error)) from None
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:

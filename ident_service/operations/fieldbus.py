@@ -16,7 +16,7 @@ from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
 from drivers.canopen.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line, budget
 from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
-from drivers.canopen.capabilities import Capabilities, capabilities, foretold, judged, named, where
+from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, named, where
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
 from drivers.canopen.drive_setup import IDENTITY, differences
 from drivers.canopen.pdo_mapping import bus_profiles
@@ -24,7 +24,7 @@ from drivers.canopen.sdo import Objects
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
 from ident_service.config.eds import data_sheet
-from ident_service.config.load import mistake
+from ident_service.config.load import config_error
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
 
@@ -62,7 +62,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
         return None
     found = bus_load(config)
     if not found.fits:
-        raise mistake(arm, ("driver",), f"{found.reason}. {found.remedy}")
+        raise config_error(arm, ("driver",), f"{found.reason}. {found.remedy}")
     return found
 
 
@@ -446,8 +446,8 @@ def _foretold(driver: CanopenDriver, number: int, file: TextFile) -> Capabilitie
     sheet, drive = data_sheet(file.text), driver.drives[number]
     if not sheet.entries:
         return None
-    family, found = foretold(sheet, drive, driver.families)
-    return judged(found, family, drive, driver, sheet)
+    family, found = entries_from_sheet(sheet, drive, driver.families)
+    return assess(found, family, drive, driver, sheet)
 
 
 def probe_text(config: ArmConfig, found: Probe) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.arm import ArmConfig, Method
-from ident_service.config.load import folder_of, load_arm, load_recording_format, mistake
+from ident_service.config.load import config_error, folder_of, load_arm, load_recording_format
 from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
@@ -84,7 +84,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Identified:
+class IdentificationResult:
     """Result of an identification, and the files written.
 
     Attributes:
@@ -102,7 +102,9 @@ class Identified:
     torque: str
 
 
-def identify_files(request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None) -> Identified:
+def identify_files(
+    request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None
+) -> IdentificationResult:
     """Identify an arm from files and write the results.
 
     Args:
@@ -143,7 +145,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
             again=request.second_opinion,
         )
     except CustomError as error:
-        raise mistake(request.arm, CUSTOM, str(error)) from error
+        raise config_error(request.arm, CUSTOM, str(error)) from error
     except SolverError as error:
         # Values too large or small for the solver come from the recording; the error then names the reason.
         for recording, seen in found:
@@ -167,7 +169,7 @@ def identify_files(request: Request, folder: Path, tell: Callable[[str], None] =
             files += _write_sdpa(staging, estimate)
         files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
-    return Identified(estimate, (*files, MANIFEST), warnings, unusable, opened.torque)
+    return IdentificationResult(estimate, (*files, MANIFEST), warnings, unusable, opened.torque)
 
 
 CUSTOM = ("constraints", "custom")
@@ -189,7 +191,7 @@ def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
     try:
         return load_custom(name, folder_of(arm, CUSTOM))
     except CustomError as error:
-        raise mistake(arm, CUSTOM, str(error)) from error
+        raise config_error(arm, CUSTOM, str(error)) from error
 
 
 def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> tuple[str, ...]:

@@ -77,7 +77,7 @@ _HOURS = "hours:"
 
 
 @dataclass(frozen=True)
-class When:
+class DueRule:
     """Rule for when a re-identification is due; exactly one of these.
 
     Attributes:
@@ -91,7 +91,7 @@ class When:
     maintenance: bool = False
 
 
-def add_schedule(db: Database, arm: str, when: When, by: str, now: float, motion: str | None = None) -> Row:
+def add_schedule(db: Database, arm: str, when: DueRule, by: str, now: float, motion: str | None = None) -> Row:
     """Add a schedule that counts from now.
 
     Args:
@@ -215,7 +215,7 @@ def events(db: Database, arm: str, *, before: int | None = None, most: int = 100
     )
 
 
-def fall_due(db: Database, now: float) -> None:
+def mark_due(db: Database, now: float) -> None:
     """Enter what has become due by cron or by operating hours until now [s since 1970 in UTC]."""
     with db.transaction():
         for row in schedules(db):
@@ -258,7 +258,7 @@ def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = F
         note(db, "service", "due", row["arm"], schedule=row["id"], cause=cause)
 
 
-def dues(db: Database, arm: str | None = None) -> list[Row]:
+def pending(db: Database, arm: str | None = None) -> list[Row]:
     """Return what is due and has not been done, the earliest first."""
     return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (?1 IS NULL OR arm = ?1) ORDER BY id", arm)
 

@@ -19,7 +19,7 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import UsageError
 from ident_service.estimation.equations import equations
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import Designed, design_motion, family, settled
+from ident_service.excitation.design import Designed, complete_task, design_motion, family
 from ident_service.excitation.motion_file import Excitation, read_excitation
 from ident_service.excitation.prediction import NoiseModel, described_noise
 from ident_service.excitation.search import Budget, Progress, found_to_json, read_found
@@ -35,7 +35,7 @@ from ident_service.operations.motion_preview import Preview, preview, preview_do
 from ident_service.operations.recordings import open_together
 from ident_service.preflight.stability import delay_of, stability
 from ident_service.recordings.adapters import overlap
-from ident_service.results.manifest import appearing_folder, require_place, write_atomically
+from ident_service.results.manifest import atomic_folder, require_place, write_atomically
 from ident_service.results.motion_figures import MotionTraces, joints_over_time
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.posture_figure import Box, Closest, Plane, Postures, Rod, stick_figure
@@ -130,7 +130,7 @@ FILES = (MOTION, SEARCH, PREVIEW, DOCUMENT, *DRAWINGS)
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class PriorData:
     """Data about an arm beside its description: identified parameters, noise, recordings.
 
     Attributes:
@@ -160,7 +160,7 @@ class DesignRequest:
 
     arm: str
     changes: dict[str, Any] = field(default_factory=dict)
-    knowledge: Knowledge = Knowledge()
+    knowledge: PriorData = PriorData()
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
     resume: Path | None = None
@@ -198,7 +198,7 @@ def design_files(
     limits = motion_limits(model.config)
     whitening = np.ones_like(noise.deviation) if design.criterion == "condition_number" else noise.deviation
     added = known_information(model, base, request.knowledge, whitening)
-    task = settled(model, design, basis, base, noise.deviation, added)
+    task = complete_task(model, design, basis, base, noise.deviation, added)
     earlier = None if request.resume is None else read_found(request.resume, task, request.seed)
     designed = design_motion(
         model,
@@ -214,14 +214,14 @@ def design_files(
         cancelled=cancelled,
     )
     seen = _seen(model, designed.excitation, request.knowledge)
-    with appearing_folder(folder) as staging:
+    with atomic_folder(folder) as staging:
         write_atomically(staging / MOTION, designed.excitation.to_json() + "\n")
         write_atomically(staging / SEARCH, found_to_json(designed.found, task) + "\n")
         write_preview(staging, seen)
     return designed, seen
 
 
-def preview_files(arm: str, motion: Path | None, knowledge: Knowledge, folder: Path | None) -> Preview:
+def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: Path | None) -> Preview:
     """Preview a motion, and write text and drawings where a folder is given.
 
     Args:
@@ -238,7 +238,7 @@ def preview_files(arm: str, motion: Path | None, knowledge: Knowledge, folder: P
     chosen = excitation(model, "identification", checked=False) if motion is None else read_excitation(motion)
     seen = _seen(model, chosen, knowledge)
     if folder is not None:
-        with appearing_folder(folder) as staging:
+        with atomic_folder(folder) as staging:
             write_preview(staging, seen)
     return seen
 
@@ -251,7 +251,7 @@ def write_preview(folder: Path, seen: Preview) -> None:
         write_atomically(folder / name, text)
 
 
-def known_model(arm: str, knowledge: Knowledge) -> ArmModel:
+def known_model(arm: str, knowledge: PriorData) -> ArmModel:
     """Return the arm's model, with identified link parameters if the knowledge has some.
 
     Raises:
@@ -269,14 +269,14 @@ def known_model(arm: str, knowledge: Knowledge) -> ArmModel:
     return replace(model, prior=np.array(table["values"], dtype=float))
 
 
-def known_noise(model: ArmModel, knowledge: Knowledge) -> NoiseModel:
+def known_noise(model: ArmModel, knowledge: PriorData) -> NoiseModel:
     """Return the noise model of the arm's torques, from the knowledge or else from the description."""
     if knowledge.noise is not None:
         return recorded_noise(knowledge.noise, model)
     return described_noise(model, motion_limits(model.config))
 
 
-def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledge, noise: Array) -> Array | None:
+def known_information(model: ArmModel, base: BaseParameters, knowledge: PriorData, noise: Array) -> Array | None:
     """Return the information of the recordings, whitened by `noise` of shape (joints,); None without any."""
     if not knowledge.recordings:
         return None
@@ -289,7 +289,7 @@ def known_information(model: ArmModel, base: BaseParameters, knowledge: Knowledg
     return np.asarray(R.T @ R)
 
 
-def _seen(model: ArmModel, motion: Excitation, knowledge: Knowledge) -> Preview:
+def _seen(model: ArmModel, motion: Excitation, knowledge: PriorData) -> Preview:
     noise = known_noise(model, knowledge)
     seen = preview(model, motion, noise)
     added = known_information(model, seen.base, knowledge, noise.deviation)

@@ -11,21 +11,27 @@ import numpy as np
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.estimation.uncertainty import negligible, verdicts
-from ident_service.excitation.limit_proof import Proof, objections, proof_of
+from ident_service.excitation.limit_proof import Proof, proof_of, violations
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import condition_number
-from ident_service.excitation.prediction import NoiseModel, described_noise, expected_deviations, forecast, information
+from ident_service.excitation.prediction import (
+    NoiseModel,
+    described_noise,
+    expected_deviations,
+    information,
+    predict_following_error,
+)
 from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, scene
 from ident_service.model.expected_friction import expected_friction
-from ident_service.model.information import information_of, supports
+from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.motion.clearance import Nearest, stop_clearance
 from ident_service.motion.stop_trajectory import stop_extent
-from ident_service.motion.trajectory import Setpoint, calm_way, rest
+from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
 from ident_service.results.parameter_file import read_parameters
 
 _LOOKED_AT = 2000  # samples of each part of a motion for the forecast of the following error
@@ -99,7 +105,7 @@ def preview(
     margin = excitation.made.get("torque_margin")  # a designed motion's own
     proof = proof_of(path, model, limits, CollisionModel(model), margin if isinstance(margin, float) else None)
     lowest, highest = stop_extent(path, limits)
-    found = objections(proof, model, limits)
+    found = violations(proof, model, limits)
     for k, name in enumerate(model.chain.names):
         if lowest[k] < limits.lower[k] or highest[k] > limits.upper[k]:
             found.append(
@@ -114,7 +120,7 @@ def preview(
     durations = []
     for leg in ((home, begin), (end, home)):
         try:
-            durations.append(calm_way(leg[0], leg[1], limits).duration)
+            durations.append(plan_reduced_trajectory(leg[0], leg[1], limits).duration)
         except MotionRefused as error:
             durations.append(float("nan"))
             found.append(str(error))
@@ -150,7 +156,7 @@ def _negligible(path: FourierPath | PosturePath, model: ArmModel, base: BasePara
     torque = np.tile(_USED * limits.torque, (len(time), 1))
     if model.prior is not None:
         torque = np.einsum("jps,p->sj", H, base.K @ model.prior)
-    felt = supports(model.chain, model.layout, base.base)
+    felt = sparsity(model.chain, model.layout, base.base)
     return negligible(information_of(H, torque, np.ones(torque.shape, dtype=bool), felt))
 
 
@@ -174,7 +180,7 @@ def _following(model: ArmModel, excitation: Excitation, limits: MotionLimits) ->
     time = np.concatenate([np.linspace(begin, end, _LOOKED_AT) for begin, end in path.distinct])
     position, velocity, *_ = path.at(time)
     friction = expected_friction(model, limits, model.config.design.friction_guess)
-    return forecast(model, limits, friction, position, velocity)
+    return predict_following_error(model, limits, friction, position, velocity)
 
 
 def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:

@@ -49,7 +49,7 @@ from ident_service.model.urdf import urdf_text
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile
 from ident_service.motion.ending import ENDED, write_ending
-from ident_service.motion.fault_store import CONTROLS, UNFINISHED, FaultFile
+from ident_service.motion.fault_store import CONTROLS, UNFINISHED, FaultStore
 from ident_service.motion.run_plan import HOMING_SPEED, Destination
 from ident_service.motion.ticket import Ticket, subject_of
 from ident_service.operations.arm_checks import write_ticket
@@ -66,7 +66,7 @@ _KINDS: dict[str, type[IdentError]] = {
 
 
 @dataclass
-class Ending:
+class ProcessResult:
     """Result that the motion process reported last.
 
     Attributes:
@@ -84,7 +84,7 @@ class Ending:
         """Return whether the motion process reported a result."""
         return bool(self.report or self.error)
 
-    def raise_for(self, faults: FaultFile) -> None:
+    def raise_for(self, faults: FaultStore) -> None:
         """Raise the error that the motion process reported; faults that followed the first are added as notes.
 
         Raises:
@@ -124,14 +124,14 @@ class Ending:
         return f"exit code {self.code}"
 
 
-def watched(
+def supervise_motion_process(
     request: dict[str, Any],
     ends: tuple[int, ...],
     lease: float,
     tell: Callable[[str], None],
     stop_requested: Callable[[], bool],
     finish_requested: Callable[[], bool] = lambda: False,
-) -> Ending:
+) -> ProcessResult:
     """Start the motion process, keep its lease, and read its output until it ends.
 
     Args:
@@ -199,7 +199,7 @@ class _Watch:
         stop_requested: Callable[[], bool],
         finish_requested: Callable[[], bool],
     ) -> None:
-        self.ending = Ending({}, {})
+        self.ending = ProcessResult({}, {})
         self._process, self._path, self._lease = process, path, lease
         self._tell, self._stop_requested, self._finish_requested = tell, stop_requested, finish_requested
         self._controls: ControlFile | None = None
@@ -273,7 +273,7 @@ class _Watch:
         code, _, cause = self._fault.partition(": ")
         if code:
             with suppress(UsageError):  # a full disk, perhaps; it is latched at the end
-                FaultFile(self._path.parent).latch(code, cause)
+                FaultStore(self._path.parent).latch(code, cause)
 
 
 @contextmanager
@@ -305,7 +305,7 @@ def least_seconds(motion: Excitation, speed: float) -> float:
     return motion.path.series.period / speed if isinstance(motion.path, FourierPath) else 0.0
 
 
-class Reaching:
+class TargetMonitor:
     """Monitor of a run's accuracy target.
 
     Attributes:
@@ -373,7 +373,7 @@ class Reaching:
 
 
 @dataclass(frozen=True)
-class Ran:
+class RunResult:
     """Result of a run.
 
     Attributes:
@@ -400,7 +400,7 @@ def run_motion(
     stop_requested: Callable[[], bool] = lambda: False,
     asked_ns: int | None = None,
     until: Target | None = None,
-) -> Ran:
+) -> RunResult:
     """Move an arm along a motion, or to a destination, and record it.
 
     Args:
@@ -484,11 +484,11 @@ def run_motion(
         begin()
         reaching = None
         if until is not None and isinstance(motion, Excitation):
-            reaching = Reaching(folder, until, least_seconds(motion, speed), tell)
+            reaching = TargetMonitor(folder, until, least_seconds(motion, speed), tell)
         with recorder, reaching or nullcontext():
             started = True
             finish = (lambda: False) if reaching is None else reaching.reached
-            ending = watched(request, astuple(recorder.ends), lease, tell, stop_requested, finish)
+            ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, stop_requested, finish)
             ending.raise_for(faults)
     except BaseException as error:
         if started and not (isinstance(error, MotionRefused) and not faults.latched()):
@@ -498,10 +498,10 @@ def run_motion(
         raise
     write_manifest(folder)
     if reaching is None or until is None:
-        return Ran(folder, ending.report)
+        return RunResult(folder, ending.report)
     wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.said}
     wanted["missed"] = [] if reaching.said is not None else _missed(folder, until, reaching.period, tell)
-    return Ran(folder, {**ending.report, "until": wanted})
+    return RunResult(folder, {**ending.report, "until": wanted})
 
 
 def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], None]) -> list[dict[str, Any]] | None:

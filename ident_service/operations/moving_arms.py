@@ -7,7 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from ident_service.errors import UsageError
-from ident_service.motion.command_channel import ControlFile, mover
+from ident_service.motion.command_channel import ControlFile, controlling_pid
 from ident_service.registry.state_folder import control_path
 
 
@@ -52,7 +52,7 @@ def held_arm(state: Path, arm: str) -> bool:
 
 def moving_arms(state: Path) -> list[str]:
     """Return the names of the arms that any process moves."""
-    return _reach(state, None, mover)
+    return _reach(state, None, controlling_pid)
 
 
 def _asking(ask: Callable[[ControlFile], None]) -> Callable[[Path], int]:

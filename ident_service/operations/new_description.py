@@ -29,7 +29,7 @@ from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
-from ident_service.model.likely_bodies import drawn_about, likely_bodies, lines_of, with_urdf_bodies
+from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_urdf_bodies
 from ident_service.model.mechanism import count_mechanism, read_mechanism
 from ident_service.model.outline import mesh_capsules
 from ident_service.model.pinocchio_models import InverseDynamics
@@ -43,7 +43,7 @@ _ARM = 3  # joints that make a branch an arm and not a gripper
 
 
 @dataclass(frozen=True)
-class Said:
+class UrdfLimits:
     """Limits of a joint in a URDF; None where it has none that is plausible."""
 
     position: tuple[float, float] | None
@@ -111,7 +111,7 @@ def arm_part(text: str, file: str, base: str | None, tip: str | None) -> dict[st
     return part | {"tip": link} if branched else part
 
 
-def said_of(text: str) -> dict[str, Said]:
+def urdf_limits(text: str) -> dict[str, UrdfLimits]:
     """Return the limits of every joint of a URDF whose elements were counted, by its name."""
     found = {}
     for joint in ET.fromstring(text).findall("joint"):  # noqa: S314 - counted before
@@ -128,7 +128,7 @@ def said_of(text: str) -> dict[str, Said]:
         ranged = lower is not None and upper is not None and lower < upper and joint.get("type") != "continuous"
         position = (float(lower or 0.0), float(upper or 0.0)) if ranged else None
         velocity, effort = number("velocity"), number("effort")
-        found[joint.get("name", "")] = Said(
+        found[joint.get("name", "")] = UrdfLimits(
             position,
             velocity if velocity is not None and 0.0 < velocity < 100.0 else None,
             effort if effort is not None and 0.0 < effort < 1e5 else None,
@@ -336,7 +336,7 @@ def new_description(
 
         draft.remarks += _which(loaded(), draft)
         tell("joints and bodies")
-        _joints(draft, loaded(), said_of(text))
+        _joints(draft, loaded(), urdf_limits(text))
         _bodies(draft, loaded, urdf.parent)
         tell("a posture to begin in")
         model = _home(draft, loaded)
@@ -369,7 +369,7 @@ def _which(model: ArmModel, draft: Draft) -> list[str]:
     return [f"the arm: {ends}{more} (--base and --tip say otherwise)"]
 
 
-def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
+def _joints(draft: Draft, model: ArmModel, said: Mapping[str, UrdfLimits]) -> None:
     """Set the limits of every joint: the URDF's, else guesses; torque limits that can hold the arm."""
     chain = model.chain
     likely = likely_bodies(with_urdf_bodies(model))
@@ -395,7 +395,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, Said]) -> None:
             raise ModelError(f"{draft.urdf}: {name} turns from {low:g} to {high:g} rad: limits of a URDF are radians")
     gravity, inertia = _worst(model, ranges)
     for k, name in enumerate(chain.names):
-        turns, one = chain.revolute[k], said.get(name, Said(None, None, None))
+        turns, one = chain.revolute[k], said.get(name, UrdfLimits(None, None, None))
         velocity = one.velocity or _VELOCITY[turns]
         acceleration = velocity / _SECONDS
         torque = one.effort or _HEAVY * (gravity[k] + 2.0 * inertia[k] * acceleration)
@@ -519,7 +519,7 @@ def _drives(draft: Draft, model: ArmModel) -> None:
     delta = prior.copy()
     for link in range(chain.joints):
         place = layout.inertial(link)
-        delta[place] = drawn_about(prior[place], rng)
+        delta[place] = perturbed_body(prior[place], rng)
     shares = 1.0 + 0.3 * rng.uniform(-1.0, 1.0, size=(3, chain.joints))
     delta[layout.term_columns("drive_inertia")] = drives * shares[0]
     delta[layout.term_columns("viscous")] = _FRICTION * limits.torque / limits.velocity * shares[1]

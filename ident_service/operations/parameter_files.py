@@ -30,11 +30,11 @@ from ident_service.operations.recordings import open_together, require_no_fault
 from ident_service.operations.verify import custom_note
 from ident_service.recordings.adapters import overlap
 from ident_service.recordings.recording import Recording
-from ident_service.results.comparison.comparison import Comparison, Side, compare, read_side
+from ident_service.results.comparison.comparison import ComparedSet, Comparison, compare, read_side
 from ident_service.results.comparison.presentation import comparison_html, comparison_text, write_comparison
 from ident_service.results.export.urdf import write_urdf
 from ident_service.results.manifest import (
-    appearing_folder,
+    atomic_folder,
     replacing_folder,
     require_place,
     require_replaceable,
@@ -197,7 +197,7 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
     if out.suffix == ".json" and not out.is_dir():
         write_comparison(out, comparison)
         return comparison, (out,)
-    with appearing_folder(out) as staging:
+    with atomic_folder(out) as staging:
         names = write_comparison_files(staging, comparison)
     return comparison, tuple(out / name for name in names)
 
@@ -232,7 +232,7 @@ PAYLOAD_DOCUMENT, PAYLOAD_TEXT = "payload.json", "payload.txt"
 
 
 @dataclass(frozen=True)
-class Found:
+class PayloadResult:
     """Result of a payload identification, and the files written.
 
     Attributes:
@@ -252,7 +252,7 @@ class Found:
     files: tuple[str, ...]
 
 
-def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> Found:
+def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_offsets: bool = False) -> PayloadResult:
     """Identify the payload that an identified arm carries, and write the results.
 
     Args:
@@ -303,10 +303,10 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
             comparison = _compared(side, staging, out)
             names += write_comparison_files(staging, comparison)
         write_manifest(staging)
-    return Found(arm, payload, document, text, comparison, (*names, MANIFEST))
+    return PayloadResult(arm, payload, document, text, comparison, (*names, MANIFEST))
 
 
-def known_arm(side: Side) -> KnownArm:
+def known_arm(side: ComparedSet) -> KnownArm:
     """Return the identified arm of a folder of results.
 
     Raises:
@@ -324,7 +324,7 @@ def known_arm(side: Side) -> KnownArm:
     return KnownArm(model, file.base, file.values, side.covariance, fit.get("blocks"), known)
 
 
-def _require_new(side: Side, recordings: Sequence[Recording]) -> None:
+def _require_new(side: ComparedSet, recordings: Sequence[Recording]) -> None:
     fitted = {one["sha256"] for one in side.content.get("provenance", {}).get("recordings", [])}
     for index, recording in enumerate(recordings):
         if recording.sha256 in fitted:
@@ -333,8 +333,8 @@ def _require_new(side: Side, recordings: Sequence[Recording]) -> None:
             raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
 
 
-def _compared(side: Side, staging: Path, out: Path) -> Comparison:
+def _compared(side: ComparedSet, staging: Path, out: Path) -> Comparison:
     """Return the comparison of the arm with the arm under load, under the paths of the final folder."""
     loaded = read_side(staging / PARAMETERS)
     config = None if side.config is None else loaded_config(side.config)
-    return compare([side, Side(out / PARAMETERS, loaded.sha256, loaded.file, config)])
+    return compare([side, ComparedSet(out / PARAMETERS, loaded.sha256, loaded.file, config)])

@@ -11,13 +11,13 @@ from typing import Final, Literal
 import numpy as np
 
 from ident_service.config.load import load_recording_format
-from ident_service.config.recording import RecordingFormat, disagreements, units_of_other_joints
+from ident_service.config.recording import RecordingFormat, disagreements, mismatched_units
 from ident_service.errors import RecordingError, UsageError
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.state_machine import State
 from ident_service.recordings.adapters import MeasuredRecording, RangeRecording, first_stamp, without_standstill
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.files import split_range
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.mcap_records import MAGIC
@@ -46,7 +46,7 @@ RECORDED: Final = "recorded"  # torque of another program's file, which does not
 
 
 @dataclass(frozen=True)
-class Opened:
+class OpenedRecordings:
     """Recordings that are read for one estimate.
 
     Attributes:
@@ -65,7 +65,7 @@ def open_together(
     model: ArmModel,
     forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
     torque: Torque | None = None,
-) -> Opened:
+) -> OpenedRecordings:
     """Open recordings for one estimate, with the same kind of torque in all that ident recorded.
 
     Torques that drives measured and commanded ones differ by the error of the current loops, and each has its
@@ -81,7 +81,7 @@ def open_together(
         UsageError, RecordingError: as `open_for`; a recording lacks the torque that is demanded.
     """
     asked = torque or model.config.identification.torque
-    found = [open_for(path, model, forms.get(path), asked) for path in paths]
+    found = [open_for_arm(path, model, forms.get(path), asked) for path in paths]
     kinds = [torque_in(recording) for recording in found]
     remarks = tuple(
         f"{recording.path}: left out from {recording.ended:.6g} s after its first sample on: the motion was stopped,"
@@ -98,21 +98,21 @@ def open_together(
         )
         for place, kind in enumerate(kinds):
             if kind == "measured":
-                found[place] = open_for(paths[place], model, forms.get(paths[place]), "commanded")
+                found[place] = open_for_arm(paths[place], model, forms.get(paths[place]), "commanded")
         kinds = ["commanded" if kind == "measured" else kind for kind in kinds]
-    return Opened(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
+    return OpenedRecordings(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
 
 
 def torque_in(recording: Recording) -> str:
     """Return which torque a recording gives: `measured`, `commanded`, or `recorded` for a file of another program."""
-    if isinstance(recording, KeptRecording | RangeRecording):
+    if isinstance(recording, CachedRecording | RangeRecording):
         return torque_in(recording.whole)
     if isinstance(recording, MeasuredRecording):
         return "measured"
     return "commanded" if isinstance(recording, McapRecording) and recording.own else RECORDED
 
 
-def open_for(
+def open_for_arm(
     path: Path, model: ArmModel, form: RecordingFormat | None = None, torque: Torque | None = None
 ) -> Recording:
     """Open a recording, or a range of one, for an arm.
@@ -132,7 +132,7 @@ def open_for(
     # Cached, because quality, friction, equations and evidence each read the recording.
     torque = torque or model.config.identification.torque
     whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
-    recording: Recording = KeptRecording(whole)
+    recording: Recording = CachedRecording(whole)
     if isinstance(whole, McapRecording | MeasuredRecording) and (ended := _ended(whole, recording)) is not None:
         # A range that a person asks for beyond this end is empty, and the error says so.
         recording = RangeRecording(recording, 0.0, ended)
@@ -189,7 +189,7 @@ def own_formats(
         if "standstill" not in form.model_fields_set:
             form = form.model_copy(update={"standstill": general.standstill})
         wrong = [message for _, message in disagreements(form, model.config.transmission, model.chain.names)]
-        wrong += units_of_other_joints(form, model.chain.names, model.chain.revolute)
+        wrong += mismatched_units(form, model.chain.names, model.chain.revolute)
         if wrong:
             raise UsageError(f"{file}: {'; '.join(wrong)}")
         found |= dict.fromkeys(named, form)

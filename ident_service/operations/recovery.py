@@ -24,10 +24,10 @@ from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import DriverError, MotionRefused, PositionUnknown, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
-from ident_service.motion.clearance import outside, require_near
-from ident_service.motion.command_channel import ControlFile, mover
+from ident_service.motion.clearance import position_limit_violations, require_near
+from ident_service.motion.command_channel import ControlFile, controlling_pid
 from ident_service.motion.control_loop import REST_SPEED
-from ident_service.motion.fault_store import Remembered
+from ident_service.motion.fault_store import StoredFault
 from ident_service.motion.last_position import PositionFile
 from ident_service.motion.read_only_monitor import Watched, watch
 from ident_service.recordings.files import require_writable
@@ -59,7 +59,7 @@ class Recovery:
     """
 
     arm: str
-    faults: tuple[Remembered, ...]
+    faults: tuple[StoredFault, ...]
     mover: int | None
     seen: Watched | None
     unreachable: str
@@ -87,7 +87,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     """
     limits, called = motion_limits(config), called or config.name
     faults = fault_file(state, config.name).remembered()
-    pid = mover(control_path(state, config.name))
+    pid = controlling_pid(control_path(state, config.name))
     if pid is not None:
         stop_first = (
             f"`ident stop {called}` brings it to rest; process {pid} moves it.",
@@ -108,7 +108,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     except DriverError as error:
         unreachable = str(error)
     tripped = {} if seen is None else _tripped(seen)
-    out = [] if seen is None else outside(seen.position, limits, seen.joint_names)
+    out = [] if seen is None else position_limit_violations(seen.position, limits, seen.joint_names)
     support = _SUPPORT
     if seen is not None and isinstance(config.driver, CanopenDriver) and any(w & AxisStatus.IDLE for w in seen.status):
         support = _HELD.format(called)
@@ -118,7 +118,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
 
 
-def let_go(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str, ...]:
+def release_held_drives(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str, ...]:
     """Switch off drives that hold an arm in quick stop, once a person has confirmed that it is supported.
 
     Args:
@@ -169,7 +169,7 @@ def _reset(arm: Arm) -> str:
 
 def _before(
     name: str,
-    faults: tuple[Remembered, ...],
+    faults: tuple[StoredFault, ...],
     seen: Watched | None,
     unreachable: str,
     zero_lost: str,
@@ -195,7 +195,7 @@ def _before(
         steps.append(f"Release the emergency stop, or read the drive's own fault code and mend its cause: {refusal}.")
     if tripped or (faults and steps):
         steps.append(f"`ident recover {name}` again: it resets the drives when every fault is acknowledged.")
-    if not silent and (out := outside(seen.position, limits, seen.joint_names)):
+    if not silent and (out := position_limit_violations(seen.position, limits, seen.joint_names)):
         try:
             require_near(seen.position, limits, seen.joint_names)
             steps.append(
@@ -228,7 +228,7 @@ class JointPosture:
 
 
 @dataclass(frozen=True)
-class Zeroed:
+class ZeroingResult:
     """Result of zeroing an arm.
 
     Attributes:
@@ -242,7 +242,7 @@ class Zeroed:
     arm: str
     posture: tuple[JointPosture, ...]
     drives: tuple[str, ...]
-    faults: tuple[Remembered, ...]
+    faults: tuple[StoredFault, ...]
     ticket_removed: bool
 
 
@@ -267,7 +267,7 @@ def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
     return tuple(found)
 
 
-def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> Zeroed:
+def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm: Arm | None = None) -> ZeroingResult:
     """Set an arm's present position as its home in the drives, once a person has confirmed the posture.
 
     Args:
@@ -293,4 +293,4 @@ def take_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm
         ticket.unlink(missing_ok=True)
         PositionFile(ticket.parent, config).forget()  # what drives tell is about another zero from now on
         drives = (make_arm(config) if arm is None else arm).zero()
-    return Zeroed(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)
+    return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

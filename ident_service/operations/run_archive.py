@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Final
 
 from ident_service.errors import ParameterError, UsageError
-from ident_service.operations.acceptance import accepted_recordings, accepted_runs, settle
+from ident_service.operations.acceptance import accepted_recordings, accepted_runs, synchronise
 from ident_service.registry.database import Database, Row, note
 from ident_service.registry.runs import RUNS, index_run, known_run, run_folder
-from ident_service.results.manifest import MANIFEST, appearing_folder, named_files, verified_files
+from ident_service.results.manifest import MANIFEST, atomic_folder, named_files, verified_files
 
 MOST_BYTES: Final = 64 * 2**30
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")
@@ -67,7 +67,7 @@ def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
 
 
 def _copy(folder: Path, target: Path) -> None:
-    with appearing_folder(target) as staging:
+    with atomic_folder(target) as staging:
         for name in (*named_files(folder), MANIFEST):
             # Without following a link that was put there since the verification.
             fd = os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -80,7 +80,7 @@ def _copy(folder: Path, target: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Expendable:
+class PrunableRecording:
     """Recording that the retention policy allows to delete.
 
     Attributes:
@@ -94,7 +94,7 @@ class Expendable:
     bytes: int
 
 
-def expendable(db: Database, state: Path, newest: int) -> list[Expendable]:
+def expendable(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
     """Recordings that the policy lets go.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
@@ -106,7 +106,7 @@ def expendable(db: Database, state: Path, newest: int) -> list[Expendable]:
     """
     if newest < 0:
         raise UsageError("the number of newest runs that keep their recordings is 0 or more")
-    settle(db, state)
+    synchronise(db, state)
     kept = accepted_runs(db)
     busy = _busy(db)
     rows = db.rows(
@@ -117,7 +117,7 @@ def expendable(db: Database, state: Path, newest: int) -> list[Expendable]:
     )
     needed = accepted_recordings(state) - {row["sha256"] for row in rows if row["run"] in kept}
     return [
-        Expendable(row["run"], row["name"], row["bytes"])
+        PrunableRecording(row["run"], row["name"], row["bytes"])
         for row in rows
         if row["rank"] > newest and row["run"] not in kept | busy and row["sha256"] not in needed
     ]
@@ -136,7 +136,7 @@ def _busy(db: Database) -> set[str]:
     return found
 
 
-def let_go(db: Database, state: Path, newest: int, who: str) -> list[Expendable]:
+def prune(db: Database, state: Path, newest: int, who: str) -> list[PrunableRecording]:
     """Delete the recordings that `expendable` returns; each row is marked first, so that a kill does no damage."""
     gone = expendable(db, state, newest)
     for one in gone:

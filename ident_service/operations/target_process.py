@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.load import arm_from_json
-from ident_service.estimation.online import GrowingInformation
+from ident_service.estimation.online import SequentialLeastSquares
 from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
-from ident_service.estimation.uncertainty import shares
+from ident_service.estimation.uncertainty import relative_deviations
 from ident_service.model.arm_model import arm_model
-from ident_service.recordings.mcap_follower import RecordingTail
+from ident_service.recordings.mcap_follower import RecordingFollower
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Block
 
@@ -49,7 +49,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
         IdentError: the recording or the description cannot be read.
     """
     model = arm_model(arm_from_json(folder / "arm.json"))
-    growing = GrowingInformation(model, in_blocks=True, period=least)
+    growing = SequentialLeastSquares(model, in_blocks=True, period=least)
     places = target.places(growing.base, model.config.name)
     if (tail := _opened(folder)) is None:
         return None
@@ -84,7 +84,7 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
         IdentError: the recording or the description cannot be read.
     """
     model = arm_model(arm_from_json(folder / "arm.json"))
-    growing = GrowingInformation(model, in_blocks=True, period=period)
+    growing = SequentialLeastSquares(model, in_blocks=True, period=period)
     for block in open_recording(folder / "run.mcap", model.chain.names).blocks():
         growing.add(block)
         while growing.step():
@@ -93,7 +93,7 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
     if doubt is None or doubt.blocks < LEAST_BLOCKS:
         known = np.full(len(places), np.inf)
     else:
-        known = shares(doubt.beta, doubt.deviations, doubt.negligible)[places]
+        known = relative_deviations(doubt.beta, doubt.deviations, doubt.negligible)[places]
     found = [
         (growing.base.expressions[place], float(share))
         for place, share in zip(places.tolist(), known, strict=True)
@@ -103,12 +103,12 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
     return [{"parameter": name, "share": share if np.isfinite(share) else None} for name, share in found]
 
 
-def _opened(folder: Path) -> RecordingTail | None:
+def _opened(folder: Path) -> RecordingFollower | None:
     """Return the recording as soon as there is one; None where nobody waits for it any more."""
     while True:
         for name in ("run.mcap.partial", "run.mcap"):
             try:
-                return RecordingTail(folder / name)
+                return RecordingFollower(folder / name)
             except FileNotFoundError:
                 continue
         if _left_alone():

@@ -51,7 +51,7 @@ def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
     """Return the conditions and expressions of a description, and the name of its custom constraints, if any."""
     # The numerical packages are loaded only where there is a description to make conditions from.
     from ident_service.config.load import arm_from_json, load_arm
-    from ident_service.estimation.certificate import stated_arm
+    from ident_service.estimation.certificate import certificate_arm
     from ident_service.estimation.feasible.feasible_set import feasible_set
     from ident_service.model.arm_model import arm_model
     from ident_service.model.base_parameters import base_parameters
@@ -60,7 +60,7 @@ def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
     model = arm_model(config)
     base = base_parameters(model.chain, model.layout)
     conditions = feasible_set("pseudo_inertia", base.names, config)
-    stated = stated_arm(config.name, _sha256(config, file), base, conditions, units=model.layout.units)
+    stated = certificate_arm(config.name, _sha256(config, file), base, conditions, units=model.layout.units)
     return stated, config.constraints.custom
 
 

@@ -49,7 +49,7 @@ def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
     return np.where(np.arange(len(limits_torque)) == joint, size, 0.0)
 
 
-def delay_of(trace: Trace, expected: Vector, joint: int) -> Delay | None:
+def hidden_delay(trace: Trace, expected: Vector, joint: int) -> Delay | None:
     """Measure the hidden delay; None where the joint did not slide for long enough, or did not respond.
 
     With a the measured and b the expected acceleration, both through one filter, `a(t) = g b(t - d) + friction`, and so

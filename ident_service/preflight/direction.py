@@ -21,8 +21,8 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.clearance import way_clearance
-from ident_service.motion.ticket import Check, Measure, Verdict, failed, judged, measures
-from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, rest, way
+from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, measures
+from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
 from ident_service.preflight.delay import FREQUENCY, Delay, delay_measures, dither
 from ident_service.preflight.session import BAND, Rows, Session, Trace
 from ident_service.preflight.stability import INERTIA, drive_matrix, known_drives
@@ -57,7 +57,7 @@ SIGN_REMEDY = (
 
 
 @dataclass(frozen=True)
-class Stroke:
+class TestMotion:
     """Represent a small test motion of one joint from where it stands and back.
 
     Attributes:
@@ -85,7 +85,7 @@ class Stroke:
 
 
 @dataclass(frozen=True)
-class Answer:
+class JointResponse:
     """Represent the response of one joint to its test motion.
 
     Attributes:
@@ -99,7 +99,7 @@ class Answer:
     doubt: float
 
 
-def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[Stroke]:
+def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int | None = None) -> list[TestMotion]:
     """Plan a small test motion for every joint, or for one, by number.
 
     Raises:
@@ -122,7 +122,7 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
     return found
 
 
-def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
+def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
     """Move one joint there and back three times: twice to learn its friction, the second time shaken, and once more.
 
     Returns:
@@ -139,10 +139,10 @@ def follow_stroke(session: Session, stroke: Stroke) -> tuple[Rows, Rows]:
     return session.follow(reference, stroke.duration), shaken
 
 
-def answer(trace: Trace, stroke: Stroke, session: Session) -> Answer:
+def judge_response(trace: Trace, stroke: TestMotion, session: Session) -> JointResponse:
     """Evaluate a test motion that the loop could follow to its end."""
     answers, doubt = _answer_to_torque(trace, stroke.joint, session)
-    return Answer(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
+    return JointResponse(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
 
 def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
@@ -165,7 +165,7 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
     return _fitted(columns, measured[sliding], window)
 
 
-def _displaced(trace: Trace, stroke: Stroke) -> float:
+def _displaced(trace: Trace, stroke: TestMotion) -> float:
     """Return the mean displacement there and back, from dwell to dwell [rad or m]."""
     ends = (DWELL, stroke.there.duration + 2.0 * DWELL, stroke.duration)
     last = max(1, round(_SETTLED / trace.period))
@@ -174,7 +174,7 @@ def _displaced(trace: Trace, stroke: Stroke) -> float:
     return far - 0.5 * (start + back)
 
 
-def went_against(trace: Trace, joint: int, session: Session) -> bool:
+def moved_against_torque(trace: Trace, joint: int, session: Session) -> bool:
     """Return whether the joint that left its reference accelerated against its own torque, since it last stood.
 
     Friction holds it until the torque is large enough, and is constant afterwards, so that only what comes after it has
@@ -219,7 +219,7 @@ def wrong_signs(trace: Trace, session: Session) -> list[int]:
     size = np.maximum(np.linalg.norm(seen, axis=0), 1e-9)
 
     def unexplained(torque_sign: Vector, position_sign: Vector) -> float:
-        expected = varying(expected_way(trace, session, torque_sign)) * position_sign
+        expected = varying(expected_displacement(trace, session, torque_sign)) * position_sign
         # How much more or less inertia there is than the model knows is not the question, but no less than none.
         gain = (seen * expected).sum(axis=0) / np.maximum((expected**2).sum(axis=0), 1e-30)
         return float((((seen - np.maximum(gain, 0.0) * expected) / size) ** 2).sum())
@@ -249,7 +249,7 @@ def sign_failure(joints: Sequence[int], model: ArmModel, why: str) -> Check:
 
 
 def direction_check(
-    answers: Sequence[Answer], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
+    answers: Sequence[JointResponse], model: ArmModel, session: Session, delays: Sequence[Delay] = ()
 ) -> Check:
     """Evaluate all test motions of a session, and the delays measured on them, as one check."""
     names, ones = model.chain.names, ("",) * model.chain.joints
@@ -282,7 +282,7 @@ def direction_check(
         for name, value, sure in zip(names, response, np.abs(response) + _DOUBT * doubt, strict=True)
         if sure < ODD_ANSWER
     ]
-    check = judged(
+    check = check_from_measures(
         "direction",
         found,
         "Check this joint's gear ratio, encoder steps per turn and torque constant in the driver's configuration, and "
@@ -296,22 +296,25 @@ def direction_check(
 
 def _free_stroke(
     home: Vector, joint: int, collision: CollisionModel, slow: MotionLimits, clearance: float
-) -> Stroke | None:
+) -> TestMotion | None:
     for amplitude in AMPLITUDES:
         target = home.copy()
         target[joint] += amplitude
         if not slow.lower[joint] <= target[joint] <= slow.upper[joint]:
             continue
         try:
-            there, back = way(rest(home), rest(target), slow), way(rest(target), rest(home), slow)
+            there, back = (
+                plan_trajectory(rest(home), rest(target), slow),
+                plan_trajectory(rest(target), rest(home), slow),
+            )
         except MotionRefused:
             continue
         if not collision.pairs or way_clearance(collision, there, slow, clearance).proven:
-            return Stroke(joint, amplitude, there, back)
+            return TestMotion(joint, amplitude, there, back)
     return None
 
 
-def expected_way(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
+def expected_displacement(trace: Trace, session: Session, sign: Vector | float = 1.0) -> Vector:
     """Return the displacement that the model expects of the torque times `sign` [rad or m], (cycles, joints)."""
     acceleration = np.linalg.solve(session.inertia, (sign * (trace.torque - session.gravity)).T).T
     return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)

@@ -10,7 +10,7 @@ from ident_service.config.motion_limits import MotionLimits, Vector
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.expected_friction import ExpectedFriction
-from ident_service.motion.ticket import Check, Verdict, failed, joint_units, judged, measures
+from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, joint_units, measures
 from ident_service.preflight.direction import sign_failure, wrong_signs
 from ident_service.preflight.session import Rows, Session, remedy_of
 from ident_service.preflight.static_checks import HOLDABLE
@@ -50,7 +50,7 @@ def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | 
     )
 
 
-def held_torque(rows: Rows, period: float) -> Vector:
+def holding_torque(rows: Rows, period: float) -> Vector:
     """Return the mean torque that held the arm, after it had settled [N m or N], shape (joints,).
 
     Args:
@@ -87,13 +87,13 @@ def gravity_check(
         *measures("gravity torque of the model", gravity, force, names),
         *measures("difference", difference, force, names, most=most),
     ]
-    check = judged("gravity", found, REMEDY)
+    check = check_from_measures("gravity", found, REMEDY)
     if check.verdict is Verdict.FAILED and (weight := _weight(held - gravity, gravity, most)):
         return replace(check, reason=f"{weight}: {check.reason}")
     return check
 
 
-def not_held(
+def diagnose_holding(
     session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, error: ArmFault
 ) -> Check:
     """Find out why a fault ended the holding of an arm.

@@ -16,7 +16,16 @@ from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.last_position import LOOK_AT_IT, LastPosition, turned
-from ident_service.motion.ticket import Check, Verdict, failed, joint_units, judged, measure, measures, skipped
+from ident_service.motion.ticket import (
+    Check,
+    Verdict,
+    check_from_measures,
+    failed,
+    joint_units,
+    measure,
+    measures,
+    skipped,
+)
 
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
 LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)
@@ -34,7 +43,7 @@ RATE_REMEDY = (
 
 
 @dataclass(frozen=True)
-class Looked:
+class IdleRecording:
     """Hold cycles recorded without torque.
 
     Attributes:
@@ -63,7 +72,9 @@ class Looked:
         return enough and bool(np.isfinite(self.position).all())
 
 
-def look(arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None) -> Looked:
+def record_idle(
+    arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = lambda sample: None
+) -> IdleRecording:
     """Record cycles of an open arm without torque.
 
     Args:
@@ -81,11 +92,15 @@ def look(arm: Arm, cycles: int, period: float, work: Callable[[Sample], None] = 
         woken.append(arm.clock.now_ns())
         samples.append(sample)
         work(sample)
-    return Looked(tuple(samples), np.array(woken, dtype=float), period)
+    return IdleRecording(tuple(samples), np.array(woken, dtype=float), period)
 
 
 def identities_check(
-    described: ArmDescription, model: ArmModel, limits: MotionLimits, expected: Sequence[str] | None, looked: Looked
+    described: ArmDescription,
+    model: ArmModel,
+    limits: MotionLimits,
+    expected: Sequence[str] | None,
+    looked: IdleRecording,
 ) -> Check:
     """Check that every axis answers, and is the drive that the description means.
 
@@ -149,7 +164,7 @@ def identities_check(
     ]
     # An infinite limit is no finite number, but clips nothing.
     found = [one for one in found if not (one.what.startswith("torque limit") and one.value is None)]
-    return judged(
+    return check_from_measures(
         code,
         found,
         "Check power, cables and bus termination of the axes that do not answer; bring limits and rate of driver and "
@@ -157,7 +172,9 @@ def identities_check(
     )
 
 
-def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None) -> Check:
+def at_rest_check(
+    looked: IdleRecording, model: ArmModel, limits: MotionLimits, closed: LastPosition | None = None
+) -> Check:
     """Check that the arm stands still without torque, inside its limits, and no motor whole turns elsewhere.
 
     Args:
@@ -181,12 +198,12 @@ def at_rest_check(looked: Looked, model: ArmModel, limits: MotionLimits, closed:
         found += measures("moved since it was closed last", position[-1] - closed.position, angle, names)
         if words := turned(closed, position[-1], model.config):
             return failed(code, words, LOOK_AT_IT, found)
-    return judged(
+    return check_from_measures(
         code, found, "Let the arm come to rest on its support, inside its position limits, and keep hands off."
     )
 
 
-def rate_check(looked: Looked, lock_step: bool) -> Check:
+def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
     """Check that this machine keeps the rate: median period, and lateness of cycles.
 
     Args:
@@ -206,7 +223,7 @@ def rate_check(looked: Looked, lock_step: bool) -> Check:
         measure("worst lateness", float(late.max()) * 1e3, "ms", most=LONGEST_GAP * period * 1e3),
         measure("late cycles", float((late > LATE * period).mean()), "", most=LATE_SHARE),
     ]  # fmt: skip
-    return judged(
+    return check_from_measures(
         code,
         found,
         RATE_REMEDY,
@@ -233,11 +250,11 @@ def loop_rate_check(stamps_ns: Vector, period: float, lock_step: bool, before: C
         measure(f"worst lateness, {seconds}", float(late.max()) * 1e3, "ms", most=LONGEST_GAP * period * 1e3),
         measure(f"late cycles, {seconds}", float((late > LATE * period).mean()), "", most=LATE_SHARE),
     ]
-    return judged(before.code, found, RATE_REMEDY)
+    return check_from_measures(before.code, found, RATE_REMEDY)
 
 
 def noise_check(
-    looked: Looked, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass: Vector
+    looked: IdleRecording, described: ArmDescription, model: ArmModel, limits: MotionLimits, mass: Vector
 ) -> Check:
     """Check the position noise of an arm at rest, and what filter and gains make of it.
 
@@ -279,7 +296,7 @@ def noise_check(
             most=TORQUE_NOISE * limits.torque,
         ),
     ]  # fmt: skip
-    return judged(
+    return check_from_measures(
         "noise",
         found,
         "Check shielding and grounding of the encoder, keep the arm's surroundings still, or lower "

@@ -23,10 +23,10 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.pinocchio_models import InverseDynamics
-from ident_service.motion.clearance import admitting, reachable
+from ident_service.motion.clearance import recoverable_limits, relaxed_limits
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.last_position import LastPosition
-from ident_service.motion.run import attended
+from ident_service.motion.run import keep_host_alive
 from ident_service.motion.ticket import (
     ABOUT_THE_MOTION,
     CODES,
@@ -41,26 +41,26 @@ from ident_service.motion.ticket import (
 )
 from ident_service.motion.trajectory import hold, rest
 from ident_service.preflight import gravity as weight
-from ident_service.preflight.delay import delay_of
+from ident_service.preflight.delay import hidden_delay
 from ident_service.preflight.direction import (
     DWELL,
-    Stroke,
-    answer,
+    TestMotion,
     direction_check,
-    expected_way,
+    expected_displacement,
     follow_stroke,
+    judge_response,
+    moved_against_torque,
     sign_failure,
     strokes,
-    went_against,
 )
 from ident_service.preflight.passive_checks import (
-    Looked,
+    IdleRecording,
     at_rest_check,
     identities_check,
-    look,
     loop_rate_check,
     noise_check,
     rate_check,
+    record_idle,
     unreachable,
 )
 from ident_service.preflight.session import Rows, Session, remedy_of, trace_of
@@ -73,7 +73,7 @@ from ident_service.preflight.static_checks import (
     way_home_check,
     ways_check,
 )
-from ident_service.preflight.watchdog import CODE, Confirm, Consent, consent, watchdog_check
+from ident_service.preflight.watchdog import CODE, Confirm, Consent, confirm_watchdog_test, watchdog_check
 
 LOOK = 1.0  # s
 RESTS = 3.0  # s that an arm may take to come to rest when its drives have stopped
@@ -208,20 +208,20 @@ class _Preflight:
         period = 1.0 / self.described.rate
         first = self.arm.exchange(None)
         cycles = max(_LEAST_CYCLES, round(self.look_seconds / period))
-        looked = look(self.arm, cycles, period, self._load(first, limits, period))
+        looked = record_idle(self.arm, cycles, period, self._load(first, limits, period))
         # Drives would take us for dead, above all while a person thinks.
-        with attended(self.arm):
+        with keep_host_alive(self.arm):
             agreed = self._agreed(looked, limits)
         if agreed is None:
             return
         # A person may have taken minutes to answer, and may have moved the arm meanwhile.
-        again = look(self.arm, _LOOK_AGAIN, period)
+        again = record_idle(self.arm, _LOOK_AGAIN, period)
         if (still := at_rest_check(again, self.model, self._bounds(limits))).verdict is not Verdict.PASSED:
             self._passed(still)
             return
         home = again.samples[-1].position
-        with attended(self.arm):
-            limits = limits if self.excitation is not None else admitting(home, limits)
+        with keep_host_alive(self.arm):
+            limits = limits if self.excitation is not None else relaxed_limits(home, limits)
             friction = _felt_friction(self.model, limits)
             session = Session(self.arm, self.model, limits, self.described, home, friction)
             planned = self._planned(session)
@@ -229,9 +229,9 @@ class _Preflight:
 
     def _bounds(self, limits: MotionLimits) -> MotionLimits:
         """Return where the run may begin: inside the limits, or for a way home as far outside as `reachable` allows."""
-        return limits if self.excitation is not None else reachable(limits)
+        return limits if self.excitation is not None else recoverable_limits(limits)
 
-    def _agreed(self, looked: Looked, limits: MotionLimits) -> Consent | None:
+    def _agreed(self, looked: IdleRecording, limits: MotionLimits) -> Consent | None:
         """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
         if self.described is None or not self._passed(
             identities_check(self.described, self.model, limits, self.identities, looked)
@@ -244,7 +244,7 @@ class _Preflight:
             self.away = away_from_home(self.model, limits, home)
         if self.excitation is None:
             self._passed(way_home_check(self.model, limits, home))
-            limits = admitting(home, limits)
+            limits = relaxed_limits(home, limits)
         elif self.checks["motion_fits"].verdict is Verdict.PASSED:
             self._passed(ways_check(self.model, limits, self.excitation, home), of_place=True)
         self._passed(rate_check(looked, self.arm.clock.lock_step))
@@ -256,23 +256,25 @@ class _Preflight:
         if (impossible := weight.holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible, of_place=True)
             return None
-        agreed = consent(self.model, looked.samples[-1], self.confirm)
+        agreed = confirm_watchdog_test(self.model, looked.samples[-1], self.confirm)
         if agreed.check is not None:
             self._passed(agreed.check)
         return agreed
 
-    def _planned(self, session: Session) -> list[Stroke]:
+    def _planned(self, session: Session) -> list[TestMotion]:
         """Plan a small test motion of every joint; none, and a failed check, where a joint has no room."""
         try:
             # Of a joint that stands outside its limits none leads farther out.
-            room = admitting(session.home, motion_limits(self.model.config), 0.0)
+            room = relaxed_limits(session.home, motion_limits(self.model.config), 0.0)
             return strokes(session, self.model, room)
         except (ModelError, MotionRefused) as error:
             remedy = "Move the arm by hand to where every joint has room."
             self._passed(failed("direction", str(error), remedy), of_place=True)
             return []
 
-    def _touched(self, session: Session, planned: Sequence[Stroke], gravity: _Gravity, *, try_watchdog: bool) -> None:
+    def _touched(
+        self, session: Session, planned: Sequence[TestMotion], gravity: _Gravity, *, try_watchdog: bool
+    ) -> None:
         """Hold the arm, move it a little, and fall silent; judge the findings after torque is off."""
         held: Rows = ()
         moved: list[tuple[Rows, Rows]] = []
@@ -280,7 +282,7 @@ class _Preflight:
         try:
             session.energise()
             held = session.follow(hold(session.home), weight.SETTLE + max(weight.HOLD, self.rate_seconds))
-            if planned and gravity.carried_by(weight.held_torque(held, session.period)):
+            if planned and gravity.carried_by(weight.holding_torque(held, session.period)):
                 moved += (follow_stroke(session, one) for one in planned)
                 session.follow(hold(session.home), weight.SETTLE)
                 if try_watchdog:
@@ -294,7 +296,7 @@ class _Preflight:
                 raise
             self._faulted(session, gravity, error)
             raise _Ended from error
-        with attended(self.arm):
+        with keep_host_alive(self.arm):
             self._judged(session, gravity, held, planned, moved)
         if silent is not None and silent.verdict is Verdict.PASSED:
             silent = self._silent_in_motion(silent)
@@ -309,19 +311,19 @@ class _Preflight:
             limits, described = motion_limits(self.model.config), self.arm.describe()
             period = 1.0 / described.rate
             for _ in range(max(1, round(RESTS / (_LOOK_AGAIN * period)))):
-                looked = look(self.arm, _LOOK_AGAIN, period)
-                if at_rest_check(looked, self.model, reachable(limits)).verdict is Verdict.PASSED:
+                looked = record_idle(self.arm, _LOOK_AGAIN, period)
+                if at_rest_check(looked, self.model, recoverable_limits(limits)).verdict is Verdict.PASSED:
                     break
             else:
                 return failed(CODE, "the arm does not come to rest after its drives stopped", REST_REMEDY)
             home = looked.samples[-1].position
             if any(AxisStatus(word) & AxisStatus.FAULT for word in looked.samples[-1].status):
                 self.arm.reset()  # the host's own silence was the fault
-            with attended(self.arm):
-                limits = admitting(home, limits)
+            with keep_host_alive(self.arm):
+                limits = relaxed_limits(home, limits)
                 friction = _felt_friction(self.model, limits)
                 session = Session(self.arm, self.model, limits, described, home, friction)
-                room = admitting(home, motion_limits(self.model.config), 0.0)
+                room = relaxed_limits(home, motion_limits(self.model.config), 0.0)
                 stroke = strokes(session, self.model, room, only=0)[0]
             session.energise()
             session.follow(hold(home), weight.SETTLE)
@@ -338,7 +340,7 @@ class _Preflight:
         session: Session,
         gravity: _Gravity,
         held: Rows,
-        planned: Sequence[Stroke],
+        planned: Sequence[TestMotion],
         moved: Sequence[tuple[Rows, Rows]],
     ) -> None:
         if held:
@@ -347,16 +349,16 @@ class _Preflight:
             rate = loop_rate_check(stamps, session.period, self.arm.clock.lock_step, before)
             if rate is not before:
                 self._passed(rate)
-            torque = weight.held_torque(held, session.period)
+            torque = weight.holding_torque(held, session.period)
             self._passed(weight.gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
         if planned and len(moved) == len(planned):
             answers = [
-                answer(trace_of(rows, session.period), stroke, session)
+                judge_response(trace_of(rows, session.period), stroke, session)
                 for (rows, _), stroke in zip(moved, planned, strict=True)
             ]
             traces = [trace_of(shaken, session.period) for _, shaken in moved]
             delays = [
-                delay_of(trace, expected_way(trace, session), stroke.joint)
+                hidden_delay(trace, expected_displacement(trace, session), stroke.joint)
                 for trace, stroke in zip(traces, planned, strict=True)
             ]
             self._passed(direction_check(answers, self.model, session, [one for one in delays if one]))
@@ -379,7 +381,7 @@ class _Preflight:
     def _faulted(self, session: Session, gravity: _Gravity, error: ArmFault) -> None:
         """Find out what ended the loop: what the fault names, a joint that went the wrong way, or another cause."""
         if "gravity" not in self.checks:
-            self._passed(weight.not_held(session, self.model, gravity.limits, gravity.friction, error))
+            self._passed(weight.diagnose_holding(session, self.model, gravity.limits, gravity.friction, error))
             return
         if (remedy := remedy_of(error)) is not None:
             self._passed(failed("direction", str(error), remedy))
@@ -387,7 +389,7 @@ class _Preflight:
         trace = session.trace()
         astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
         name = self.model.chain.names[astray]
-        if went_against(trace, astray, session):
+        if moved_against_torque(trace, astray, session):
             self._passed(sign_failure([astray], self.model, str(error)))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."

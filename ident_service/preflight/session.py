@@ -28,7 +28,7 @@ from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Elapsed
-from ident_service.motion.safety_monitor import Guard, Reaction
+from ident_service.motion.safety_monitor import Reaction, SafetyMonitor
 from ident_service.motion.trajectory import Reference, Setpoint
 from ident_service.preflight.stability import INERTIA, known_drives
 
@@ -194,7 +194,7 @@ class Session:
             following_error=np.minimum(limits.following_error, FARTHEST),
             velocity=np.minimum(limits.velocity, FASTEST),
         )
-        self._guard = Guard(
+        self._guard = SafetyMonitor(
             model.chain.names, narrow, period, home, revolute=model.chain.revolute, max_age=described.lost_cycles
         )
         self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)

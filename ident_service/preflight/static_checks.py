@@ -8,7 +8,7 @@ from drivers.canopen.bus_load import budget
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import IdentError, ModelError, MotionRefused
-from ident_service.excitation.limit_proof import objections, proof_of
+from ident_service.excitation.limit_proof import proof_of, violations
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
@@ -16,10 +16,19 @@ from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
 from ident_service.motion.clearance import stop_clearance, way_clearance
 from ident_service.motion.run import unhurried
-from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.stop_trajectory import require_stops_within_limits
-from ident_service.motion.ticket import Check, Measure, Verdict, failed, joint_units, judged, measure, measures
-from ident_service.motion.trajectory import PathReference, rest, way
+from ident_service.motion.ticket import (
+    Check,
+    Measure,
+    Verdict,
+    check_from_measures,
+    failed,
+    joint_units,
+    measure,
+    measures,
+)
+from ident_service.motion.trajectory import PathReference, plan_trajectory, rest
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
 
 # What drives may take to notice that the host is gone where joints can fall: what falls freely has sunk 5 cm after it
@@ -83,7 +92,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
     code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
     try:
         proof = proof_of(excitation.path, model, limits, CollisionModel(model))
-        found = objections(proof, model, limits)
+        found = violations(proof, model, limits)
         nearest = stop_clearance(excitation.path, limits, model)
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), remedy)
@@ -105,7 +114,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         taken.append(measure("clearance of stops", nearest.distance, "m", least=0.0))
         if nearest.distance <= 0.0:
             found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
-    return failed(code, "; ".join(found), remedy, taken) if found else judged(code, taken, remedy)
+    return failed(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
 
 
 @unhurried()
@@ -128,7 +137,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
     ]
     if report.coupled_radius is not None:
         found.append(measure("largest spectral radius, all joints", report.coupled_radius, "", most=float(most[0])))
-    return judged(
+    return check_from_measures(
         "stability",
         found,
         f"Lower kp and kd, raise control.velocity_cutoff or control.rate, or give the prior its drive inertia; inertia "
@@ -157,7 +166,7 @@ def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> C
     """Check that the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
     code = "ways_clear"
     try:
-        ((_, leg),) = GoTo(Destination.HOME).legs(model, position, limits)
+        ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), "Move the arm by hand to where the straight way home is free.")
     return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
@@ -180,8 +189,8 @@ def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, po
         collision = CollisionModel(model)
         ends = (motion.at(0.0), motion.at(motion.duration))
         for what, leg in (
-            ("the way to the motion", way(rest(position), ends[0], limits)),
-            ("the way back", way(ends[1], rest(position), limits)),
+            ("the way to the motion", plan_trajectory(rest(position), ends[0], limits)),
+            ("the way back", plan_trajectory(ends[1], rest(position), limits)),
         ):
             found.append(measure(f"{what}, length", leg.duration, "s"))
             if collision.pairs:
@@ -189,4 +198,4 @@ def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, po
                 found.append(measure(f"{what}, clearance", clearance.lower_bound, "m", least=least))
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found)
-    return judged(code, found, "Move the arm by hand to where motions begin (home), then check again.")
+    return check_from_measures(code, found, "Move the arm by hand to where motions begin (home), then check again.")

@@ -16,7 +16,7 @@ from drivers.arm import Arm, Flags, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisStatus
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.ticket import Check, Verdict, failed, judged, measure, skipped
+from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure, skipped
 from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.session import Session
 from ident_service.preflight.static_checks import LONGEST_SILENCE
@@ -55,7 +55,7 @@ class Consent:
     check: Check | None
 
 
-def consent(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
+def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> Consent:
     """Ask a person whether the drives' watchdog may be tried, before anything is energised.
 
     Args:
@@ -169,7 +169,7 @@ def watchdog_check(
     if moving is not None and travel is not None:
         unit = "rad" if model.chain.revolute[moving] else "m"
         found.append(measure("in motion, way until it rests", travel, unit, joint=model.chain.names[moving]))
-    return failed(CODE, "; ".join(strange), REMEDY, found) if strange else judged(CODE, found, REMEDY)
+    return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
 
 
 def _most(dog: Watchdog, period: float, told: float) -> float:

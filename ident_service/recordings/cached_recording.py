@@ -38,7 +38,7 @@ def memory_of(recording: Recording) -> Memory | None:
     return found if isinstance(found, Memory) else None
 
 
-class KeptRecording:
+class CachedRecording:
     """Cache another recording behind the same protocol; one larger than a bound is read from its file every time."""
 
     def __init__(self, whole: Recording, max_bytes: int = MAX_BYTES) -> None:

@@ -44,7 +44,7 @@ class Samples:
     reference: Matrix
 
 
-class RecordingTail:
+class RecordingFollower:
     """Read a recording as it grows.
 
     Attributes:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import UsageError
 from ident_service.recordings.recording import Block, Matrix, Recording, cut, join
-from ident_service.recordings.resampling import Grid, Segment, Timing, grid, trimmed
+from ident_service.recordings.resampling import ArrivalTest, Grid, Segment, grid, trimmed
 
 Array = NDArray[np.float64]
 
@@ -200,7 +200,7 @@ class _Joints:
         self._steps = 0
         self._at_limit = np.zeros(joints)
         self._still, self._pairs = np.zeros(joints), 0
-        self._timing = Timing(stamps)
+        self._timing = ArrivalTest(stamps)
         self._plateaus = [(_Plateau(), _Plateau()) for _ in names]
 
     def add(self, block: Block) -> None:

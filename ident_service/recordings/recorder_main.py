@@ -73,7 +73,7 @@ def message_of(error: Exception) -> str:
     return str(error) if isinstance(error, IdentError) else f"recording failed: {error or type(error).__name__}"
 
 
-class Drain:
+class RingConsumer:
     """Write the records of an attached ring reader with an open recording writer, until the end."""
 
     def __init__(self, reader: RingReader, writer: RecordingWriter, channel: int, work: int, room: int | None) -> None:
@@ -217,7 +217,9 @@ def serve(channel: socket.socket, ring: int, work: int, room: int) -> None:
                 tell({"error": message_of(error)})
                 return
             tell({"ready": True})
-            tell(asdict(Drain(reader, writer, channel.fileno(), work, room if asked["lock_step"] else None).run()))
+            tell(
+                asdict(RingConsumer(reader, writer, channel.fileno(), work, room if asked["lock_step"] else None).run())
+            )
 
 
 def main() -> None:

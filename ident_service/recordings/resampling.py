@@ -304,7 +304,7 @@ Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Piece:
+class UniformRun:
     """Hold consecutive samples of a segment, as far apart as `Grid.period_s`.
 
     Attributes:
@@ -325,7 +325,7 @@ def uniform(
     *,
     shortest_s: float = 0.0,
     samples: int = BLOCK_SAMPLES,
-) -> Iterator[Piece]:
+) -> Iterator[UniformRun]:
     """Read a recording as uniform samples, segment after segment, in constant memory.
 
     A regular recording passes through bit for bit, cut at its gaps; so do the values of one whose stamps are of
@@ -361,7 +361,7 @@ def uniform(
             blocks = _evenly(blocks, stamps, segment)
         if stamps.resampled:
             blocks = _resampled(blocks, stamps, segment, recording.torque_held)
-        yield from _marked(blocks)
+        yield from _with_ends(blocks)
 
 
 def _parts(blocks: Iterable[Block], segments: tuple[Segment, ...]) -> Iterator[tuple[Segment, Block]]:
@@ -378,16 +378,16 @@ def _parts(blocks: Iterable[Block], segments: tuple[Segment, ...]) -> Iterator[t
                 index += 1
 
 
-def _marked(blocks: Iterable[Block]) -> Iterator[Piece]:
+def _with_ends(blocks: Iterable[Block]) -> Iterator[UniformRun]:
     """Yield one segment's blocks as pieces, each held back until it is known whether it is the last one."""
     start, waiting = True, None
     for block in blocks:
         if waiting is not None:
-            yield Piece(waiting, start, end=False)
+            yield UniformRun(waiting, start, end=False)
             start = False
         waiting = block
     if waiting is not None:
-        yield Piece(waiting, start, end=True)
+        yield UniformRun(waiting, start, end=True)
 
 
 def _evenly(blocks: Iterable[Block], stamps: Grid, segment: Segment) -> Iterator[Block]:
@@ -488,7 +488,7 @@ _LEAST: Final = 10  # irregular steps
 _CLEAR: Final = 4.0  # ratio of the squared errors below which it is not decided
 
 
-class Timing:
+class ArrivalTest:
     """Compare both predictions of the motion over a recording's blocks, one after the other."""
 
     def __init__(self, stamps: Grid) -> None:

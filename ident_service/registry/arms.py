@@ -22,7 +22,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.yaml_source import shipped_arms
 from ident_service.errors import AlreadyThere, ConfigError, Problem, UnknownId, UsageError
 from ident_service.registry.database import Database, Row, note
-from ident_service.results.manifest import appearing_folder
+from ident_service.results.manifest import atomic_folder
 
 DESCRIPTIONS: Final = "descriptions"
 ARM_FILE: Final = "arm.yaml"
@@ -136,7 +136,7 @@ def add_arm(
         with db.transaction():  # so that deleting or adding the same arm happens before or after
             _require_free(db, config, replace=replace)
             if not folder.exists():
-                with appearing_folder(folder) as built:
+                with atomic_folder(folder) as built:
                     for part in path.parent.iterdir():
                         shutil.copyfile(part, built / part.name)
             db.write(

@@ -586,7 +586,7 @@ def _enter(db: Database, line: _Line) -> None:
     db.write("INSERT INTO audit (at, who, what, about, detail) VALUES (?, ?, ?, ?, ?)", *line)
 
 
-def trail(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
+def audit_log(db: Database, *, before: int | None = None, most: int = 100) -> list[Row]:
     """Return lines of the audit trail, the newest first, from the one before the id `before`."""
     rows = db.rows(
         "SELECT * FROM audit WHERE id < ? ORDER BY id DESC LIMIT ?", 2**62 if before is None else before, most

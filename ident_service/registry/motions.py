@@ -12,7 +12,7 @@ from typing import Final
 from ident_service.errors import UnknownId, UsageError
 from ident_service.excitation.motion_file import excitation_from_json, read_excitation
 from ident_service.registry.database import Database, Row, note
-from ident_service.results.manifest import appearing_folder, file_sha256, write_atomically
+from ident_service.results.manifest import atomic_folder, file_sha256, write_atomically
 
 MOTIONS: Final = "motions"
 MOTION_FILE: Final = "motion.json"
@@ -55,7 +55,7 @@ def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: 
     if found != joints:
         raise UsageError(f"a motion of {found} joints, but {arm} has {joints}; upload one that was designed for it")
     motion = new_id(arm)
-    with appearing_folder(state / MOTIONS / motion) as folder:
+    with atomic_folder(state / MOTIONS / motion) as folder:
         write_atomically(folder / MOTION_FILE, text)
     with db.transaction():
         index_motion(db, state, motion, arm, by)

@@ -20,7 +20,7 @@ from ident_service.registry.database import Database, Row
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
-TAKEN_AWAY: Final = frozenset({"export", "figures", "payload", "correct"})
+DOWNLOADABLE_KINDS: Final = frozenset({"export", "figures", "payload", "correct"})
 """Kinds of jobs that make files for download, in a folder of their own below `EXPORTS`."""
 UPLOAD, COLUMNS = "upload.json", "columns.yaml"
 """Files of a run that is an uploaded recording: its announcement, and the layout of its columns."""
@@ -230,7 +230,7 @@ def known_export(db: Database, export: str) -> Row:
     Raises:
         UnknownId: there is none, or it made nothing.
     """
-    kinds, states = sorted(TAKEN_AWAY), _ENDED
+    kinds, states = sorted(DOWNLOADABLE_KINDS), _ENDED
     row = db.row(
         f"SELECT id, kind, arm, run, created_by, ended FROM jobs WHERE run = ? AND kind IN ({_marks(kinds)}) "  # noqa: S608
         f"AND state IN ({_marks(states)})",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from ident_service.errors import UsageError
-from ident_service.motion.fault_store import CONTROLS, FaultFile
+from ident_service.motion.fault_store import CONTROLS, FaultStore
 
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
@@ -155,9 +155,9 @@ def ticket_path(state: Path, arm: str) -> Path:
     return arm_folder(state, arm) / "ticket.json"
 
 
-def fault_file(state: Path, arm: str) -> FaultFile:
+def fault_file(state: Path, arm: str) -> FaultStore:
     """Return the store of the arm's faults that no person has acknowledged (`motion/fault_store.py`)."""
-    return FaultFile(arm_folder(state, arm))
+    return FaultStore(arm_folder(state, arm))
 
 
 def new_run_folder(state: Path, arm: str, kind: str = "runs") -> Path:

@@ -44,7 +44,7 @@ def require_place(folder: Path) -> None:
 
 
 @contextmanager
-def appearing_folder(folder: Path) -> Iterator[Path]:
+def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a place to build a folder's content in, which gets its name when the block ends without an error.
 
     A folder that exists keeps its other files; files of the same name are replaced one by one.

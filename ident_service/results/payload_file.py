@@ -228,7 +228,7 @@ def loaded_parameters(
         beta = base.K @ delta
     proof = certify(beta, base, conditions, delta)
     covariance = loaded_covariance(arm, payload)
-    deviations = np.sqrt(np.diag(covariance)) * _care(content)
+    deviations = np.sqrt(np.diag(covariance)) * _deviation_factors(content)
     as_zero = negligible(recorded.everything)
     document = {key: deepcopy(value) for key, value in content.items() if key not in _STALE}
     table = document["base_parameters"]
@@ -282,7 +282,7 @@ def _moved(content: Mapping[str, Any], arm: KnownArm, payload: Payload) -> Array
     return delta
 
 
-def _care(content: Mapping[str, Any]) -> Array:
+def _deviation_factors(content: Mapping[str, Any]) -> Array:
     """Return the factors by which the arm's standard deviations exceed those of its covariance, shape (base,)."""
     table = content["base_parameters"]
     told = np.array([np.inf if one is None else one for one in table["standard_deviations"]], float)

@@ -17,7 +17,7 @@ from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
 from ident_service.results.evidence.gathering import gather_evidence
-from ident_service.results.manifest import MANIFEST, appearing_folder, hashes, write_atomically, write_manifest
+from ident_service.results.manifest import MANIFEST, atomic_folder, hashes, write_atomically, write_manifest
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.plots import Canvas
 from ident_service.results.report.figures import figures
@@ -152,7 +152,7 @@ def write_figures(run: Path, out: Path, form: Literal["svg", "png"]) -> list[str
     if out.exists() and out.samefile(run):
         raise UsageError(f"{out}: holds the results; give another folder")
     drawn = figures(read_evidence_of(results), results.parameters).all()
-    with appearing_folder(out) as staging:
+    with atomic_folder(out) as staging:
         for figure in drawn:
             (staging / f"{figure.slug}.{form}").write_bytes(rendered(figure.svg()))
     return [f"{figure.slug}.{form}" for figure in drawn]

@@ -8,7 +8,7 @@ import sys
 import time
 
 from ident_service.errors import DriverError
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -21,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with Wire(options.name, options.bitrate, options.data_bitrate, fd=options.fd) as wire:
+        with CanBusServer(options.name, options.bitrate, options.data_bitrate, fd=options.fd) as wire:
             print("ready", flush=True)
             while True:
                 wire.poll(time.monotonic_ns() + 1_000_000_000)

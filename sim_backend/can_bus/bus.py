@@ -17,7 +17,7 @@ from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 from sim_backend.can_bus.host import WireThread
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.can_bus.link import Connection
 from sim_backend.can_bus.packets import Hello
 
@@ -60,7 +60,7 @@ class IdentWireBus(can.BusABC):
         try:
             if host:
                 rates = (bitrate, data_bitrate if fd else None) if pace else (0, None)
-                thread = WireThread(Wire(channel, *rates, fd=fd))
+                thread = WireThread(CanBusServer(channel, *rates, fd=fd))
                 self._thread = thread.__enter__()
             self._connection = Connection(channel, Hello("python-can", own=receive_own_messages))
         except DriverError as error:

@@ -16,8 +16,8 @@ from typing import Self
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame, check_sendable
 from drivers.clock import RealClock
-from sim_backend.can_bus.hub import Wire
-from sim_backend.can_bus.medium import Port
+from sim_backend.can_bus.hub import CanBusServer
+from sim_backend.can_bus.medium import BusEndpoint
 
 _LOOK_NS = 1_000_000_000
 
@@ -28,7 +28,7 @@ class LocalPort:
     One thread hosts the wire and uses its local ports; there may be several.
     """
 
-    def __init__(self, wire: Wire, label: str) -> None:
+    def __init__(self, wire: CanBusServer, label: str) -> None:
         """Add a port to an entered wire.
 
         Args:
@@ -36,7 +36,7 @@ class LocalPort:
             label: of the port, for people.
         """
         self.clock = RealClock()
-        self.port = Port(label, fd=wire.fd)
+        self.port = BusEndpoint(label, fd=wire.fd)
         self._wire = wire
         wire.medium.add(self.port)
         self._waiting: list[Frame] = []
@@ -107,7 +107,7 @@ class LocalPort:
 class WireThread:
     """Host a wire in a thread; a context manager."""
 
-    def __init__(self, wire: Wire) -> None:
+    def __init__(self, wire: CanBusServer) -> None:
         """Prepare to host a wire that is not entered yet."""
         self.wire = wire
         self._ended = False

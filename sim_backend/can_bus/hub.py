@@ -23,7 +23,7 @@ from drivers.can.can_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, Frame, pa
 from drivers.canopen.bus_load import exact
 from ident_service.errors import DriverError
 from sim_backend.can_bus import link, packets
-from sim_backend.can_bus.medium import Medium, Port, overflow
+from sim_backend.can_bus.medium import BusEndpoint, Medium, overflow
 
 MOST_ENDS: Final = 32
 LATEST_NS: Final = 500_000_000  # that a wire makes up for when its host was late
@@ -37,11 +37,11 @@ class _End:
 
     def __init__(self, sock: socket.socket) -> None:
         self.socket, self.dropped = sock, False
-        self.port: Port | None = None
+        self.port: BusEndpoint | None = None
         self.heard_ns = 0  # when its last frame came
 
 
-class Wire:
+class CanBusServer:
     """Emulate a CAN bus for the processes of one user; a context manager.
 
     Attributes:
@@ -211,7 +211,9 @@ class Wire:
         if not self._answer(end, packets.CROWDED if crowded else packets.ACCEPTED) or crowded:
             self._drop(end)
             return
-        end.port = Port(hello.label, link.peer_pid(end.socket), own=hello.own, filters=hello.filters, fd=hello.fd)
+        end.port = BusEndpoint(
+            hello.label, link.peer_pid(end.socket), own=hello.own, filters=hello.filters, fd=hello.fd
+        )
         self.medium.add(end.port)
 
     def _answer(self, end: _End, answer: int) -> bool:
@@ -223,7 +225,7 @@ class Wire:
             return False
         return True
 
-    def _deliver(self, end: _End, port: Port, now: int) -> None:
+    def _deliver(self, end: _End, port: BusEndpoint, now: int) -> None:
         frames = port.take()
         if end.dropped:
             frames.insert(0, (overflow(now), False))

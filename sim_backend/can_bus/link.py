@@ -23,10 +23,10 @@ from pathlib import Path
 
 from drivers.can.bus_state import BusError, BusOffWatch, kind_of
 from drivers.can.can_frame import (
-    HEARD,
     MAX_PACKET_BYTES,
     MAX_PACKET_FRAMES,
     MOST_AT_ONCE,
+    RECEIVE_FILTER,
     Frame,
     check_sendable,
     pack_frames,
@@ -165,7 +165,7 @@ def from_config(config: ArmConfig, bus_number: int) -> WireLink:
     if unknown := sorted(set(bus.options) - {"pace"}):
         raise DriverError(f"driver.buses.{bus_number}.options: ident_wire has only pace, found {', '.join(unknown)}")
     fd = bus.data_bitrate is not None
-    return WireLink(Connection(bus.channel, packets.Hello("driver", filters=HEARD, fd=fd)), fd=fd)
+    return WireLink(Connection(bus.channel, packets.Hello("driver", filters=RECEIVE_FILTER, fd=fd)), fd=fd)
 
 
 class Connection:

@@ -116,7 +116,7 @@ def priority(frame: Frame) -> tuple[int, int, int, int, int]:
     return frame.identifier, int(frame.remote), 0, 0, 0
 
 
-class Port:
+class BusEndpoint:
     """Represent one controller on the wire.
 
     Attributes:
@@ -201,11 +201,11 @@ class Medium:
             error_ns: how long an error frame does.
             fd: whether the wire itself carries CAN FD.
         """
-        self.ports: list[Port] = []
+        self.ports: list[BusEndpoint] = []
         self.sent = self.destroyed = self.collisions = 0
         self._duration_ns, self._error_ns, self._fd = duration_ns, error_ns, fd
-        self._to_destroy: dict[Port | None, int] = {}
-        self._current: tuple[Port, Frame, int] | None = None
+        self._to_destroy: dict[BusEndpoint | None, int] = {}
+        self._current: tuple[BusEndpoint, Frame, int] | None = None
         self._free_ns = 0
 
     @property
@@ -213,11 +213,11 @@ class Medium:
         """Return when the frame that is being sent ends, None while the wire is free."""
         return None if self._current is None else self._current[2]
 
-    def add(self, port: Port) -> None:
+    def add(self, port: BusEndpoint) -> None:
         """Add a port to the wire."""
         self.ports.append(port)
 
-    def remove(self, port: Port) -> None:
+    def remove(self, port: BusEndpoint) -> None:
         """Remove a port; the frame it was sending breaks off, and its queued frames are dropped."""
         if port in self.ports:
             self.ports.remove(port)
@@ -226,11 +226,11 @@ class Medium:
         port.pending.clear()
         self._to_destroy.pop(port, None)
 
-    def room(self, port: Port) -> int:
+    def room(self, port: BusEndpoint) -> int:
         """Return how many more frames a port may queue."""
         return QUEUE - len(port.pending)
 
-    def offer(self, port: Port, frame: Frame, now_ns: int) -> bool:
+    def offer(self, port: BusEndpoint, frame: Frame, now_ns: int) -> bool:
         """Queue a frame; False when the queue is full. A controller that is off the bus sends nothing, silently."""
         if port.counters.state == "off":
             return True
@@ -250,15 +250,15 @@ class Medium:
             self._current, self._free_ns = None, end
             self._finish(port, frame, end)
 
-    def destroy(self, count: int, port: Port | None = None) -> None:
+    def destroy(self, count: int, port: BusEndpoint | None = None) -> None:
         """Destroy the next `count` frames, of one port or of any, by an error; they are sent again."""
         self._to_destroy[port] = count
 
-    def set_counters(self, port: Port, sending: int, receiving: int, now_ns: int) -> None:
+    def set_counters(self, port: BusEndpoint, sending: int, receiving: int, now_ns: int) -> None:
         """Set a controller's error counters, with the change of state that follows; 256 sending is bus-off."""
         self._note(port, port.counters.set(sending, receiving, now_ns))
 
-    def restart(self, port: Port, now_ns: int) -> None:
+    def restart(self, port: BusEndpoint, now_ns: int) -> None:
         """Return a controller to the bus."""
         self._note(port, port.counters.restart(now_ns))
 
@@ -280,7 +280,7 @@ class Medium:
         self._current = (port, frame, end)
         return True
 
-    def _finish(self, sender: Port, frame: Frame, end: int) -> None:
+    def _finish(self, sender: BusEndpoint, frame: Frame, end: int) -> None:
         for key in (sender, None):
             if self._to_destroy.get(key, 0):
                 self._to_destroy[key] -= 1
@@ -300,7 +300,7 @@ class Medium:
             if port is not sender or port.own:
                 port.hear(heard, port is sender)
 
-    def _destroyed(self, sender: Port, frame: Frame, end: int) -> None:
+    def _destroyed(self, sender: BusEndpoint, frame: Frame, end: int) -> None:
         self.destroyed += 1
         self._free_ns = end + self._error_ns
         sender.pending.appendleft((end, frame))
@@ -309,7 +309,7 @@ class Medium:
             if port is not sender and port.counters.state != "off":
                 self._note(port, port.counters.receive_error(end))
 
-    def _note(self, port: Port, error: Frame | None) -> None:
+    def _note(self, port: BusEndpoint, error: Frame | None) -> None:
         if error is not None:
             if port.counters.state == "off":
                 port.pending.clear()

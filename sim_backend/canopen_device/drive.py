@@ -36,7 +36,7 @@ from sim_backend.canopen_device.nmt import Nmt, State
 from sim_backend.canopen_device.node import Node
 from sim_backend.canopen_device.objects import WRONG_STATE, WRONG_VALUE, Objects, SdoAbort, SdoServer
 from sim_backend.canopen_device.pdo import COMMUNICATION, MAPPING, RPDO_TIMEOUT, Pdos, check_write
-from sim_backend.canopen_device.personality import LIKE_NEW, Firmware, Personality
+from sim_backend.canopen_device.personality import LIKE_NEW, DriveProperties, Firmware
 from sim_backend.emulator.face import Traffic
 from sim_backend.emulator.motor import Motor
 
@@ -45,7 +45,7 @@ _PERIODS, _MILLISECONDS, _SYNC_PERIOD = 0x2F70, 0x2F75, 0x1006
 _SYNC, _TARGET = "sync", "target"
 
 
-class MakersWatchdogs:
+class VendorWatchdogs:
     """Emulate both watchdogs of one drive; each starts with the first event that it supervises."""
 
     def __init__(self, node: Node, emergency: Emergency, late: Callable[[], None], *, there: bool) -> None:
@@ -90,7 +90,7 @@ class TorqueLoop:
         follows: whether the target acts (bit 12).
     """
 
-    def __init__(self, objects: Objects, motor: Motor, personality: Personality) -> None:
+    def __init__(self, objects: Objects, motor: Motor, personality: DriveProperties) -> None:
         """Start with a loop that is not closed."""
         self._objects, self._motor, self._personality = objects, motor, personality
         self.limited = self.follows = False
@@ -346,7 +346,7 @@ class CanopenDrive:
     """
 
     def __init__(
-        self, eds: str, number: int, motor: Motor, own: dict[int, int] | None = None, like: Personality = LIKE_NEW
+        self, eds: str, number: int, motor: Motor, own: dict[int, int] | None = None, like: DriveProperties = LIKE_NEW
     ) -> None:
         """Create a drive without power.
 
@@ -373,7 +373,7 @@ class CanopenDrive:
         self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
         self._torque = TorqueLoop(self.objects, motor, self._personality)
         self._firmware = Firmware(node, self._personality, self._control)
-        self._makers = MakersWatchdogs(node, self.emergency, self._late, there=like.shipped)
+        self._makers = VendorWatchdogs(node, self.emergency, self._late, there=like.shipped)
         self._failure = 0
         self._warned = self._evaluated = False
         self._ears: set[int] = set()

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
-from ident_service.config.eds import Listed, data_sheet
+from ident_service.config.eds import DataSheetEntry, data_sheet
 from ident_service.errors import DriverError
 
 Value = int | bytes
@@ -181,7 +181,7 @@ def _read(text: str, node: int) -> tuple[Mapping[int, Entry], Mapping[int, int]]
     return {key: _entry(key, one, node) for key, one in sheet.entries.items() if key >> 8 >= _FIRST}, dummies
 
 
-def _entry(key: int, listed: Listed, node: int) -> Entry:
+def _entry(key: int, listed: DataSheetEntry, node: int) -> Entry:
     form = _FORMATS.get(listed.kind)
     low = high = None
     if form is None:

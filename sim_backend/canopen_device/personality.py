@@ -31,7 +31,7 @@ def _key(text: str) -> int:
 
 
 @dataclass(frozen=True)
-class Personality:
+class DriveProperties:
     """Describe the properties of one drive; the defaults are the shipped data sheet's.
 
     Attributes:
@@ -70,10 +70,10 @@ class Personality:
         return counts * self.scale * objects.number(self.rated >> 8, self.rated & 0xFF) * 1e-3
 
 
-LIKE_NEW = Personality()
+LIKE_NEW = DriveProperties()
 
 
-def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> Personality:
+def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = ()) -> DriveProperties:
     """Derive the properties of a drive from a maker's file, with the motor of a description.
 
     Args:
@@ -93,7 +93,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
     motor = {0x607500: round(1e3 * amperes), 0x607600: round(1e3 * drive.rated_torque)}
     if unit.rated is not None:
         motor[_key(unit.rated)] = round(drive.rated_torque / scale)
-    return Personality(
+    return DriveProperties(
         modes=tuple(path.mode for path in paths),
         target=_key(paths[0].target) if paths else 0x607100,
         limits=tuple(sorted(limits, key=str)),
@@ -116,7 +116,7 @@ def _unspecified(sheet: DataSheet, limits: list[int]) -> list[tuple[int, int]]:
 class Firmware:
     """Delay the effect of modes of operation and control words as a drive's firmware does."""
 
-    def __init__(self, node: Node, personality: Personality, control: Callable[[int], None]) -> None:
+    def __init__(self, node: Node, personality: DriveProperties, control: Callable[[int], None]) -> None:
         """Use the given node; `control` is called with each control word that takes effect."""
         self._node, self._personality, self._control = node, personality, control
 

@@ -21,11 +21,11 @@ from sim_backend.canopen_device.drive import CanopenDrive as Drive
 from sim_backend.canopen_device.personality import personality_of
 from sim_backend.emulator.body import Body, Gears
 from sim_backend.emulator.emulator import Emulator
-from sim_backend.emulator.faults import PuckFault, configured
+from sim_backend.emulator.faults import DriveFault, configured
 from sim_backend.emulator.motor import Motor, Power
 
 
-def build_emulator(config: ArmConfig, faults: Sequence[PuckFault] = ()) -> Emulator:
+def build_emulator(config: ArmConfig, faults: Sequence[DriveFault] = ()) -> Emulator:
     """Build the drives that a configuration describes, on an arm at its home position and at rest, without power.
 
     Args:

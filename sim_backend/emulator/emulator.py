@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Sequence
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 from sim_backend.emulator.body import Body
-from sim_backend.emulator.face import Face
-from sim_backend.emulator.faults import Injection, PuckFault, Sent
+from sim_backend.emulator.face import EmulatedDevice
+from sim_backend.emulator.faults import DriveFault, Injection, Sent
 from sim_backend.machine import Truth
 
 # An arm that moves is brought forward this often when nothing else happens [ns].
@@ -35,10 +35,10 @@ class Emulator:
     def __init__(
         self,
         body: Body,
-        faces: Sequence[Face],
+        faces: Sequence[EmulatedDevice],
         buses: Sequence[int],
         names: Sequence[str],
-        faults: Sequence[PuckFault] = (),
+        faults: Sequence[DriveFault] = (),
     ) -> None:
         """Assemble the emulator; nothing has power yet.
 
@@ -52,14 +52,14 @@ class Emulator:
         self.body, self.faces, self.names = body, tuple(faces), tuple(names)
         self.observer: Callable[[Truth], None] | None = None
         self._buses = tuple(buses)
-        self._on_bus: dict[int, list[tuple[int, Face]]] = {bus: [] for bus in self._buses}
+        self._on_bus: dict[int, list[tuple[int, EmulatedDevice]]] = {bus: [] for bus in self._buses}
         for drive, face in enumerate(self.faces):
             self._on_bus[self._buses[drive]].append((drive, face))
         self._injection = Injection(body, self.faces, self._buses)
         self._period_ns = round(body.plant.period * 1e9)
-        self._configured: tuple[PuckFault, ...] = tuple(faults)
-        self._to_begin: list[tuple[int, int | None, PuckFault]] = []
-        self._to_end: list[tuple[int, PuckFault]] = []
+        self._configured: tuple[DriveFault, ...] = tuple(faults)
+        self._to_begin: list[tuple[int, int | None, DriveFault]] = []
+        self._to_end: list[tuple[int, DriveFault]] = []
         self._synced: set[int] = set()
         self._now_ns = 0
         self._deadline: tuple[int | None] | None = None  # as computed last, while it holds
@@ -81,7 +81,7 @@ class Emulator:
         return tuple("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
 
     @property
-    def active(self) -> tuple[PuckFault, ...]:
+    def active(self) -> tuple[DriveFault, ...]:
         """Return the faults that act at present."""
         return tuple(self._injection.active)
 
@@ -174,7 +174,7 @@ class Emulator:
             self._now_ns = max(now_ns, self._now_ns)
             self._deadline = None
 
-    def inject(self, faults: Iterable[PuckFault], now_ns: int) -> None:
+    def inject(self, faults: Iterable[DriveFault], now_ns: int) -> None:
         """Schedule faults, counted from now on; they take effect with `tick`."""
         for fault in faults:
             if fault.drive is not None and not 0 <= fault.drive < len(self.faces):
@@ -183,7 +183,7 @@ class Emulator:
             self._to_begin.append((begin, end, fault))
         self._deadline = None
 
-    def add_configured(self, faults: Iterable[PuckFault]) -> None:
+    def add_configured(self, faults: Iterable[DriveFault]) -> None:
         """Schedule faults counted from the first SYNC, as those of the configuration."""
         self._configured += tuple(faults)
 

@@ -20,7 +20,7 @@ class Traffic(Enum):
     OTHER = "other"
 
 
-class Face(Protocol):
+class EmulatedDevice(Protocol):
     """Define one emulated motor controller; no call goes back in time, each returns the frames that follow in order."""
 
     motor: Motor

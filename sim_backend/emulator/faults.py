@@ -14,7 +14,7 @@ from drivers.can.can_frame import Frame
 from ident_service.config.simulation import FAULT_RULES, FaultRule, SimulatedFault
 from ident_service.errors import DriverError
 from sim_backend.emulator.body import Body
-from sim_backend.emulator.face import Face, Traffic
+from sim_backend.emulator.face import EmulatedDevice, Traffic
 from sim_backend.emulator.motor import Defects
 
 # Without a time of its own, a fault of one cycle lasts for one nominal period.
@@ -58,7 +58,7 @@ _LARGEST_CODE = 0xFFFF
 
 
 @dataclass(frozen=True)
-class PuckFault:
+class DriveFault:
     """Describe one fault to inject.
 
     Attributes:
@@ -90,7 +90,7 @@ class PuckFault:
         return begins, None if PUCK_FAULTS[self.kind].stays else begins + period_ns
 
 
-def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[PuckFault, ...]:
+def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[DriveFault, ...]:
     """Convert the faults of a configuration.
 
     Args:
@@ -108,11 +108,11 @@ def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: f
             raise DriverError(f"driver.emulation.faults: {kind}: {_NO_COUNTERPART[kind]}")
         at = fault.at if fault.at is not None else (fault.cycle or 0) * period
         drive = None if fault.joint is None else _joint(fault.joint, names)
-        found.append(PuckFault(kind, drive, at, fault.duration, fault.size or 0.0, fault.offset or (0.0, 0.0, 0.0)))
+        found.append(DriveFault(kind, drive, at, fault.duration, fault.size or 0.0, fault.offset or (0.0, 0.0, 0.0)))
     return tuple(found)
 
 
-def parse_fault(text: str, names: Sequence[str]) -> PuckFault:
+def parse_fault(text: str, names: Sequence[str]) -> DriveFault:
     """Parse a fault as people write it: `KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]`.
 
     Args:
@@ -126,7 +126,7 @@ def parse_fault(text: str, names: Sequence[str]) -> PuckFault:
     rule = PUCK_FAULTS.get(kind)
     if rule is None:
         raise DriverError(f"no fault is called {kind!r}; there are {', '.join(PUCK_FAULTS)}")
-    fault = PuckFault(kind)
+    fault = DriveFault(kind)
     given = set()
     for word in words:
         key, equals, value = word.partition("=")
@@ -142,7 +142,7 @@ def parse_fault(text: str, names: Sequence[str]) -> PuckFault:
             fault = replace(fault, offset=(parts[0], parts[1], parts[2]))
         else:
             number = _number(kind, key, value)
-            fault = PuckFault(
+            fault = DriveFault(
                 kind,
                 fault.drive,
                 number if key == "at" else fault.at,
@@ -160,7 +160,7 @@ def parse_fault(text: str, names: Sequence[str]) -> PuckFault:
     return fault
 
 
-def _check_range(fault: PuckFault) -> None:
+def _check_range(fault: DriveFault) -> None:
     if fault.at < 0.0 or (fault.duration is not None and fault.duration <= 0.0):
         raise DriverError(f"{fault.kind}: at must not be negative, and duration must be above 0")
     same = {kind.value for kind in FAULT_RULES}
@@ -220,7 +220,7 @@ class Injection:
         active: in the order in which they came.
     """
 
-    def __init__(self, body: Body, faces: Sequence[Face], buses: Sequence[int]) -> None:
+    def __init__(self, body: Body, faces: Sequence[EmulatedDevice], buses: Sequence[int]) -> None:
         """Start without faults.
 
         Args:
@@ -229,7 +229,7 @@ class Injection:
             buses: index of each one's bus.
         """
         self._body, self._faces, self._buses = body, faces, buses
-        self.active: list[PuckFault] = []
+        self.active: list[DriveFault] = []
         self._dead: frozenset[int] = frozenset()
 
     @property
@@ -241,12 +241,12 @@ class Injection:
         """Return whether a node neither receives nor sends anything."""
         return drive in self._dead
 
-    def begin(self, fault: PuckFault, now_ns: int) -> list[Sent]:
+    def begin(self, fault: DriveFault, now_ns: int) -> list[Sent]:
         """Begin a fault; returns the frames that the drives send because of it."""
         self.active.append(fault)
         return self._changed(fault, now_ns, begins=True)
 
-    def end(self, fault: PuckFault, now_ns: int) -> list[Sent]:
+    def end(self, fault: DriveFault, now_ns: int) -> list[Sent]:
         """End a fault; returns the frames that the drives send because of it."""
         self.active.remove(fault)
         return self._changed(fault, now_ns, begins=False)
@@ -285,7 +285,7 @@ class Injection:
                     sent.append(Sent(self._buses[drive], None, frame._replace(data=bytes(len(frame.data))), now_ns))
         return [Sent(self._buses[drive], drive, frame, now_ns + delay), *sent]
 
-    def _changed(self, fault: PuckFault, now_ns: int, *, begins: bool) -> list[Sent]:
+    def _changed(self, fault: DriveFault, now_ns: int, *, begins: bool) -> list[Sent]:
         drives = range(len(self._faces)) if fault.drive is None else range(fault.drive, fault.drive + 1)
         sent: list[Sent] = []
         match fault.kind:
@@ -309,7 +309,7 @@ class Injection:
             sent += self.on_the_way(drive, frames, now_ns)
         return sent
 
-    def _drive_changed(self, fault: PuckFault, drive: int, now_ns: int, *, begins: bool) -> list[Frame]:
+    def _drive_changed(self, fault: DriveFault, drive: int, now_ns: int, *, begins: bool) -> list[Frame]:
         """Apply the immediate effect of a fault, or of its end, to a drive."""
         face = self._faces[drive]
         match fault.kind, begins:

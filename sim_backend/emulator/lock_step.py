@@ -26,12 +26,12 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError
 from sim_backend.emulator.build import build_emulator
-from sim_backend.emulator.faults import PuckFault, Sent
+from sim_backend.emulator.faults import DriveFault, Sent
 
 _CLASSIC = 8  # bytes of a classic frame, at most
 
 
-class Wire:
+class LockStepBus:
     """Emulate one bus."""
 
     def __init__(self, bitrate: int, data_bitrate: int | None = None) -> None:
@@ -105,7 +105,7 @@ class LockStepArm:
         clock: all links'.
     """
 
-    def __init__(self, config: ArmConfig, faults: Sequence[PuckFault] = (), clock: VirtualClock | None = None) -> None:
+    def __init__(self, config: ArmConfig, faults: Sequence[DriveFault] = (), clock: VirtualClock | None = None) -> None:
         """Build the arm and power it up.
 
         Args:
@@ -122,7 +122,7 @@ class LockStepArm:
         self.emulator = build_emulator(config, faults)
         assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
         self.clock = VirtualClock() if clock is None else clock
-        self._wires = [Wire(bus.bitrate, bus.data_bitrate) for bus in driver.buses]
+        self._wires = [LockStepBus(bus.bitrate, bus.data_bitrate) for bus in driver.buses]
         self._heard: list[deque[Frame]] = [deque() for _ in driver.buses]
         self._open: set[int] = set()
         self._now_ns = self.clock.now_ns()
@@ -140,7 +140,7 @@ class LockStepArm:
         self._heard[bus].clear()
         return LockStepLink(self, bus)
 
-    def inject(self, *faults: PuckFault) -> None:
+    def inject(self, *faults: DriveFault) -> None:
         """Inject faults, counted from now on."""
         self._run(self.clock.now_ns())
         self.emulator.inject(faults, self._now_ns)
@@ -277,8 +277,8 @@ _standing: dict[int, LockStepArm] = {}
 
 
 @contextmanager
-def standing(
-    config: ArmConfig, faults: Sequence[PuckFault] = (), clock: VirtualClock | None = None
+def keep_arm(
+    config: ArmConfig, faults: Sequence[DriveFault] = (), clock: VirtualClock | None = None
 ) -> Iterator[LockStepArm]:
     """Keep an emulated arm alive before links to it are opened and after they are closed.
 

@@ -30,17 +30,17 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus, CanopenDriver
 from ident_service.errors import DriverError
 from sim_backend.can_bus.host import LocalPort
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.emulator.build import build_emulator
 from sim_backend.emulator.emulator import Emulator
-from sim_backend.emulator.faults import PuckFault, Sent, parse_fault
+from sim_backend.emulator.faults import DriveFault, Sent, parse_fault
 from sim_backend.emulator.lock_step import INTERFACE
 
 # Names that python-can has for interfaces of a driver.
 _NAMES = {"raw": "socketcan"}
 
 
-class Station:
+class PythonCanBuses:
     """Connect to the buses of one arm."""
 
     def __init__(self, buses: Sequence[CanBus]) -> None:
@@ -160,7 +160,7 @@ def _frame(message: can.Message) -> Frame:
 WIRE_INTERFACE = "ident_wire"
 
 
-class Wires:
+class HostedBuses:
     """Host the buses of one arm, all of them wires.
 
     Attributes:
@@ -177,13 +177,13 @@ class Wires:
             DriverError: a wire that another process runs, or that cannot be had; none stays then.
         """
         self.unsent = 0
-        self._wires: list[Wire] = []
+        self._wires: list[CanBusServer] = []
         self._ports: list[LocalPort] = []
         self._heard: deque[tuple[int, Frame]] = deque()
         try:
             for bus in buses:
                 bitrate = bus.bitrate if bus.options.get("pace", False) else 0
-                self._wires.append(Wire(bus.channel, bitrate, bus.data_bitrate).__enter__())
+                self._wires.append(CanBusServer(bus.channel, bitrate, bus.data_bitrate).__enter__())
                 self._ports.append(LocalPort(self._wires[-1], "drives"))
         except BaseException:
             self.close()
@@ -307,7 +307,7 @@ def emulate(
         raise DriverError(
             f"{config.name}: either all buses are {WIRE_INTERFACE} or none is, for one loop to serve them"
         )
-    station = Wires(driver.buses) if ours == {True} else Station(driver.buses)
+    station = HostedBuses(driver.buses) if ours == {True} else PythonCanBuses(driver.buses)
     try:
         return _Run(emulator, station, tell, commands).until(seconds, stop_requested)
     finally:
@@ -318,19 +318,19 @@ class _Run:
     def __init__(
         self,
         emulator: Emulator,
-        station: Station | Wires,
+        station: PythonCanBuses | HostedBuses,
         tell: Callable[[str], None],
         commands: Callable[[], str | None],
     ) -> None:
         self._emulator, self._station = emulator, station
-        self._stamps = isinstance(station, Wires)  # whether frames say when they were on the wire
+        self._stamps = isinstance(station, HostedBuses)  # whether frames say when they were on the wire
         self._given_up_ns = round(_GIVEN_UP * 1e9 * emulator.body.plant.period)
         self._tell, self._commands = tell, commands
         self._clock = RealClock()
         self._later: list[tuple[int, int, Sent]] = []
         self._heard = self._sent = 0
         self._told: tuple[str, ...] = ("",) * len(emulator.faces)
-        self._faults: tuple[PuckFault, ...] = ()
+        self._faults: tuple[DriveFault, ...] = ()
         self._rested = True
         self._stirred_ns = 0
         self._quit = False
@@ -427,7 +427,7 @@ class _Run:
             self._rested = resting
             self._tell("the arm is at rest" if resting else "the arm moves")
 
-    def _named(self, fault: PuckFault) -> str:
+    def _named(self, fault: DriveFault) -> str:
         return fault.kind if fault.drive is None else f"{fault.kind} of {self._emulator.names[fault.drive]}"
 
     def _resting(self, now_ns: int) -> bool:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from sim_backend.can_bus.host import WireThread
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 
 _WIRES = iter(range(10**9))
 
@@ -20,7 +20,7 @@ def name() -> str:
 
 
 @pytest.fixture
-def wire(name: str) -> Iterator[Wire]:
+def wire(name: str) -> Iterator[CanBusServer]:
     """A wire without pace in a thread."""
-    with WireThread(Wire(name)) as thread:
+    with WireThread(CanBusServer(name)) as thread:
         yield thread.wire

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from drivers.can.can_frame import FD_LENGTHS, Frame
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.can_bus.link import Connection, WireLink
 from sim_backend.can_bus.packets import Hello
 
@@ -38,7 +38,7 @@ def content(frame: Frame | None) -> Frame | None:
     return None if frame is None else frame._replace(stamp_ns=0)
 
 
-def greeted(wire: Wire, count: int) -> None:
+def greeted(wire: CanBusServer, count: int) -> None:
     """Wait until so many ends are on the wire."""
     wait_for(lambda: len(wire.medium.ports) == count)
 

@@ -17,21 +17,21 @@ from drivers.can.can_link import open_links
 from drivers.canopen.bus_load import exact
 from ident_service.errors import DriverError
 from sim_backend.can_bus.host import WireThread
-from sim_backend.can_bus.hub import ERROR_BITS, Wire
-from sim_backend.can_bus.medium import Medium, Port
+from sim_backend.can_bus.hub import ERROR_BITS, CanBusServer
+from sim_backend.can_bus.medium import BusEndpoint, Medium
 
 SLOW, FAST = 500_000, 2_000_000
 
 
 @pytest.fixture
-def fd_wire(name: str) -> Iterator[Wire]:
-    with WireThread(Wire(name, fd=True)) as thread:
+def fd_wire(name: str) -> Iterator[CanBusServer]:
+    with WireThread(CanBusServer(name, fd=True)) as thread:
         yield thread.wire
 
 
 @given(drawn=st.lists(frames(fd=True), min_size=1, max_size=30))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
-def test_frames_of_all_lengths_reach_the_others_as_what_they_are(fd_wire: Wire, drawn: list[Frame]) -> None:
+def test_frames_of_all_lengths_reach_the_others_as_what_they_are(fd_wire: CanBusServer, drawn: list[Frame]) -> None:
     with can.Bus(interface="ident_wire", channel=fd_wire.name) as sender:
         listener = end_of(fd_wire.name)
         for frame in drawn:
@@ -49,7 +49,7 @@ def test_frames_of_all_lengths_reach_the_others_as_what_they_are(fd_wire: Wire, 
         listener.close()
 
 
-def test_a_configured_link_sends_fd_and_python_can_sees_it(fd_wire: Wire) -> None:
+def test_a_configured_link_sends_fd_and_python_can_sees_it(fd_wire: CanBusServer) -> None:
     (link,) = open_links(arm_on_bus(interface="ident_wire", channel=fd_wire.name, data_bitrate=4_000_000))
     with can.Bus(interface="ident_wire", channel=fd_wire.name) as bus:
         for length in sorted(FD_LENGTHS):
@@ -70,7 +70,7 @@ def test_a_configured_link_sends_fd_and_python_can_sees_it(fd_wire: Wire) -> Non
 def test_its_pace_is_that_of_both_bit_rates(name: str) -> None:
     frame = Frame(0x201, bytes(range(64)), fd=True)
     bits = exact(frame, fd=True)
-    with WireThread(Wire(name, SLOW, FAST)):
+    with WireThread(CanBusServer(name, SLOW, FAST)):
         sender, listener = end_of(name), end_of(name)
         sender.send_all([frame] * 5)
         stamps = [found.stamp_ns for found in (listener.receive(soon()) for _ in range(5)) if found is not None]
@@ -81,13 +81,13 @@ def test_its_pace_is_that_of_both_bit_rates(name: str) -> None:
     # 64 bytes in data bits, hardly more than 8 bytes take a classic frame.
     assert expected < 2.5 * 111 * 2_000
     with pytest.raises(DriverError, match="needs its data bit rate"):
-        Wire(name, SLOW, fd=True)
+        CanBusServer(name, SLOW, fd=True)
 
 
 def test_a_classic_controller_destroys_them_until_their_sender_is_off_the_bus() -> None:
     """ISO 11898-1, fault confinement: 8 counts a frame, bus-off beyond 255, so after 32 tries."""
     medium = Medium(lambda frame: 15_000, 20_000)
-    sender, classic, other = Port("sender"), Port("classic", fd=False), Port("other")
+    sender, classic, other = BusEndpoint("sender"), BusEndpoint("classic", fd=False), BusEndpoint("other")
     for port in (sender, classic, other):
         medium.add(port)
     medium.offer(sender, Frame(0x201, bytes(2), fd=True), 0)
@@ -106,7 +106,7 @@ def test_a_classic_controller_destroys_them_until_their_sender_is_off_the_bus() 
 
 @pytest.mark.parametrize("wire_is_fd", [False, True])
 def test_a_driver_and_a_wire_that_disagree_end_in_bus_off(name: str, wire_is_fd: bool) -> None:
-    with WireThread(Wire(name, SLOW, FAST if wire_is_fd else None)) as thread:
+    with WireThread(CanBusServer(name, SLOW, FAST if wire_is_fd else None)) as thread:
         data_bitrate = None if wire_is_fd else FAST
         bus = {"interface": "ident_wire", "channel": name, "bitrate": SLOW, "data_bitrate": data_bitrate}
         (driver,) = open_links(arm_on_bus(**bus))
@@ -134,8 +134,8 @@ def test_a_packet_with_a_frame_that_is_neither_is_refused() -> None:
 
 def test_an_error_lasts_as_long_on_either_wire(name: str) -> None:
     for data_bitrate in (None, FAST):
-        medium = Wire(name, SLOW, data_bitrate).medium
-        sender, listener = Port("sender"), Port("listener")
+        medium = CanBusServer(name, SLOW, data_bitrate).medium
+        sender, listener = BusEndpoint("sender"), BusEndpoint("listener")
         medium.add(sender)
         medium.add(listener)
         medium.destroy(1)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from link_bench import frames
 
 from drivers.can.bus_state import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
-from drivers.can.can_frame import HEARD, Frame
+from drivers.can.can_frame import RECEIVE_FILTER, Frame
 from drivers.canopen.bus_load import exact
 from sim_backend.can_bus.hub import ERROR_BITS
-from sim_backend.can_bus.medium import INBOX, QUEUE, Medium, Port, priority
+from sim_backend.can_bus.medium import INBOX, QUEUE, BusEndpoint, Medium, priority
 
 
 def bits_of(frame: Frame) -> str:
@@ -69,16 +69,16 @@ def test_who_wins_is_who_sends_the_first_dominant_bit(one: Frame, other: Frame) 
         assert (priority(one) < priority(other)) == (decided[0] < decided[1])
 
 
-def on_wire(count: int, bitrate: int = 0) -> tuple[Medium, list[Port]]:
+def on_wire(count: int, bitrate: int = 0) -> tuple[Medium, list[BusEndpoint]]:
     duration = (lambda frame: exact(frame).nominal * 1_000_000_000 // bitrate) if bitrate else None
     medium = Medium(duration, ERROR_BITS * 1_000_000_000 // bitrate if bitrate else 0)
-    ports = [Port(f"port {k}") for k in range(count)]
+    ports = [BusEndpoint(f"port {k}") for k in range(count)]
     for port in ports:
         medium.add(port)
     return medium, ports
 
 
-def heard(port: Port) -> list[Frame]:
+def heard(port: BusEndpoint) -> list[Frame]:
     return [frame for frame, _ in port.take()]
 
 
@@ -161,11 +161,11 @@ def test_who_does_not_listen_loses_frames_and_is_told_before_the_next_one() -> N
 
 
 @pytest.mark.parametrize(
-    ("filters", "wanted"), [(HEARD, range(0x800)), (((0x080, 0x700), (0x700, 0x7FF)), (*range(0x100), 0x700))]
+    ("filters", "wanted"), [(RECEIVE_FILTER, range(0x800)), (((0x080, 0x700), (0x700, 0x7FF)), (*range(0x100), 0x700))]
 )
 def test_a_port_hears_what_its_filters_say(filters: tuple[tuple[int, int], ...], wanted: Sequence[int]) -> None:
     medium = Medium()
-    sender, listener = Port("all"), Port("driver", filters=filters)
+    sender, listener = BusEndpoint("all"), BusEndpoint("driver", filters=filters)
     medium.add(sender)
     medium.add(listener)
     passed = []

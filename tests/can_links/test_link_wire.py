@@ -25,14 +25,14 @@ from ident_service.errors import DriverError
 from sim_backend.can_bus import link as address
 from sim_backend.can_bus import packets
 from sim_backend.can_bus.host import LocalPort, WireThread
-from sim_backend.can_bus.hub import MOST_ENDS, Wire
+from sim_backend.can_bus.hub import MOST_ENDS, CanBusServer
 from sim_backend.can_bus.link import Connection, WireLink
 from sim_backend.can_bus.packets import Hello
 
 
 @given(drawn=st.lists(frames(), min_size=1, max_size=30))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
-def test_every_frame_reaches_all_others_in_its_order(wire: Wire, drawn: list[Frame]) -> None:
+def test_every_frame_reaches_all_others_in_its_order(wire: CanBusServer, drawn: list[Frame]) -> None:
     sender, *listeners = ends = [end_of(wire.name) for _ in range(3)]
     for frame in drawn:
         sender.send(frame)
@@ -50,7 +50,7 @@ def test_every_frame_reaches_all_others_in_its_order(wire: Wire, drawn: list[Fra
 
 
 def test_frames_that_wait_together_are_ordered_by_arbitration(name: str) -> None:
-    with Wire(name) as wire:
+    with CanBusServer(name) as wire:
         connections = []
         for k in range(3):  # nobody hosts the wire yet, so the greeting is done in steps
             sock = address.connect(name)
@@ -68,7 +68,7 @@ def test_frames_that_wait_together_are_ordered_by_arbitration(name: str) -> None
 
 
 def test_a_port_of_the_host_needs_no_socket_and_no_thread(name: str) -> None:
-    with Wire(name) as wire:
+    with CanBusServer(name) as wire:
         one, other = LocalPort(wire, "one"), LocalPort(wire, "other")
         one.send_all([Frame(0x201, b"\1"), Frame(0x080)])
         assert [content(frame) for frame in other.drain()] == [Frame(0x201, b"\1"), Frame(0x080)]
@@ -80,7 +80,7 @@ def test_a_port_of_the_host_needs_no_socket_and_no_thread(name: str) -> None:
 
 
 def test_a_paced_wire_takes_the_time_of_its_bits(name: str) -> None:
-    with WireThread(Wire(name, 1_000_000)):
+    with WireThread(CanBusServer(name, 1_000_000)):
         sender, listener = end_of(name), end_of(name)
         sender.send_all([Frame(0x080)] * 20)
         stamps = [frame.stamp_ns for frame in (listener.receive(soon()) for _ in range(20)) if frame is not None]
@@ -90,7 +90,7 @@ def test_a_paced_wire_takes_the_time_of_its_bits(name: str) -> None:
         listener.close()
 
 
-def test_a_link_hears_sdo_and_all_else_of_canopen_but_not_itself(wire: Wire) -> None:
+def test_a_link_hears_sdo_and_all_else_of_canopen_but_not_itself(wire: CanBusServer) -> None:
     (link,) = open_links(arm_on_bus(interface="ident_wire", channel=wire.name))
     assert isinstance(link, WireLink)
     drive = end_of(wire.name)
@@ -115,14 +115,14 @@ def test_without_a_wire_the_message_says_how_to_start_one(name: str) -> None:
         open_links(arm_on_bus(interface="ident_wire", channel=name, options={"host": True}))
 
 
-def test_a_wire_is_run_once(wire: Wire) -> None:
-    with pytest.raises(BusError, match="another process runs this wire"), Wire(wire.name):
+def test_a_wire_is_run_once(wire: CanBusServer) -> None:
+    with pytest.raises(BusError, match="another process runs this wire"), CanBusServer(wire.name):
         pass
 
 
 @pytest.mark.parametrize("channel", ["", "a\0b", "x" * 200])
 def test_a_name_that_cannot_be_one_is_refused(channel: str) -> None:
-    with pytest.raises(BusError, match="1 to 60 characters"), Wire(channel):
+    with pytest.raises(BusError, match="1 to 60 characters"), CanBusServer(channel):
         pass
 
 
@@ -134,11 +134,11 @@ def test_a_socket_file_is_its_owners_alone_and_does_not_outlive_its_wire_in_the_
         child.kill()
         child.wait()
     assert path.exists()
-    with WireThread(Wire(str(path))):
+    with WireThread(CanBusServer(str(path))):
         end_of(str(path)).close()
     assert not path.exists()
     path.write_text("not a socket")
-    with pytest.raises(BusError), Wire(str(path)):
+    with pytest.raises(BusError), CanBusServer(str(path)):
         pass
     assert path.read_text() == "not a socket"
 
@@ -183,7 +183,7 @@ while True:
 
 @pytest.mark.parametrize("bitrate", [0, 1_000_000])
 def test_an_end_that_is_killed_while_it_talks_is_forgotten(name: str, bitrate: int) -> None:
-    with WireThread(Wire(name, bitrate)) as thread:
+    with WireThread(CanBusServer(name, bitrate)) as thread:
         one, other = end_of(name), end_of(name)
         with process("-c", _TALKER, name) as child:
             assert one.receive(soon()) is not None
@@ -202,7 +202,7 @@ def test_an_end_that_is_killed_while_it_talks_is_forgotten(name: str, bitrate: i
 
 @given(noise=st.lists(st.binary(min_size=1, max_size=200), min_size=1, max_size=5), greets=st.booleans())
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200)
-def test_noise_on_the_socket_never_stops_the_wire(wire: Wire, noise: list[bytes], greets: bool) -> None:
+def test_noise_on_the_socket_never_stops_the_wire(wire: CanBusServer, noise: list[bytes], greets: bool) -> None:
     one, other = end_of(wire.name), end_of(wire.name)
     with address.connect(wire.name) as sock:
         sock.settimeout(PATIENCE)
@@ -229,7 +229,7 @@ def test_noise_on_the_socket_never_stops_the_wire(wire: Wire, noise: list[bytes]
 @pytest.mark.parametrize(
     "frame", [Frame(0x40, bytes(8), error=True), Frame(0x100, bytes(12))], ids=["error frame", "too long"]
 )
-def test_an_end_that_sends_what_no_controller_sends_is_thrown_out(wire: Wire, frame: Frame) -> None:
+def test_an_end_that_sends_what_no_controller_sends_is_thrown_out(wire: CanBusServer, frame: Frame) -> None:
     with address.connect(wire.name) as sock:
         sock.settimeout(PATIENCE)
         sock.send(packets.pack_hello(Hello("liar")))
@@ -239,7 +239,7 @@ def test_an_end_that_sends_what_no_controller_sends_is_thrown_out(wire: Wire, fr
     assert wire.expelled == 1
 
 
-def test_a_crowded_wire_says_so(wire: Wire) -> None:
+def test_a_crowded_wire_says_so(wire: CanBusServer) -> None:
     ends = [end_of(wire.name) for _ in range(MOST_ENDS)]
     with pytest.raises(BusError, match="no room for another end"):
         end_of(wire.name)
@@ -249,7 +249,7 @@ def test_a_crowded_wire_says_so(wire: Wire) -> None:
     end_of(wire.name).close()
 
 
-def test_an_end_of_another_version_is_told_so(wire: Wire) -> None:
+def test_an_end_of_another_version_is_told_so(wire: CanBusServer) -> None:
     with address.connect(wire.name) as sock:
         sock.settimeout(PATIENCE)
         sock.send(packets.pack_hello(Hello("old"))[:4] + b"\0" + bytes(40))
@@ -271,7 +271,7 @@ def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
                         end.result(PATIENCE)
 
 
-def test_who_does_not_read_loses_frames_and_is_told_and_holds_nobody_up(wire: Wire) -> None:
+def test_who_does_not_read_loses_frames_and_is_told_and_holds_nobody_up(wire: CanBusServer) -> None:
     sleeper, sender, listener = end_of(wire.name), end_of(wire.name), end_of(wire.name)
     count = 5000
     for k in range(count):
@@ -293,7 +293,7 @@ def test_who_does_not_read_loses_frames_and_is_told_and_holds_nobody_up(wire: Wi
 
 
 def test_a_wire_that_is_too_slow_takes_no_more_and_never_blocks(name: str) -> None:
-    with WireThread(Wire(name, 1000)):  # 1 kbit/s
+    with WireThread(CanBusServer(name, 1000)):  # 1 kbit/s
         sender, listener = end_of(name), end_of(name)
 
         def without_end() -> None:
@@ -307,7 +307,7 @@ def test_a_wire_that_is_too_slow_takes_no_more_and_never_blocks(name: str) -> No
         listener.close()
 
 
-def test_bus_off_is_heard_then_sending_is_refused_until_a_restart(wire: Wire) -> None:
+def test_bus_off_is_heard_then_sending_is_refused_until_a_restart(wire: CanBusServer) -> None:
     driver, drive = end_of(wire.name, "driver"), end_of(wire.name, "drive")
     greeted(wire, 2)
     (port,) = [port for port in wire.medium.ports if port.label == "driver"]
@@ -337,7 +337,7 @@ def test_bus_off_is_heard_then_sending_is_refused_until_a_restart(wire: Wire) ->
 def test_a_connection_is_of_one_user_only(name: str) -> None:
     if os.getuid() != 0:
         pytest.skip("only root can become somebody else")
-    with WireThread(Wire(name)) as thread:
+    with WireThread(CanBusServer(name)) as thread:
         code = (
             "import os, sys; from sim_backend.can_bus import link as address\n"
             "where = address.address_of(sys.argv[1]); import socket; os.setuid(65534)\n"
@@ -353,7 +353,7 @@ def test_a_connection_is_of_one_user_only(name: str) -> None:
 
 
 def test_a_frame_comes_when_it_was_sent_however_late_the_wires_host_is() -> None:
-    with Wire(f"late-{os.getpid()}") as wire, ThreadPoolExecutor(1) as others:
+    with CanBusServer(f"late-{os.getpid()}") as wire, ThreadPoolExecutor(1) as others:
         port = LocalPort(wire, "drives")
         greeting = others.submit(end_of, wire.name)
         while not greeting.done():

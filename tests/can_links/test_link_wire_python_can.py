@@ -13,10 +13,10 @@ import pytest
 from link_bench import PATIENCE, content, end_of, soon
 
 from drivers.can.can_frame import Frame
-from sim_backend.can_bus.hub import Wire
+from sim_backend.can_bus.hub import CanBusServer
 
 
-def test_python_can_talks_over_the_wire(wire: Wire) -> None:
+def test_python_can_talks_over_the_wire(wire: CanBusServer) -> None:
     link = end_of(wire.name)
     with can.Bus(interface="ident_wire", channel=wire.name, bitrate=1_000_000) as bus:
         before = time.time()
@@ -65,7 +65,7 @@ def test_python_can_hears_itself_when_it_asks_for_it(name: str) -> None:
         can.Bus(interface="ident_wire", channel=name)
 
 
-def test_the_canopen_library_reads_an_object_over_the_wire(wire: Wire) -> None:
+def test_the_canopen_library_reads_an_object_over_the_wire(wire: CanBusServer) -> None:
     dictionary = canopen.ObjectDictionary()
     variable = canopen.objectdictionary.ODVariable("device type", 0x1000)
     variable.data_type = canopen.objectdictionary.UNSIGNED32
@@ -87,7 +87,7 @@ def test_the_canopen_library_reads_an_object_over_the_wire(wire: Wire) -> None:
 
 
 @pytest.mark.slow
-def test_the_logger_of_python_can_sees_the_wire(wire: Wire) -> None:
+def test_the_logger_of_python_can_sees_the_wire(wire: CanBusServer) -> None:
     link = end_of(wire.name)
     command = [sys.executable, "-u", "-m", "can.logger", "-i", "ident_wire", "-c", wire.name]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)

@@ -19,7 +19,7 @@ from drivers.canopen.driver import CanopenArm
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from sim_backend.canopen_device.drive import CanopenDrive
-from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 
 ZERO = np.zeros(2)
@@ -162,7 +162,7 @@ def test_an_arm_that_another_host_drives_is_left_alone(identifier: int) -> None:
 @pytest.mark.parametrize("silent", [(1,), (0, 1)])
 def test_drives_that_do_not_answer_are_named(silent: tuple[int, ...]) -> None:
     bench = Bench(weightless_config())
-    bench.behind.inject(*(PuckFault("node_silent", drive) for drive in silent))
+    bench.behind.inject(*(DriveFault("node_silent", drive) for drive in silent))
     nodes = ", ".join(str(drive + 1) for drive in silent)
     with pytest.raises(DriverError, match=f"no answer of drives {nodes} within 2 s; check power"):
         bench.arm.open()
@@ -202,7 +202,7 @@ def test_a_protection_that_does_not_hold_is_found_by_reading_it_back(index: int,
 def test_a_drive_in_a_fault_is_not_enabled_and_says_why() -> None:
     bench = Bench(weightless_config())
     with bench.arm as arm:
-        bench.behind.inject(PuckFault("emergency", 1, size=0x4310))
+        bench.behind.inject(DriveFault("emergency", 1, size=0x4310))
         for _ in range(60):
             arm.exchange(None)
         with pytest.raises(DriverError, match=r"slide: drive 2 is in the state fault \(4310h drive too hot"):
@@ -295,7 +295,7 @@ def test_a_node_that_reboots_is_told_of_and_is_enabled_only_after_opening_again(
     with bench.arm as arm:
         arm.enable()
         arm.exchange(np.array([1.0, 1.0]))
-        bench.behind.inject(PuckFault("reboot", 1))
+        bench.behind.inject(DriveFault("reboot", 1))
         samples = [arm.exchange(np.array([1.0, 1.0])) for _ in range(20)]
         assert [sample.age[1] for sample in samples] == list(range(1, 21))
         assert not any(sample.age[0] for sample in samples)
@@ -315,7 +315,7 @@ def test_an_arm_whose_bus_is_gone_can_be_stopped_closed_and_opened_again() -> No
     bench = Bench(weightless_config())
     bench.arm.open()
     bench.arm.enable()
-    bench.behind.inject(PuckFault("bus_gone", duration=1.0))
+    bench.behind.inject(DriveFault("bus_gone", duration=1.0))
     with pytest.raises(DriverError, match="gone"):
         bench.arm.exchange(ZERO)
     bench.arm.stop(StopKind.QUICK_STOP)

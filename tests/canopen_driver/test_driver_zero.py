@@ -18,7 +18,7 @@ from drivers.canopen.stored_zero import Zeros
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError, PositionUnknown
 from sim_backend.canopen_device.drive import CanopenDrive
-from sim_backend.emulator.faults import PuckFault
+from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 
 HOME = np.array([0.5, 0.4])
@@ -113,12 +113,12 @@ def test_a_zeroed_arm_knows_where_it_stands_until_its_drives_lose_their_power() 
         close(bench.looks(), np.array(position))
         close(bench.sees(), np.array(position))
         close(bench.looks(), np.array(position))
-    bench.behind.inject(PuckFault("reboot", 1))
+    bench.behind.inject(DriveFault("reboot", 1))
     bench.settle(100)
     for act in (bench.arm.open, bench.arm.look().open):
         with pytest.raises(PositionUnknown, match=r"drives 2 do not know where"):
             act()
-    bench.behind.inject(PuckFault("node_silent", 0, duration=0.01))  # its power goes and comes
+    bench.behind.inject(DriveFault("node_silent", 0, duration=0.01))  # its power goes and comes
     bench.settle(100)
     with pytest.raises(PositionUnknown, match=r"drives 1, 2 do not know where"):
         bench.arm.open()
@@ -325,7 +325,7 @@ def test_a_drive_that_restarts_in_a_session_has_lost_its_zero_when_it_ends() -> 
     with bench.arm as arm:
         arm.enable()
         arm.exchange(np.zeros(2))
-        bench.behind.inject(PuckFault("reboot", 1))
+        bench.behind.inject(DriveFault("reboot", 1))
         for _ in range(50):
             arm.exchange(np.zeros(2))
     assert bench.marks()[1] == 0
@@ -347,7 +347,7 @@ def test_a_drive_that_restarts_while_the_arm_is_opened_is_not_vouched_for(
         if frame.identifier == SDO_REQUEST + 2:
             asked.append(frame)
             if len(asked) == request_number:
-                bench.behind.inject(PuckFault("reboot", 1))
+                bench.behind.inject(DriveFault("reboot", 1))
         return False
 
     bench.loses = strikes
@@ -365,7 +365,7 @@ def test_a_look_ends_when_a_drive_restarts() -> None:
     bench = Bench().zeroed()
     with bench.arm.look() as arm:
         arm.exchange(None)
-        bench.behind.inject(PuckFault("reboot", 0))
+        bench.behind.inject(DriveFault("reboot", 0))
         bench.settle(100)
         with pytest.raises(PositionUnknown, match="drives 1 do not know"):
             arm.exchange(None)
@@ -373,7 +373,7 @@ def test_a_look_ends_when_a_drive_restarts() -> None:
 
 def test_a_latched_fault_is_told_and_does_not_keep_it_from_being_zeroed() -> None:
     bench = Bench()
-    bench.behind.inject(PuckFault("emergency", 1, size=0x4310))
+    bench.behind.inject(DriveFault("emergency", 1, size=0x4310))
     bench.settle(100)
     bench.lead(HOME)
     first, second = bench.arm.zero()

@@ -38,7 +38,7 @@ from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.last_position import FILE, PositionFile
-from ident_service.motion.run import attended
+from ident_service.motion.run import keep_host_alive
 from ident_service.recordings.open import open_recording
 from ident_service.registry.state_folder import arm_folder, fault_file
 
@@ -203,7 +203,7 @@ def test_a_person_may_think_longer_than_drives_wait_for_their_host(bench: Bench)
     config = load_arm(bench.arm)
     assert isinstance(config.driver, CanopenDriver)
     with emulated(bench.arm), make_arm(config) as arm:
-        with attended(arm):
+        with keep_host_alive(arm):
             time.sleep(3.0 * config.driver.heartbeats.timeout)
         sample = arm.exchange(None)
         told = {event.code for event in sample.events}

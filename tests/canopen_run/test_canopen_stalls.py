@@ -22,7 +22,7 @@ from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, ConfigError, DriverError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.command_channel import StopWhen
+from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.run import RunReport, run
 from sim_backend.can_bus.link import Connection
 from sim_backend.can_bus.packets import Hello
@@ -104,7 +104,7 @@ def moved(folder: Path, stalls: dict[int, float], *, before: bool = False, fault
             links[0].at = (1000, lambda: behind.inject(broken))
         try:
             motion = excitation(model, "identification")
-            report = run(arm, model, motion, story, StopWhen(lambda: False), hold_seconds=0.1)
+            report = run(arm, model, motion, story, StopCondition(lambda: False), hold_seconds=0.1)
         except ArmFault as error:
             ended = error
     return Moved(links[0], story, report, ended, np.array(speeds).max(axis=0))

@@ -23,7 +23,7 @@ from ident_service.certificate_verifier import INERTIAL, Arm, rational_text, ver
 from ident_service.cli import main
 from ident_service.config.arm import Ellipsoid
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.estimation.certificate import certify, exact_block, stated_arm
+from ident_service.estimation.certificate import certificate_arm, certify, exact_block
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
@@ -65,7 +65,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     conditions = feasible_set("pseudo_inertia", base.names, config)
     delta = _body(base.names)
     assert conditions.margin(delta)[0] > 0.0, conditions.margin(delta)
-    stated = stated_arm(config.name, config.sha256, base, conditions, units=model.layout.units)
+    stated = certificate_arm(config.name, config.sha256, base, conditions, units=model.layout.units)
 
     def document(beta: np.ndarray, delta: np.ndarray | None) -> Document:
         proof = certify(beta, base, conditions, delta)

@@ -124,7 +124,7 @@ from ident_service import cli
 def verb(arguments):
     signal.raise_signal(signal.SIGINT)
     return 0, "did not hear it\\n", {}
-cli.remote.remotely = verb
+cli.remote.run_on_daemon = verb
 raise SystemExit(cli.main(["config", "check", "planar2", "--server", "http://localhost"]))
 """
 

@@ -14,7 +14,7 @@ from drivers.arm import Arm
 from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
 from ident_service.motion.arm_factory import make_arm
-from ident_service.motion.command_channel import ControlFile, Homing, StoppableArm
+from ident_service.motion.command_channel import ControlFile, Homing, InterruptibleArm
 from ident_service.registry.state_folder import control_path, fault_file
 
 
@@ -60,7 +60,7 @@ def test_drives_that_hold_an_arm_are_not_told_to_let_go_without_its_name(
 ) -> None:
     let_go: list[str] = []
     monkeypatch.setattr(
-        "ident_service.operations.recovery.let_go", lambda config, _: let_go.append(config.name) or ("j1",)
+        "ident_service.operations.recovery.release_held_drives", lambda config, _: let_go.append(config.name) or ("j1",)
     )
     assert ident("supported", "planar2").code == 2
     assert let_go == []
@@ -112,7 +112,7 @@ def test_a_state_folder_that_cannot_be_is_refused_before_anything_moves(
 
 def test_a_stop_ends_a_preflight(state: Path) -> None:
     asked: list[bool] = []
-    arm: Arm = StoppableArm(make_arm(load_arm("planar2")), lambda: bool(asked))
+    arm: Arm = InterruptibleArm(make_arm(load_arm("planar2")), lambda: bool(asked))
     with arm:
         arm.enable()
         arm.exchange(np.zeros(2))

@@ -9,7 +9,7 @@ import pytest
 from cli.conftest import Ident
 
 from ident_service.cli import GROUPS, main, parser
-from ident_service.cli.arguments import Verbs, asks_for_json
+from ident_service.cli.arguments import VerbList, asks_for_json
 
 WRONG = [
     ((), "the following arguments are required: VERB"),
@@ -79,7 +79,7 @@ def test_every_group_adds_verbs_of_its_own() -> None:
     top = parser()
     for group in GROUPS:
         # A second registration of the same words must collide: each group really adds to the list it is given.
-        alone = Verbs.of(type(top)(prog="ident"))
+        alone = VerbList.of(type(top)(prog="ident"))
         group.add(alone)
         assert alone.commands.choices
         assert set(alone.commands.choices) <= set(_verbs(top.format_help()))

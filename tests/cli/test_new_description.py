@@ -20,7 +20,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import ModelError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model, control_model
-from ident_service.model.likely_bodies import drawn_about
+from ident_service.model.likely_bodies import perturbed_body
 from ident_service.model.outline import capsule_around
 from ident_service.model.pinocchio_models import InverseDynamics, inertia_from_delta
 from ident_service.motion.controller import ComputedTorque
@@ -248,7 +248,7 @@ def test_the_arm_is_the_longest_branch_and_ends_where_its_gripper_begins() -> No
 def test_a_drawn_body_is_real_and_near(seed: int) -> None:
     rng = np.random.default_rng(seed)
     body = np.array([0.3, 0.01, -0.02, 0.4, 0.03, 0.2, 0.1, -0.2, 0.3, 4.0])
-    drawn = drawn_about(body, rng)
+    drawn = perturbed_body(body, rng)
     inertia = inertia_from_delta(drawn)
     assert np.linalg.eigvalsh(0.5 * np.trace(inertia.inertia) * np.eye(3) - inertia.inertia)[0] > 0.0
     assert 0.85 < drawn[9] / body[9] < 1.15

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.errors import ParameterError
-from ident_service.estimation.change_detection import ALPHA, Identified, Motion, drift, holm
+from ident_service.estimation.change_detection import ALPHA, ComparedEstimate, Motion, detect_change, holm
 
 LEADING = ("Lzz1", "lx1", "ly1", "fv1", "fc1", "fo1", "Lzz2", "lx2", "fv2", "fc2", "fo2")
 SIZE = len(LEADING)
@@ -22,14 +22,14 @@ def covariance(seed: int, size: int = SIZE) -> np.ndarray:
     return A @ A.T / A.shape[1]
 
 
-def drawn(rng: np.random.Generator, S: np.ndarray, blocks: int | None = None, shift: float = 0.0) -> Identified:
+def drawn(rng: np.random.Generator, S: np.ndarray, blocks: int | None = None, shift: float = 0.0) -> ComparedEstimate:
     """An estimate with this covariance around the same truth; the covariance estimated from so many blocks."""
     values = rng.multivariate_normal(np.zeros(len(S)), S, method="cholesky")
     values[8] += shift * np.sqrt(S[8, 8])
     if blocks is not None:
         scores = rng.multivariate_normal(np.zeros(len(S)), S, size=blocks, method="cholesky")
         S = np.cov(scores.T)
-    return Identified(LEADING, values, S, blocks)
+    return ComparedEstimate(LEADING, values, S, blocks)
 
 
 def uniform(p: list[float]) -> float:
@@ -41,7 +41,7 @@ def uniform(p: list[float]) -> float:
 def test_p_is_uniform_under_the_null_where_covariances_are_known() -> None:
     rng = np.random.default_rng(1)
     S1, S2 = covariance(1), covariance(2)
-    found = [drift(drawn(rng, S1), drawn(rng, S2)) for _ in range(250)]
+    found = [detect_change(drawn(rng, S1), drawn(rng, S2)) for _ in range(250)]
     assert uniform([one.joint.p for one in found]) > 0.01
     for number in range(len(found[0].effects)):
         assert uniform([one.effects[number].test.p for one in found]) > 0.001
@@ -55,7 +55,7 @@ def test_p_is_uniform_under_the_null_where_covariances_are_known() -> None:
 def test_p_is_uniform_where_covariances_come_from_few_blocks(blocks: tuple[int, int]) -> None:
     rng = np.random.default_rng(2)
     S1, S2 = covariance(3), covariance(4)
-    found = [drift(drawn(rng, S1, blocks[0]), drawn(rng, S2, blocks[1])) for _ in range(250)]
+    found = [detect_change(drawn(rng, S1, blocks[0]), drawn(rng, S2, blocks[1])) for _ in range(250)]
     assert uniform([one.joint.p for one in found]) > 0.01
     assert uniform([one.effects[2].test.p for one in found]) > 0.01
     # Taken for known, the same covariances cry wolf.
@@ -67,7 +67,7 @@ def test_p_is_uniform_where_covariances_come_from_few_blocks(blocks: tuple[int, 
 def test_more_parameters_than_blocks_give_no_false_alarms() -> None:
     rng = np.random.default_rng(3)
     S = covariance(5)
-    found = [drift(drawn(rng, S, 8), drawn(rng, S, 9)) for _ in range(200)]
+    found = [detect_change(drawn(rng, S, 8), drawn(rng, S, 9)) for _ in range(200)]
     assert all(0 < one.joint.directions < SIZE for one in found)
     assert all(one.joint.left_out == SIZE - one.joint.directions for one in found)
     assert np.mean([one.joint.p < 0.05 for one in found]) < 0.08
@@ -78,7 +78,7 @@ def test_a_change_of_one_friction_is_found_and_named() -> None:
     rng = np.random.default_rng(4)
     S = covariance(6)
     for _ in range(50):
-        found = drift(drawn(rng, S, 60), drawn(rng, S, 60, shift=12.0))
+        found = detect_change(drawn(rng, S, 60), drawn(rng, S, 60, shift=12.0))
         assert found.verdict == "changed"
         assert [(one.kind, one.number) for one in found.changes] == [("friction", 2)]
 
@@ -90,20 +90,20 @@ def test_neither_order_nor_units_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     S1, S2 = covariance(seed), covariance(seed + 1)
     first, second = drawn(rng, S1, 30), drawn(rng, S2, 50)
-    plain, backwards = drift(first, second), drift(second, first)
+    plain, backwards = detect_change(first, second), detect_change(second, first)
     units = 10.0 ** rng.uniform(-3, 3, SIZE)
 
-    def other_units(one: Identified) -> Identified:
-        return Identified(LEADING, one.values * units, one.covariance * np.outer(units, units), one.blocks)
+    def other_units(one: ComparedEstimate) -> ComparedEstimate:
+        return ComparedEstimate(LEADING, one.values * units, one.covariance * np.outer(units, units), one.blocks)
 
-    scaled = drift(other_units(first), other_units(second))
+    scaled = detect_change(other_units(first), other_units(second))
     order = rng.permutation(SIZE)
 
-    def shuffled(one: Identified) -> Identified:
+    def shuffled(one: ComparedEstimate) -> ComparedEstimate:
         leading = tuple(LEADING[k] for k in order)
-        return Identified(leading, one.values[order], one.covariance[np.ix_(order, order)], one.blocks)
+        return ComparedEstimate(leading, one.values[order], one.covariance[np.ix_(order, order)], one.blocks)
 
-    mixed = drift(shuffled(first), shuffled(second))
+    mixed = detect_change(shuffled(first), shuffled(second))
     for other in (backwards, scaled, mixed):
         assert other.joint.statistic == pytest.approx(plain.joint.statistic, rel=1e-5)
         assert other.joint.p == pytest.approx(plain.joint.p, rel=1e-4, abs=1e-12)
@@ -115,7 +115,7 @@ def test_neither_order_nor_units_matter(seed: int) -> None:
 
 def test_what_is_identical_has_not_changed() -> None:
     one = drawn(np.random.default_rng(5), covariance(7), 30)
-    found = drift(one, one)
+    found = detect_change(one, one)
     assert not found.z.any()
     assert found.joint.statistic == 0.0
     assert found.joint.p == 1.0
@@ -131,14 +131,14 @@ def test_what_nobody_saw_is_left_out_and_said() -> None:
     blind[1, 1] = np.inf
     values = second.values.copy()
     values[1] += 1e9
-    found = drift(first, Identified(LEADING, values, blind))
+    found = detect_change(first, ComparedEstimate(LEADING, values, blind))
     assert found.joint.left_out == 1
     assert found.joint.directions == SIZE - 1
     assert found.z[1] == 0.0
     assert found.deviations[1] == np.inf
     assert found.verdict == "unchanged"
     nothing = np.diag(np.full(SIZE, np.inf))
-    assert drift(first, Identified(LEADING, values, nothing)).joint.p == 1.0
+    assert detect_change(first, ComparedEstimate(LEADING, values, nothing)).joint.p == 1.0
 
 
 def test_small_torques_do_not_alarm_however_significant() -> None:
@@ -148,17 +148,20 @@ def test_small_torques_do_not_alarm_however_significant() -> None:
     # Both joints feel every parameter alike, 10 N m of torque, 0.1 N m of residual.
     response = np.full((1, SIZE), 1.0)
     motion = Motion((response, response), np.array([10.0, 10.0]), np.array([0.1, 0.1]))
-    found = drift(Identified(LEADING, values, S), Identified(LEADING, moved, S, None, motion))
+    found = detect_change(ComparedEstimate(LEADING, values, S), ComparedEstimate(LEADING, moved, S, None, motion))
     assert found.joint.p < 1e-100
     assert found.verdict == "unchanged"
     assert found.torque_share is not None
     np.testing.assert_allclose(found.torque_share, 1e-4)
     moved[3] += 0.2
-    found = drift(Identified(LEADING, values, S), Identified(LEADING, moved, S, None, motion))
+    found = detect_change(ComparedEstimate(LEADING, values, S), ComparedEstimate(LEADING, moved, S, None, motion))
     assert [(one.kind, one.number, one.joint) for one in found.changes] == [("friction", 1, 0)]
     # Two per cent of the torque, but a tenth of what nobody can explain.
     poor = Motion((response, response), np.array([10.0, 10.0]), np.array([2.1, 2.1]))
-    assert drift(Identified(LEADING, values, S), Identified(LEADING, moved, S, None, poor)).verdict == "unchanged"
+    assert (
+        detect_change(ComparedEstimate(LEADING, values, S), ComparedEstimate(LEADING, moved, S, None, poor)).verdict
+        == "unchanged"
+    )
 
 
 def test_holm_is_the_textbook_s() -> None:
@@ -178,10 +181,10 @@ def test_holm_keeps_the_order_and_never_helps(p: list[float]) -> None:
 
 def test_what_does_not_belong_together_is_refused() -> None:
     S = np.eye(2)
-    first = Identified(("fv1", "fc1"), np.zeros(2), S)
+    first = ComparedEstimate(("fv1", "fc1"), np.zeros(2), S)
     with pytest.raises(ParameterError, match="different base parameters"):
-        drift(first, Identified(("fv1", "fo1"), np.zeros(2), S))
+        detect_change(first, ComparedEstimate(("fv1", "fo1"), np.zeros(2), S))
     with pytest.raises(ParameterError, match=r"values\.shape=\(3,\)"):
-        Identified(("fv1", "fc1"), np.zeros(3), S)
+        ComparedEstimate(("fv1", "fc1"), np.zeros(3), S)
     with pytest.raises(ParameterError, match="from 1 blocks says nothing"):
-        Identified(("fv1", "fc1"), np.zeros(2), S, 1)
+        ComparedEstimate(("fv1", "fc1"), np.zeros(2), S, 1)

@@ -10,14 +10,14 @@ from helpers.changed_arms import COARSE, changed, recorded_arm
 from ident_service.config.arm import ArmConfig
 from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
-from ident_service.results.comparison.comparison import Pair, Side, compare, findings, read_side
+from ident_service.results.comparison.comparison import ComparedSet, Pair, compare, findings, read_side
 from ident_service.results.parameter_file import parameters_document, write_parameters
 
 SEEDS = 20
 DRIER = {"fv2": 1.3, "fc2": 1.3}
 
 
-def side(folder: Path, name: str, config: ArmConfig) -> Side:
+def side(folder: Path, name: str, config: ArmConfig) -> ComparedSet:
     recording = recorded_arm(config, folder / f"{name}.mcap")
     write_parameters(folder / f"{name}.json", parameters_document(identify(arm_model(config), [recording])))
     return read_side(folder / f"{name}.json")

@@ -8,16 +8,16 @@ from helpers.random_arms import model_around, random_body, random_chain, random_
 
 from ident_service.estimation.change_detection import (
     Cause,
-    Identified,
+    ComparedEstimate,
     Motion,
     causes,
-    drift,
+    detect_change,
     friction_ratio,
     meaning_of_cause,
     meaning_of_effect,
 )
 from ident_service.model.base_parameters import base_parameters
-from ident_service.model.information import information_of, supports
+from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 
 ARM = model_around(random_chain(np.random.default_rng(3), 4, branches=False, prismatic=False))
@@ -32,7 +32,7 @@ def motion_of(delta: np.ndarray) -> Motion:
     H = joint_regressor(ARM.chain, ARM.layout, q, dq, ddq, BASE.base)
     torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + 0.1 * rng.normal(size=q.shape)
     keep = np.ones(q.shape, dtype=bool)
-    information = information_of(H, torque, keep, supports(ARM.chain, ARM.layout, BASE.base))
+    information = information_of(H, torque, keep, sparsity(ARM.chain, ARM.layout, BASE.base))
     return Motion.of(information, BASE.K @ delta)
 
 
@@ -82,9 +82,9 @@ def test_no_difference_has_no_cause() -> None:
 def test_friction_up_down_and_offset_mean_different_things(by_name: dict[str, float], word: str) -> None:
     difference, motion = changed(**by_name)
     S = np.diag(np.full(BASE.size, 1e-8))
-    first = Identified(LEADING, BASE.K @ DELTA, S)
-    second = Identified(LEADING, BASE.K @ DELTA + difference, S, None, motion)
-    found = drift(first, second)
+    first = ComparedEstimate(LEADING, BASE.K @ DELTA, S)
+    second = ComparedEstimate(LEADING, BASE.K @ DELTA + difference, S, None, motion)
+    found = detect_change(first, second)
     (effect,) = found.changes
     assert (effect.kind, effect.number) == ("friction", 1)
     assert word in meaning_of_effect(effect, found, LEADING, 4)

@@ -14,7 +14,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.payload import Payload, knowledge_with_payload
 from ident_service.errors import ConfigError, ModelError
-from ident_service.estimation.feasible.feasible_set import configured
+from ident_service.estimation.feasible.feasible_set import configured_blocks
 from ident_service.model.arm_model import arm_model
 from ident_service.model.regressor import joint_regressor
 from ident_service.motion.after_stop import falling_joints
@@ -111,11 +111,11 @@ def test_bounds_of_masses_are_those_of_the_arm_with_it(shipped: Path) -> None:
     config, bare = loaded_and_bare(shipped)
     model, layout = arm_model(config), arm_model(config).layout
     index = {name: column for column, name in enumerate(layout.names)}
-    names = [block.name for block in configured(config, (1, 2), index)]
+    names = [block.name for block in configured_blocks(config, (1, 2), index)]
     assert "total mass at most 4.8 kg" in names
     assert "link 1: centre of mass inside its box" in names
     assert "link 2: centre of mass inside its box" not in names  # the box is that of the link alone
-    assert [b.name for b in configured(bare, (1, 2), index)].count("link 2: centre of mass inside its box") == 1
+    assert [b.name for b in configured_blocks(bare, (1, 2), index)].count("link 2: centre of mass inside its box") == 1
     joints = dict(config.joints)
     body = joints["elbow"].body.model_copy(update={"mass": (0.5, 1.5)})
     joints["elbow"] = joints["elbow"].model_copy(update={"body": body})

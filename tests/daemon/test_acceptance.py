@@ -12,8 +12,8 @@ import pytest
 from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import accepted_description
 from ident_service.errors import ParameterError, UnknownId, UsageError
-from ident_service.operations.acceptance import accept, acceptances, rollback, settle
-from ident_service.operations.run_archive import expendable, import_run, let_go
+from ident_service.operations.acceptance import accept, acceptances, rollback, synchronise
+from ident_service.operations.run_archive import expendable, import_run, prune
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database
 from ident_service.registry.runs import (
@@ -56,13 +56,13 @@ def test_a_kill_after_the_act_and_before_what_follows_is_made_good(db: Database,
     # As a kill between the folder and what follows it leaves things:
     current(state).write_bytes(first)
     db.write("DELETE FROM acceptances WHERE number = 2")
-    settle(db, state)
+    synchronise(db, state)
     assert json.loads(current(state).read_text())["method"] == "huber"
     assert [row["number"] for row in db.rows("SELECT number FROM acceptances ORDER BY number")] == [1, 2]
     # And before the act, half a folder is no act.
     half = state / "arms" / "quick" / "accepted" / ".0003.abcd.partial"
     half.mkdir()
-    settle(db, state)
+    synchronise(db, state)
     assert len(acceptances(state, "quick")) == 2
 
 
@@ -191,7 +191,7 @@ def test_only_recordings_that_nobody_accepted_are_let_go(db: Database, state: Pa
     assert {one.run[:8] for one in gone} == {"20260102", "20260103"}
     assert {one.name for one in gone} == {"identification.mcap", "validation.mcap"}
     assert all((state / "runs" / one.run / one.name).is_file() for one in gone)  # a dry run
-    assert let_go(db, state, 2, "me") == gone
+    assert prune(db, state, 2, "me") == gone
     assert not any((state / "runs" / one.run / one.name).exists() for one in gone)
     assert expendable(db, state, 2) == []
     # What stays is still what the manifest names, and the row keeps the hash of what went.
@@ -226,7 +226,7 @@ def test_recordings_behind_an_accepted_set_of_another_run_stay(db: Database, sta
     import_run(db, state, identified, "me")
     assert {one.run[:8] for one in expendable(db, state, 0)} == {"20250101", "20250102", "20250103"}
     accept(db, state, state / "runs" / identified.name, "kept for ever", "me")
-    assert [one.run[:8] for one in let_go(db, state, 0, "me")] == ["20250103"]
+    assert [one.run[:8] for one in prune(db, state, 0, "me")] == ["20250103"]
     # An earlier set stays one that can be rolled back to.
     document = json.loads((identified / "parameters.json").read_text())
     document["provenance"]["recordings"] = document["validation"] = []

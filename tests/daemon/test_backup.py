@@ -25,7 +25,7 @@ from ident_service.errors import MotionRefused, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations import backup
 from ident_service.operations.backup import back_up, restore
-from ident_service.registry.database import FILE, Database, note, trail
+from ident_service.registry.database import FILE, Database, audit_log, note
 from ident_service.registry.state_folder import RESTORING, control_path, single_instance
 from ident_service.registry.tokens import Access, access, add_token, first_token
 
@@ -89,7 +89,7 @@ def test_what_is_backed_up_comes_back(full: Path, tmp_path: Path) -> None:
     assert all(found[name] == (full / name).read_bytes() for name in KEPT if name != FILE)
     assert not [path for path in (state, *state.rglob("*")) if path.stat().st_mode & 0o077]
     with Database(state) as db:
-        assert {line["what"] for line in trail(db)} == {"token added", "did", "restored"}
+        assert {line["what"] for line in audit_log(db)} == {"token added", "did", "restored"}
         assert db.rows("SELECT * FROM sessions") == []
         assert db.row("SELECT deleted FROM recordings") == {"deleted": None}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.tar", "full", "new"]
@@ -185,7 +185,7 @@ def test_a_damaged_backup_is_refused_and_nothing_changes(good: bytes, tmp_path: 
         assert content(state) == {}
     else:  # what was changed is padding, or a time
         with Database(state) as db:
-            assert [line["what"] for line in trail(db)] == ["restored", "did"]
+            assert [line["what"] for line in audit_log(db)] == ["restored", "did"]
         assert (state / "arms" / "note.json").read_text() == '{"a": 1}' * 100
 
 
@@ -299,7 +299,7 @@ def test_a_restore_that_is_killed_is_told_and_done_again(full: Path, tmp_path: P
     restore(file, full, "me", replace=not moves)
     assert not (full / RESTORING).exists()
     with Database(full) as db:
-        assert [line["what"] for line in trail(db)] == ["restored", "did"]
+        assert [line["what"] for line in audit_log(db)] == ["restored", "did"]
     kept = {path.name for place in full.glob("replaced-*") for path in place.rglob("*")}
     assert {"faults.json", "run.mcap", "token"} <= kept
 
@@ -373,4 +373,4 @@ def test_the_owners_old_token_counts_no_more_after_a_restore(tmp_path: Path) -> 
         assert access(db, old) is None
         assert access(db, new) == Access("owner-2", "operator")
         assert access(db, ann) == Access("ann", "operator")
-        assert [line["about"] for line in trail(db) if line["what"] == "token revoked"] == ["owner"]
+        assert [line["about"] for line in audit_log(db) if line["what"] == "token revoked"] == ["owner"]

@@ -15,7 +15,7 @@ from daemon.verbs_bench import with_run
 from ident_service.daemon.jobs.requests import Run
 from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import trail
+from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import control_path
 
 pytestmark = pytest.mark.slow
@@ -58,7 +58,7 @@ def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) 
             answer = daemon.post(f"/api/v1/arms/{ARM}/{word}")
             assert (answer.status_code, answer.json()) == (200, {"arm": ARM, "asked": word, "reached": True})
         assert daemon.service.engine.audit.flush(10.0)
-        assert [line["what"] for line in trail(daemon.service.db, most=len(words))] == words[::-1]
+        assert [line["what"] for line in audit_log(daemon.service.db, most=len(words))] == words[::-1]
     ended = daemon.follow(job, lease=True)
     assert ended["state"] == "done", ended
     report = daemon.get(f"/api/v1/jobs/{job}/result").json()["answer"]["report"]
@@ -291,4 +291,6 @@ def test_what_dies_without_a_word_has_failed(daemon: Asked, arm: str) -> None:
     ended = daemon.follow(job["id"])
     assert ended["state"] == "failed"
     assert "signal 9" in ended["detail"]
-    assert [line["detail"]["state"] for line in trail(daemon.service.db) if line["what"] == "job ended"] == ["failed"]
+    assert [line["detail"]["state"] for line in audit_log(daemon.service.db) if line["what"] == "job ended"] == [
+        "failed"
+    ]

@@ -22,7 +22,7 @@ from benchmarks import stops
 from ident_service.client import IdentClient
 from ident_service.daemon import connections
 from ident_service.daemon.connections import BODY_SECONDS, HEADER_SECONDS, Connection, Connections
-from ident_service.daemon.serve import AsideHandler, JsonLines, NotTooOften
+from ident_service.daemon.serve import JsonLines, QueuedHandler, RepeatFilter
 from ident_service.errors import ArmError
 
 NEAR, FAR = "127.0.0.1", "203.0.113.9"
@@ -224,7 +224,7 @@ def test_a_log_that_nobody_reads_keeps_nobody() -> None:
     reader, writer = os.pipe()
     log, lines = logging.Logger("test"), list[str]()
     with os.fdopen(reader) as read, os.fdopen(writer, "w") as stream:
-        handler = AsideHandler(stream)
+        handler = QueuedHandler(stream)
         handler.setFormatter(JsonLines())
         log.addHandler(handler)
         for k in range(5000):
@@ -244,7 +244,7 @@ def test_what_is_said_again_and_again_is_left_out_and_counted() -> None:
     log = logging.Logger("test")
     handler = logging.Handler()
     handler.emit = kept.append  # type: ignore[method-assign]
-    handler.addFilter(NotTooOften(lambda: now[0]))
+    handler.addFilter(RepeatFilter(lambda: now[0]))
     log.addHandler(handler)
     for _ in range(1000):
         log.warning("again %s", "and again")

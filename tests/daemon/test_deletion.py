@@ -16,9 +16,9 @@ from ident_service.daemon.web.arm_pages import ladder
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations import deletion
 from ident_service.operations.acceptance import accept
-from ident_service.operations.maintenance_schedule import When, add_schedule, known_schedule
+from ident_service.operations.maintenance_schedule import DueRule, add_schedule, known_schedule
 from ident_service.registry import jobs
-from ident_service.registry.database import Database, trail
+from ident_service.registry.database import Database, audit_log
 from ident_service.registry.runs import index_run, operating_seconds
 from ident_service.registry.state_folder import control_path, fault_file
 
@@ -54,7 +54,7 @@ def test_a_run_that_nothing_refers_to_goes_with_its_files(filled: Asked) -> None
     assert filled.get(f"/api/v1/runs/{FIRST}").status_code == 404
     assert [path.name for path in (state / "runs").iterdir()] == [SECOND]
     assert delete(filled, f"runs/{FIRST}")[0] == 404
-    assert (trail(filled.service.db)[0]["what"], trail(filled.service.db)[0]["about"]) == ("run deleted", FIRST)
+    assert (audit_log(filled.service.db)[0]["what"], audit_log(filled.service.db)[0]["about"]) == ("run deleted", FIRST)
 
 
 def test_what_refers_to_a_run_is_named_and_kept(filled: Asked) -> None:
@@ -73,7 +73,7 @@ def test_what_refers_to_a_run_is_named_and_kept(filled: Asked) -> None:
 def test_operating_hours_still_count_what_is_deleted(filled: Asked) -> None:
     db = filled.service.db
     db.write("UPDATE runs SET seconds = 3600.0")
-    number = add_schedule(db, "quick", When(hours=1.5), "test", 0.0)["id"]
+    number = add_schedule(db, "quick", DueRule(hours=1.5), "test", 0.0)["id"]
     db.write("UPDATE schedules SET counted = 3600.0")
     assert operating_seconds(db, "quick") - known_schedule(db, number)["counted"] == 3600.0
     assert delete(filled, f"runs/{SECOND}")[0] == 200
@@ -124,7 +124,7 @@ def test_an_arm_takes_with_it_what_is_its_own(filled: Asked, commissioned: Path)
     db, state = filled.service.db, filled.service.state
     motion = uploaded_motion(filled, commissioned)
     accept(db, state, state / "runs" / FIRST, "good", "test")
-    add_schedule(db, "quick", When(hours=1.5), "test", 0.0, motion)
+    add_schedule(db, "quick", DueRule(hours=1.5), "test", 0.0, motion)
     kinds = [("run", FIRST), ("run", SECOND), ("motion", motion), ("schedule", "1"), ("acceptance", "1")]
     status, answer = delete(filled, "arms/quick")
     assert (status, [(one["kind"], one["id"]) for one in answer["error"]["dependents"]]) == (409, kinds)
@@ -170,7 +170,7 @@ def test_shipped_arms_stay(filled: Asked) -> None:
 
 def test_a_motion_takes_its_schedules_with_it(filled: Asked, commissioned: Path) -> None:
     motion = uploaded_motion(filled, commissioned)
-    add_schedule(filled.service.db, "quick", When(hours=1.5), "test", 0.0, motion)
+    add_schedule(filled.service.db, "quick", DueRule(hours=1.5), "test", 0.0, motion)
     status, answer = delete(filled, f"motions/{motion}")
     wanted = [{"kind": "schedule", "id": "1", "becomes": "deleted"}]
     assert (status, answer["error"]["dependents"]) == (409, wanted)
@@ -209,5 +209,5 @@ def test_the_command_deletes_and_names(state: Path, commissioned: Path, capsys: 
     assert main([*words, "--anyway", "--json", "--by", "ann"]) == 0
     assert json.loads(capsys.readouterr().out)["dependents"] == [{"kind": "acceptance", "id": "1", "becomes": "kept"}]
     with Database(state) as db:
-        assert trail(db)[0]["who"] == "terminal:ann"
+        assert audit_log(db)[0]["who"] == "terminal:ann"
     assert main(words) == 2

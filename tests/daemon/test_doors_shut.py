@@ -12,12 +12,12 @@ import pytest
 from daemon.conftest import URL, Asked, serving
 
 from ident_service.config.load import shipped_arms
-from ident_service.daemon.authentication import CHALLENGE_SECONDS, SESSION_SECONDS, Gate, Throttle, Throttled
+from ident_service.daemon.authentication import CHALLENGE_SECONDS, SESSION_SECONDS, Authenticator, Throttle, Throttled
 from ident_service.daemon.request_guard import MOST_BODY, MOST_UPLOAD
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.motion.command_channel import ControlFile
-from ident_service.registry.database import Database, trail
+from ident_service.registry.database import Database, audit_log
 from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token, revoke_token
 
@@ -342,7 +342,7 @@ def test_a_request_that_comes_twice_moves_the_arm_once(daemon: Asked) -> None:
 def test_a_challenge_does_not_count_for_long(tmp_path: Path) -> None:
     now = [0.0]
     with Database(tmp_path) as db:
-        gate = Gate(db, lambda: now[0])
+        gate = Authenticator(db, lambda: now[0])
         word = gate.challenge("a", "me")
         now[0] = CHALLENGE_SECONDS - 0.1
         assert gate.confirm(word, "a", "me")
@@ -368,7 +368,7 @@ def test_a_session_survives_a_restart_and_ends_in_time(state: Path, monkeypatch:
         refusal(daemon.get("/api/v1/whoami", headers=header), 401)
     with Database(state) as db:
         other = add_token(db, "late", "viewer", "test")
-        gate = Gate(db)
+        gate = Authenticator(db)
         session = gate.log_in(other, "here")
         assert session is not None
         now = time.time()
@@ -392,7 +392,7 @@ def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, vi
         assert daemon.post("/api/v1/stop", headers={"Authorization": "Bearer wrong"}).json()["arms"] == ["planar2"]
         assert mover.stop
     assert daemon.service.engine.audit.flush(10.0)
-    assert {line["who"] for line in trail(daemon.service.db) if line["what"] == "stop"} == {"looks", "anybody"}
+    assert {line["who"] for line in audit_log(daemon.service.db) if line["what"] == "stop"} == {"looks", "anybody"}
 
 
 @pytest.mark.slow

@@ -13,9 +13,9 @@ from daemon.conftest import Asked, checked_before, quick_text, serving
 from daemon.served import daemon_process
 
 from ident_service.client import Event, IdentClient
-from ident_service.daemon.news import LOOK, Watch
+from ident_service.daemon.news import LOOK, EventPoller
 from ident_service.motion.command_channel import ControlFile
-from ident_service.registry.database import note, trail
+from ident_service.registry.database import audit_log, note
 from ident_service.registry.state_folder import control_path, fault_file
 
 
@@ -31,16 +31,18 @@ class Clock:
 
 
 @pytest.fixture
-def watch(daemon: Asked) -> Watch:
+def watch(daemon: Asked) -> EventPoller:
     """A watch on the registry of a service, that looks each time it is asked to."""
-    return Watch(daemon.service.db, daemon.service.state, lambda row: {"id": row["id"], "state": row["state"]}, Clock())
+    return EventPoller(
+        daemon.service.db, daemon.service.state, lambda row: {"id": row["id"], "state": row["state"]}, Clock()
+    )
 
 
 def numbers(news: list[Any]) -> list[int]:
     return [one.number for one in news if one.number is not None]
 
 
-def test_what_happens_is_told_once_and_in_order(daemon: Asked, watch: Watch) -> None:
+def test_what_happens_is_told_once_and_in_order(daemon: Asked, watch: EventPoller) -> None:
     db = daemon.service.db
     seen, late = watch.begin(None), watch.begin(None)
     watch.look()
@@ -48,13 +50,15 @@ def test_what_happens_is_told_once_and_in_order(daemon: Asked, watch: Watch) -> 
     for number in range(5):
         note(db, "me", "did", str(number))
     watch.look()
-    lines = [line["id"] for line in reversed(trail(db)) if line["what"] == "did"]
+    lines = [line["id"] for line in reversed(audit_log(db)) if line["what"] == "did"]
     assert numbers(watch.since(seen)) == lines
     assert watch.since(seen) == []
     assert numbers(watch.since(late)) == lines
 
 
-def test_who_is_far_behind_reads_the_registry(daemon: Asked, watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_is_far_behind_reads_the_registry(
+    daemon: Asked, watch: EventPoller, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("ident_service.daemon.news._PAGE", 7)
     db = daemon.service.db
     for number in range(40):
@@ -66,13 +70,13 @@ def test_who_is_far_behind_reads_the_registry(daemon: Asked, watch: Watch, monke
         page = watch.earlier(seen)
         assert len(page) <= 7
         told += numbers(page)
-    assert told == [line["id"] for line in reversed(trail(db, most=500))]
+    assert told == [line["id"] for line in reversed(audit_log(db, most=500))]
     # A number that there never was is of another registry: it begins now.
     assert watch.begin(10**6).line == told[-1]
 
 
 @pytest.mark.slow
-def test_how_arms_and_jobs_stand_is_told_to_whoever_comes(daemon: Asked, watch: Watch) -> None:
+def test_how_arms_and_jobs_stand_is_told_to_whoever_comes(daemon: Asked, watch: EventPoller) -> None:
     state = daemon.service.state
     fault_file(state, "planar2").latch("overspeed", "too fast")
     with ControlFile.take(control_path(state, "wam7_sim"), None):

@@ -25,7 +25,7 @@ from ident_service.errors import ArmError, ArmFault, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import FILE, Database, note, trail
+from ident_service.registry.database import FILE, Database, audit_log, note
 from ident_service.registry.state_folder import control_path
 
 
@@ -208,10 +208,10 @@ def test_a_stop_that_the_registry_does_not_take_is_entered_later(
         assert main(["stop", "--state", str(state)]) == 0
         after = time.time()
         assert "follows" in capsys.readouterr().err
-        assert "stop" not in [line["what"] for line in trail(daemon.service.db)]
+        assert "stop" not in [line["what"] for line in audit_log(daemon.service.db)]
         other.execute("ROLLBACK")
         until = time.monotonic() + 30.0
-        while not (found := [line for line in trail(daemon.service.db) if line["what"] == "stop"]):
+        while not (found := [line for line in audit_log(daemon.service.db) if line["what"] == "stop"]):
             assert time.monotonic() < until
             time.sleep(0.05)
     assert len(found) == 1

@@ -13,7 +13,7 @@ from daemon.conftest import Asked, quick_text
 from daemon.test_doors_shut import refusal
 
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import Database, note, trail
+from ident_service.registry.database import Database, audit_log, note
 from ident_service.registry.tokens import add_token
 
 COUNT = 12
@@ -137,7 +137,7 @@ def test_a_name_that_is_taken_is_replaced_where_that_is_asked_for(daemon: Asked)
     assert daemon.get("/api/v1/arms/planar2").json()["source"] == "shipped"
     assert post(quick_text("planar2"), replace=True).json()["source"] == "uploaded"
     refusal(daemon.post("/api/v1/descriptions/check", {"description": quick_text(), "replace": True}), 422)
-    assert len([line for line in trail(daemon.service.db) if line["what"] == "arm added"]) == 5
+    assert len([line for line in audit_log(daemon.service.db) if line["what"] == "arm added"]) == 5
 
 
 def test_a_name_that_no_address_can_have_is_refused_with_its_place(daemon: Asked) -> None:

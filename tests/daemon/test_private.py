@@ -21,7 +21,7 @@ from ident_service.daemon.serve import serve
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.motion.command_channel import ControlFile
-from ident_service.registry.database import FILE, Database, trail
+from ident_service.registry.database import FILE, Database, audit_log
 from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
@@ -188,7 +188,7 @@ def test_a_stop_by_root_stops_and_leaves_the_owner_what_it_writes(anothers: Path
     assert main(["stop", *arm, "--state", str(anothers)]) == 0
     assert owners(anothers) == {NOBODY}
     with being(NOBODY), Database(anothers) as db:
-        assert [line["what"] for line in trail(db)[:2]] == ["stop", "stop"]
+        assert [line["what"] for line in audit_log(db)[:2]] == ["stop", "stop"]
         with ControlFile.take(control_path(anothers, "planar2"), None):
             pass
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from ident_service.daemon.jobs.outcome import Said, outcome
+from ident_service.daemon.jobs.outcome import ProcessOutput, outcome
 from ident_service.errors import UnknownId, UsageError
 from ident_service.registry import jobs
-from ident_service.registry.database import FILE, MIGRATIONS, Database, note, trail
+from ident_service.registry.database import FILE, MIGRATIONS, Database, audit_log, note
 from ident_service.registry.tokens import TOKEN_FILE, access, add_token, first_token, read_token, revoke_token, tokens
 
 
@@ -68,7 +68,7 @@ def test_a_transaction_is_whole_or_nothing(tmp_path: Path) -> None:
 
         with pytest.raises(ZeroDivisionError):
             half()
-        assert trail(db) == []
+        assert audit_log(db) == []
 
 
 def test_the_audit_trail_can_be_neither_changed_nor_shortened(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_the_audit_trail_can_be_neither_changed_nor_shortened(tmp_path: Path) ->
         for sql in ("UPDATE audit SET who = 'you'", "DELETE FROM audit"):
             with pytest.raises(sqlite3.IntegrityError, match="append-only"):
                 db.write(sql)
-        (line,) = trail(db)
+        (line,) = audit_log(db)
         assert (line["who"], line["what"], line["about"], line["detail"]) == ("me", "did", "x", {"how": "so"})
 
 
@@ -107,7 +107,7 @@ def test_what_was_written_survives_a_kill(tmp_path: Path) -> None:
     )
     assert subprocess.run([sys.executable, "-c", script, tmp_path], check=False).returncode == -9
     with Database(tmp_path) as db:
-        assert [line["what"] for line in trail(db)] == ["written"]
+        assert [line["what"] for line in audit_log(db)] == ["written"]
         assert db.sound()
 
 
@@ -179,7 +179,7 @@ def test_a_token_file_is_not_read_through_a_link(tmp_path: Path) -> None:
 
 def test_a_refusal_says_why_in_the_jobs_own_line() -> None:
     def detail(**answer: Any) -> str:
-        found = outcome(Said({"exit_code": 3, **answer}), 3, "")
+        found = outcome(ProcessOutput({"exit_code": 3, **answer}), 3, "")
         assert found.state == "refused"
         return found.detail
 

@@ -19,7 +19,7 @@ from ident_service.cli import main
 from ident_service.daemon.jobs.requests import Run
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import FILE, trail
+from ident_service.registry.database import FILE, audit_log
 from ident_service.registry.state_folder import control_path, fault_file
 
 FAR = "203.0.113.9"
@@ -58,7 +58,7 @@ def test_a_stop_and_what_is_read_do_not_wait_for_who_writes(daemon: Asked, state
         assert daemon.get("/api/v1/arms").status_code == 200
         assert time.monotonic() - began < SOON
     assert daemon.service.engine.audit.flush(10.0)
-    lines = [line for line in trail(daemon.service.db) if line["what"] == "stop"]
+    lines = [line for line in audit_log(daemon.service.db) if line["what"] == "stop"]
     assert [line["who"] for line in lines] == ["looks", "anybody", "owner", "anybody"]
     # Each has the time of the act, not that of its entry.
     assert all(line["detail"] == {"reached": ["planar2"], "jobs": []} for line in lines)

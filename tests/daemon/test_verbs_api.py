@@ -16,7 +16,7 @@ from ident_service.daemon.jobs.requests import BusScan, Zero
 from ident_service.daemon.request_guard import MOST_UPLOAD
 from ident_service.operations.acceptance import accept
 from ident_service.registry.arms import known_arm, resources
-from ident_service.registry.database import trail
+from ident_service.registry.database import audit_log
 from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -142,7 +142,7 @@ def test_a_description_is_judged_and_not_kept(daemon: Asked, state: Path) -> Non
     assert daemon.post(door, on_a_bus()).status_code == 200
     assert daemon.get("/api/v1/arms/unseen").status_code == 404
     assert list((state / "descriptions").iterdir()) == []
-    assert not [line for line in trail(daemon.service.db) if line["what"] == "arm added"]
+    assert not [line for line in audit_log(daemon.service.db) if line["what"] == "arm added"]
 
 
 def test_an_arm_is_zeroed_by_a_persons_word(daemon: Asked, state: Path) -> None:
@@ -198,7 +198,7 @@ def test_recordings_are_named_before_they_are_deleted(daemon: Asked, state: Path
     assert done == named | {"deleted": True}
     assert not any((state / "runs" / one["run"] / one["name"]).exists() for one in done["recordings"])
     assert all((state / "runs" / one / "identification.mcap").is_file() for one in (ids[0], ids[2]))
-    assert {line["who"] for line in trail(db) if line["what"] == "recording deleted"} == {"owner"}
+    assert {line["who"] for line in audit_log(db) if line["what"] == "recording deleted"} == {"owner"}
     assert daemon.post(door, {"keep": 1, "yes": True}).json()["recordings"] == []
 
 
@@ -224,6 +224,6 @@ def test_tokens_are_listed_and_revoked_but_not_made(daemon: Asked, viewer: str) 
     refusal(daemon.post("/api/v1/tokens/ann/revoke"), 404)
     daemon.as_token(secret)
     refusal(daemon.get("/api/v1/whoami"), 401)
-    assert [(line["who"], line["about"]) for line in trail(daemon.service.db) if line["what"] == "token revoked"] == [
-        ("owner", "ann")
-    ]
+    assert [
+        (line["who"], line["about"]) for line in audit_log(daemon.service.db) if line["what"] == "token revoked"
+    ] == [("owner", "ann")]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ident_service.recordings.mcap_writer import DEFINITIONS, JOINT_STATE
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, assemble, join
-from ident_service.recordings.resampling import Piece
+from ident_service.recordings.resampling import UniformRun
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def whole(recording: Recording, samples: int = BLOCK_SAMPLES) -> Block:
     return join(list(recording.blocks(samples)))
 
 
-def segments_of(pieces: Iterator[Piece]) -> list[Block]:
+def segments_of(pieces: Iterator[UniformRun]) -> list[Block]:
     """One block a segment; the marks of start and end have to fit."""
     found: list[list[Block]] = []
     ended = True

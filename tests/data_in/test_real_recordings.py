@@ -14,7 +14,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.config.recording import RecordingFormat
 from ident_service.model.arm_model import arm_model
 from ident_service.model.pinocchio_models import read_urdf
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.csv_reader import CsvRecording
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.quality import Quality, quality
@@ -37,7 +37,7 @@ def opened(shared: Path, arm: str, name: str) -> Recording:
     config = load_arm(arm)
     names = arm_model(config).chain.names
     path = shared / "data" / name
-    return KeptRecording(open_recording(path, names, fmt=config.recording, transmission=config.transmission))
+    return CachedRecording(open_recording(path, names, fmt=config.recording, transmission=config.transmission))
 
 
 def judged(shared: Path, arm: str, name: str) -> Quality:

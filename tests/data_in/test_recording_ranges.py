@@ -18,11 +18,11 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
 from ident_service.daemon.jobs.commands import range_words
-from ident_service.daemon.jobs.requests import RecordingOf
+from ident_service.daemon.jobs.requests import RecordingReference
 from ident_service.errors import RecordingError, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.operations.identification import Request, identify_files
-from ident_service.operations.recordings import file_and_range, open_for, own_formats
+from ident_service.operations.recordings import file_and_range, open_for_arm, own_formats
 from ident_service.recordings.adapters import RangeRecording, overlap, without_standstill
 from ident_service.recordings.files import split_range
 from ident_service.recordings.open import open_recording
@@ -100,7 +100,7 @@ def test_names_of_ranges(tmp_path: Path) -> None:
 
 
 def test_a_range_beyond_the_end_says_how_long_the_recording_is(tmp_path: Path) -> None:
-    recording = open_for(Path(f"{written(tmp_path / 'run.csv')}@41:60"), arm_model(planar()))
+    recording = open_for_arm(Path(f"{written(tmp_path / 'run.csv')}@41:60"), arm_model(planar()))
     with pytest.raises(RecordingError, match=r"run\.csv@41:60: no sample from 41 s to 60 s; it lasts 14\.995 s"):
         list(recording.blocks())
 
@@ -153,7 +153,7 @@ def test_a_columns_file_for_one_recording(tmp_path: Path) -> None:
     named = [ours, Path(f"{theirs}@2:9")]
     forms = own_formats({theirs: columns}, named, model)
     assert set(forms) == {named[1]}
-    read = open_for(named[1], model, forms[named[1]])
+    read = open_for_arm(named[1], model, forms[named[1]])
     np.testing.assert_allclose(whole(read).torque[:, 1], -2.0 * whole(open_recording(ours)).torque[400:1800, 1])
     with pytest.raises(UsageError, match=r"other\.csv is none of the recordings"):
         own_formats({tmp_path / "other.csv": columns}, named, model)
@@ -195,14 +195,14 @@ def remote_recording(path: Path) -> dict[str, object]:
 
 def test_a_daemon_is_asked_for_the_same_range() -> None:
     assert remote_recording(Path("run-1/other.mcap@2.5:")) == {"run": "run-1", "name": "other.mcap", "start": 2.5}
-    asked = RecordingOf.model_validate(remote_recording(Path("run-1@1:40")))
+    asked = RecordingReference.model_validate(remote_recording(Path("run-1@1:40")))
     assert (asked.run, asked.name, asked.start, asked.end) == ("run-1", None, 1.0, 40.0)
     assert range_words(asked) == "@1.000000000:40.000000000"
     assert split_range(f"run.mcap{range_words(asked)}") == ("run.mcap", (1.0, 40.0))
-    assert range_words(RecordingOf(run="run-1")) == ""
+    assert range_words(RecordingReference(run="run-1")) == ""
 
 
 def test_the_description_may_say_that_standstill_is_cut(tmp_path: Path) -> None:
     config = load_arm(described(tmp_path)).model_copy(update={"recording": RecordingFormat(standstill="cut")})
     path = written(tmp_path / "run.csv", still=(400, 0))
-    assert len(whole(open_for(path, arm_model(config))).stamp_ns) == 3400 - 280
+    assert len(whole(open_for_arm(path, arm_model(config))).stamp_ns) == 3400 - 280

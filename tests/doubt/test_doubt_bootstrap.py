@@ -12,7 +12,7 @@ from estimation.synthetic import one_joint_information, random_information, seri
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.errors import ModelError, SolverError
-from ident_service.estimation.bootstrap import bootstrap, drawn, run_length
+from ident_service.estimation.bootstrap import block_resample_counts, bootstrap, run_length
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set
 from ident_service.estimation.feasible.problems import constrained_least_squares
@@ -112,7 +112,7 @@ def test_white_blocks_are_drawn_one_by_one() -> None:
 
 @pytest.mark.parametrize(("count", "length"), [(60, 1), (60, 7), (5, 5), (13, 4)])
 def test_runs_are_consecutive_and_fill_a_recording(count: int, length: int) -> None:
-    times = drawn(np.random.default_rng(1), count, length)
+    times = block_resample_counts(np.random.default_rng(1), count, length)
     again = np.random.default_rng(1).integers(0, count, size=-(-count // length))
     wanted = np.zeros(count, dtype=int)
     for block in [(start + k) % count for start in again for k in range(length)][:count]:
@@ -128,7 +128,7 @@ def test_a_replicate_is_the_estimate_from_the_blocks_it_drew() -> None:
     made = bootstrap(gathered, fit, base, conditions, 3, seed=11, run=2)
     rng = np.random.default_rng(11)
     for beta in made.betas:
-        times = drawn(rng, len(gathered.blocks), 2)
+        times = block_resample_counts(rng, len(gathered.blocks), 2)
         blocks = [block for block, count in zip(gathered.blocks, times, strict=True) for _ in range(count)]
         least = ordinary_least_squares(reduce(Information.merged, blocks), weights)
         wanted = constrained_least_squares(least, base, conditions).beta

@@ -12,7 +12,7 @@ from helpers.random_arms import bodies_of, friction_torque, random_chain, refere
 from ident_service.config.arm import Identification
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
-from ident_service.model.information import Information, information_of, supports
+from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.recordings.recording import Block
 
@@ -111,7 +111,7 @@ def random_information(
     q, dq, ddq = rng.uniform(-2.0, 2.0, size=(3, samples, model.chain.joints))
     H_b = joint_regressor(model.chain, model.layout, q, dq, ddq, base.base)
     torque = np.einsum("jps,p->sj", H_b, base.K @ delta) + noise * rng.normal(size=q.shape)
-    joint_supports = supports(model.chain, model.layout, base.base)
+    joint_supports = sparsity(model.chain, model.layout, base.base)
     return information_of(H_b, torque, np.ones(q.shape, dtype=bool), joint_supports)
 
 

@@ -12,7 +12,7 @@ from ident_service.estimation.least_squares import ordinary_least_squares, torqu
 from ident_service.estimation.uncertainty import block_covariance
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
-from ident_service.model.information import information_of, supports
+from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 
 
@@ -57,7 +57,7 @@ def test_several_joints_are_one_system(arm: ArmModel, base: BaseParameters) -> N
     H_b = joint_regressor(arm.chain, arm.layout, q, dq, ddq, base.base)
     torque = np.einsum("jps,p->sj", H_b, rng.normal(size=base.size)) + rng.normal(size=(200, 3))
     keep = rng.random((200, 3)) < 0.8
-    information = information_of(H_b, torque, keep, supports(arm.chain, arm.layout, base.base))
+    information = information_of(H_b, torque, keep, sparsity(arm.chain, arm.layout, base.base))
     W = np.vstack([H_b[joint].T[keep[:, joint]] for joint in range(3)])
     omega = np.concatenate([torque[keep[:, joint], joint] for joint in range(3)])
     fit = ordinary_least_squares(information)

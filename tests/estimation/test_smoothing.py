@@ -15,7 +15,7 @@ from ident_service.estimation import signal_processing as smoothing
 from ident_service.estimation.equations import kept_motion
 from ident_service.estimation.signal_processing import Motion, smoothed
 from ident_service.recordings.adapters import RangeRecording
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 
 RATE = 200.0
 
@@ -239,7 +239,7 @@ def test_what_depends_on_friction_alone_filters_nothing_again(monkeypatch: pytes
 
     monkeypatch.setattr(smoothing, "low_pass", counted)
     options = plain_options(smoothing=plain_smoothing(filter_torque=True))
-    recording = KeptRecording(noisy(4013))
+    recording = CachedRecording(noisy(4013))
     kept_motion(recording, options)
     once = len(filtered)
     others = {
@@ -268,7 +268,7 @@ def test_what_depends_on_friction_alone_filters_nothing_again(monkeypatch: pytes
     ],
 )
 def test_another_filter_is_never_taken_for_the_last(change: dict[str, object]) -> None:
-    kept, options = KeptRecording(noisy(4013)), plain_options()
+    kept, options = CachedRecording(noisy(4013)), plain_options()
     changed = options.model_copy(update=change)
     for asked in (options, changed, options):
         found, fresh = kept_motion(kept, asked), kept_motion(noisy(4013), asked)
@@ -277,7 +277,7 @@ def test_another_filter_is_never_taken_for_the_last(change: dict[str, object]) -
 
 
 def test_another_part_of_a_recording_has_its_own_smoothed_samples() -> None:
-    kept, options = KeptRecording(noisy(4013)), plain_options()
+    kept, options = CachedRecording(noisy(4013)), plain_options()
     whole = kept_motion(kept, options)
     for start, end in ((2.0, 12.0), (5.0, 15.0)):
         part = kept_motion(RangeRecording(kept, start, end), options)
@@ -288,7 +288,7 @@ def test_another_part_of_a_recording_has_its_own_smoothed_samples() -> None:
 
 
 def test_smoothed_samples_of_a_large_recording_are_not_kept() -> None:
-    recording, options = KeptRecording(noisy(4013), max_bytes=100_000), plain_options()
+    recording, options = CachedRecording(noisy(4013), max_bytes=100_000), plain_options()
     first, second = (next(smoothed(recording, options)) for _ in range(2))
     kept_motion(recording, options)
     assert recording.memory.recall("grid", RecordingFormat()) is not None

@@ -32,7 +32,7 @@ from ident_service.operations.identification import Request, identify_files
 from ident_service.recordings.open import open_recording
 from ident_service.results.evidence.gathering import gather_evidence
 from ident_service.results.parameter_file import ParameterFile, convex_document
-from ident_service.results.report.verdict import reservations
+from ident_service.results.report.verdict import limitations
 from ident_service.results.summary import summary
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "extending.md"
@@ -244,7 +244,7 @@ def test_a_second_opinion_sees_a_wrong_first_one(setting: Setting) -> None:
     file = ParameterFile(plain.base, plain.beta, "pseudo_inertia", document)
     evidence = gather_evidence(plain, [open_recording(setting.path)], [], "0" * 64, [])
     assert "A second solution of the constrained problem predicts other torques" in " ".join(
-        reservations(evidence, file)
+        limitations(evidence, file)
     )
     assert "THE TWO DIFFER" in summary(replace(plain, second=seen))
     early = replace(seen, status="optimal_inaccurate")

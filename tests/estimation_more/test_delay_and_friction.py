@@ -13,18 +13,18 @@ from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.arm import FrictionShape, Reversal
 from ident_service.errors import RecordingError
-from ident_service.estimation.choices import clearly_chosen
+from ident_service.estimation.choices import significant_choice
 from ident_service.estimation.equations import equations
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.fit import prepare, unconstrained
-from ident_service.estimation.friction_fit import at_the_edge, fit_friction, friction_trials, with_friction
+from ident_service.estimation.friction_fit import at_search_bounds, fit_friction, friction_trials, with_friction
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
 from ident_service.estimation.shape_uncertainty import shape_covariance
 from ident_service.estimation.torque_delay import Delay, estimate_delay, with_delay
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
-from ident_service.model.friction_state import direction
+from ident_service.model.friction_state import friction_direction
 from ident_service.model.parameter_layout import NO_STRIBECK, Layout
 from ident_service.model.regressor import joint_regressor
 
@@ -164,9 +164,9 @@ def test_a_delay_of_one_third_is_not_taken() -> None:
     ],
 )
 def test_what_is_not_clearly_better_is_not_taken(errors: list[float], value: str) -> None:
-    choice = clearly_chosen("delay", {"usual": np.full(3, 3.0), "other": np.array(errors)})
+    choice = significant_choice("delay", {"usual": np.full(3, 3.0), "other": np.array(errors)})
     assert choice.value == value
-    assert clearly_chosen("delay", {"usual": np.full(3, np.inf), "other": np.array(errors)}).value == "usual"
+    assert significant_choice("delay", {"usual": np.full(3, np.inf), "other": np.array(errors)}).value == "usual"
 
 
 # Friction.
@@ -210,7 +210,7 @@ def rubbed(
 ) -> SampledRecording:
     time = np.arange(round(seconds * RATE)) / RATE
     q, dq, ddq = (slow_waves().derivative(time, order) for order in range(3))
-    s = direction(dq, 1.0 / RATE, presliding)
+    s = friction_direction(dq, 1.0 / RATE, presliding)
     torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq, direction=s), delta)
     return SampledRecording(
         stamps(len(time), RATE), q, torque + noise * np.random.default_rng(seed).normal(size=torque.shape)
@@ -254,7 +254,7 @@ def test_friction_that_is_not_there_is_left_out_and_said() -> None:
         else:
             same = without.base.expressions.index(name)
             assert with_none.beta[number] == pytest.approx(without.beta[same], rel=1e-4, abs=1e-6)
-    assert at_the_edge(with_none.model.config.identification.friction, ("a", "b"), ("coulomb", "stribeck")) == ()
+    assert at_search_bounds(with_none.model.config.identification.friction, ("a", "b"), ("coulomb", "stribeck")) == ()
 
 
 @pytest.mark.slow
@@ -358,12 +358,12 @@ def test_friction_that_is_not_there_adds_no_doubt_of_its_shape() -> None:
 
 def test_a_number_at_the_end_of_its_search_is_said() -> None:
     shape = plain_friction(presliding=(0.05, 0.01), stribeck_velocity=(0.8, 0.02))
-    assert at_the_edge(shape, ("shoulder", "elbow"), ("coulomb", "stribeck")) == (
+    assert at_search_bounds(shape, ("shoulder", "elbow"), ("coulomb", "stribeck")) == (
         "shoulder: its pre-sliding distance of 0.05 is the largest that is searched",
         "shoulder: its Stribeck velocity of 0.8 is the largest that is searched",
         "elbow: its Stribeck velocity of 0.02 is the smallest that is searched",
     )
-    assert len(at_the_edge(shape, ("shoulder", "elbow"), ("coulomb",))) == 1
+    assert len(at_search_bounds(shape, ("shoulder", "elbow"), ("coulomb",))) == 1
 
 
 @pytest.mark.slow

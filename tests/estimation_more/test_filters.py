@@ -18,7 +18,7 @@ from ident_service.estimation.equations import equation_rows, equations, kept_mo
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
-from ident_service.model.friction_state import direction
+from ident_service.model.friction_state import friction_direction
 from ident_service.model.regressor import joint_regressor
 
 RATE = 200.0
@@ -87,7 +87,7 @@ def test_direction_follows_the_smoothed_velocity() -> None:
     C = np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, -2.0]])
     got = kept_motion(noisy(3000), options, C)
     assert got.direction is not None
-    wanted = direction(got.velocity @ C.T, 1.0 / RATE, np.full(3, 0.02))
+    wanted = friction_direction(got.velocity @ C.T, 1.0 / RATE, np.full(3, 0.02))
     np.testing.assert_allclose(got.direction, wanted, rtol=0, atol=1e-9)
 
 

@@ -18,7 +18,7 @@ from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.operations.identification import Identified, Request, identify_files
+from ident_service.operations.identification import IdentificationResult, Request, identify_files
 from ident_service.results.parameter_file import read_parameters
 
 RATE = 250.0
@@ -134,7 +134,9 @@ def test_the_same_recording_twice_is_refused(setting: Setting) -> None:
 
 
 @pytest.fixture(scope="module")
-def everything(setting: Setting, tmp_path_factory: pytest.TempPathFactory) -> tuple[Identified, Path, list[str]]:
+def everything(
+    setting: Setting, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[IdentificationResult, Path, list[str]]:
     """All that can be asked for at once."""
     folder = tmp_path_factory.mktemp("everything") / "out"
     told: list[str] = []
@@ -150,7 +152,9 @@ def parameters_of(folder: Path) -> dict[str, Any]:
     return document
 
 
-def test_the_parameter_file_is_valid_and_the_estimate_s(everything: tuple[Identified, Path, list[str]]) -> None:
+def test_the_parameter_file_is_valid_and_the_estimate_s(
+    everything: tuple[IdentificationResult, Path, list[str]],
+) -> None:
     identified, folder, told = everything
     file = read_parameters(folder / "parameters.json")
     np.testing.assert_array_equal(file.values, identified.estimate.beta)
@@ -165,7 +169,10 @@ def test_the_parameter_file_is_valid_and_the_estimate_s(everything: tuple[Identi
 
 
 def test_verify_proves_it(
-    everything: tuple[Identified, Path, list[str]], setting: Setting, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    everything: tuple[IdentificationResult, Path, list[str]],
+    setting: Setting,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
     path = everything[1] / "parameters.json"
     assert main(["verify", str(path)]) == 0
@@ -196,7 +203,7 @@ def test_verify_proves_it(
         assert ": failed: " in capsys.readouterr().out
 
 
-def test_the_bootstrap_s_deviations(everything: tuple[Identified, Path, list[str]]) -> None:
+def test_the_bootstrap_s_deviations(everything: tuple[IdentificationResult, Path, list[str]]) -> None:
     identified, folder, _ = everything
     drawn = parameters_of(folder)["bootstrap"]
     assert drawn["replicates"] == 10
@@ -208,7 +215,7 @@ def test_the_bootstrap_s_deviations(everything: tuple[Identified, Path, list[str
     assert np.median(ratio) > 0.2
 
 
-def test_the_essential_parameters(everything: tuple[Identified, Path, list[str]]) -> None:
+def test_the_essential_parameters(everything: tuple[IdentificationResult, Path, list[str]]) -> None:
     identified, folder, _ = everything
     found = parameters_of(folder)["essential"]
     assert set(found["expressions"]) <= set(identified.estimate.base.expressions)
@@ -219,7 +226,7 @@ def test_the_essential_parameters(everything: tuple[Identified, Path, list[str]]
     assert error["all"] <= error["essential"] < 1.2 * error["all"]
 
 
-def test_the_sdpa_files_parse(everything: tuple[Identified, Path, list[str]]) -> None:
+def test_the_sdpa_files_parse(everything: tuple[IdentificationResult, Path, list[str]]) -> None:
     identified, folder, _ = everything
     for name in ("feasibility_test", "correction", "constrained_least_squares"):
         assert f"{name}.dat-s" in identified.files

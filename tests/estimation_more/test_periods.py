@@ -16,7 +16,7 @@ from ident_service.errors import RecordingError
 from ident_service.estimation.identify import identify
 from ident_service.estimation.signal_processing import averaged
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.friction_state import direction
+from ident_service.model.friction_state import friction_direction
 
 RATE, PERIOD = 200.0, 5.0
 LENGTH = round(RATE * PERIOD)
@@ -109,7 +109,7 @@ def test_direction_begins_as_the_period_ends() -> None:
     options = OPTIONS.model_copy(update={"friction": plain_friction(presliding=(0.2, 0.05))})
     got = averaged(run(2 * LENGTH), options, PERIOD).motion
     rate = np.tile(periodic(np.arange(LENGTH) / RATE, 1), (6, 1))
-    wanted = direction(rate, 1.0 / RATE, np.array([0.2, 0.05]))[-LENGTH:]
+    wanted = friction_direction(rate, 1.0 / RATE, np.array([0.2, 0.05]))[-LENGTH:]
     assert got.direction is not None
     np.testing.assert_allclose(got.direction, wanted, rtol=0, atol=1e-6)
 

@@ -15,7 +15,7 @@ from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.chain import Chain
-from ident_service.model.information import supports
+from ident_service.model.information import sparsity
 from ident_service.model.parameter_layout import INERTIAL, Layout
 from ident_service.model.regressor import joint_regressor
 
@@ -138,7 +138,7 @@ def test_a_joint_feels_only_its_supports() -> None:
     chain, layout = three_joints(coupling=np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.7, 1.0]]))
     everything = np.arange(layout.size)
     H = joint_regressor(chain, layout, *random_states(np.random.default_rng(7), 30, 3))
-    for joint, support in enumerate(supports(chain, layout, everything)):
+    for joint, support in enumerate(sparsity(chain, layout, everything)):
         outside = np.setdiff1d(everything, support)
         assert not H[joint, outside].any()
     # The third drive's friction is felt by the second joint, and not by the first.

@@ -15,7 +15,7 @@ from ident_service.errors import RecordingError
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import weighted_least_squares
-from ident_service.estimation.robust_regression import standstill_shares
+from ident_service.estimation.robust_regression import standstill_weights
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
 
@@ -47,11 +47,11 @@ def off(model: ArmModel, delta: np.ndarray, gathered: Equations) -> float:
 def test_rows_that_the_model_explains_count_in_full_and_others_as_they_deserve() -> None:
     model, delta = arm()
     base = base_parameters(model.chain, model.layout)
-    good = standstill_shares(equations(measured(model, delta, 1.0), model, base))
+    good = standstill_weights(equations(measured(model, delta, 1.0), model, base))
     assert np.all(good > 0.8)
     assert np.all(good <= 1.0)
     gathered = equations(measured(model, delta, 30.0), model, base)
-    shares = standstill_shares(gathered)
+    shares = standstill_weights(gathered)
     # Rows near standstill are also those within 0.1 s of slow ones, whose noise is small.
     assert np.all(shares > 1.0 / 40.0)
     assert np.all(shares < 1.0 / 10.0)
@@ -77,7 +77,7 @@ def test_a_motion_that_turns_round_all_the_time_is_identified() -> None:
     recording = recorded(busy, delta, Fast(), rate=RATE, seconds=20.0)  # type: ignore[arg-type]
     gathered = equations(recording, busy, base)
     assert gathered.total.rows.max() == 0
-    np.testing.assert_array_equal(standstill_shares(gathered), 1.0)
+    np.testing.assert_array_equal(standstill_weights(gathered), 1.0)
     estimate = identify(busy, [recording], method="wls")
     torque = np.sqrt(gathered.everything.squared_torques().sum())
     errors = gathered.everything.squared_residuals(estimate.fit.beta)

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ident_service.model.symbolic import Program, Symbol, Tape, Value
+from ident_service.model.symbolic import ExpressionGraph, Program, Symbol, Value
 
 SAMPLES = 5
 CONSTANTS = (0.0, 1.0, -1.0, 2.0, 3.0, 0.5, -2.0)
 UNARY = {"sin": np.sin, "cos": np.cos, "abs": np.abs, "exp": np.exp}
 
 
-def run(tape: Tape, outputs: list[Value], inputs: np.ndarray) -> np.ndarray:
+def run(tape: ExpressionGraph, outputs: list[Value], inputs: np.ndarray) -> np.ndarray:
     result = np.full((len(outputs), inputs.shape[1]), np.nan)
     Program(tape, outputs).run(list(inputs), list(result))
     return result
@@ -31,7 +31,9 @@ def recipes(draw: st.DrawFn) -> list[tuple[str, int, int]]:
     return draw(st.lists(st.tuples(operations, st.integers(0, 11), st.integers(0, 11)), min_size=1, max_size=40))
 
 
-def followed(recipe: list[tuple[str, int, int]], tape: Tape, inputs: np.ndarray) -> list[tuple[Value, np.ndarray]]:
+def followed(
+    recipe: list[tuple[str, int, int]], tape: ExpressionGraph, inputs: np.ndarray
+) -> list[tuple[Value, np.ndarray]]:
     """Every value of a recipe, as the tape has it and as numpy has it."""
     values: list[tuple[Value, np.ndarray]] = [(tape.input(), row) for row in inputs]
     for operation, first, second in recipe:
@@ -57,7 +59,7 @@ def followed(recipe: list[tuple[str, int, int]], tape: Tape, inputs: np.ndarray)
 
 @given(recipe=recipes(), seed=st.integers(0, 2**16), data=st.data())
 def test_random_expressions_equal_numpy(recipe: list[tuple[str, int, int]], seed: int, data: st.DataObject) -> None:
-    tape, inputs = Tape(), states(seed, 4)
+    tape, inputs = ExpressionGraph(), states(seed, 4)
     values = followed(recipe, tape, inputs)
     # Any of them may be wanted, any of them more than once, in any order: inputs and constants too.
     chosen = data.draw(st.lists(st.integers(0, len(values) - 1), min_size=1, max_size=12))
@@ -67,7 +69,7 @@ def test_random_expressions_equal_numpy(recipe: list[tuple[str, int, int]], seed
 
 
 def test_inputs_are_not_written_to() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     inputs = states(1, 2)
     before = inputs.copy()
@@ -77,7 +79,7 @@ def test_inputs_are_not_written_to() -> None:
 
 def test_a_step_s_number_is_not_a_constant() -> None:
     # Step 2 and the constant 2.0 are equal and have the same hash.
-    tape = Tape()
+    tape = ExpressionGraph()
     symbols = [tape.input() for _ in range(4)]
     inputs = states(2, 4)
     for a in range(4):
@@ -90,7 +92,7 @@ def test_a_step_s_number_is_not_a_constant() -> None:
 
 
 def test_whole_numbers_are_constants_too() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     inputs = states(3, 2)
     wanted = [inputs[0] * 3, inputs[0] + 1, inputs[1] - 1, 1 - inputs[1]]
@@ -98,7 +100,7 @@ def test_whole_numbers_are_constants_too() -> None:
 
 
 def test_constants_are_folded() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x = tape.input()
     assert x * 0.0 == 0.0
     assert 0.0 * x == 0.0
@@ -114,7 +116,7 @@ def test_constants_are_folded() -> None:
 
 
 def test_equal_steps_are_shared() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     assert x * y is y * x
     assert x + y is y + x
@@ -128,7 +130,7 @@ def test_equal_steps_are_shared() -> None:
 
 
 def test_only_what_is_wanted_is_computed() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     _ = tape.apply("sin", x) + y
     assert Program(tape, [x * y]).steps == 1
@@ -136,7 +138,7 @@ def test_only_what_is_wanted_is_computed() -> None:
 
 
 def test_the_same_value_twice_an_input_and_a_constant() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     product, inputs = x * y, states(4, 2)
     outputs: list[Value] = [product, 7.0, product, y, product + 1.0, y, 0.0]
@@ -149,7 +151,7 @@ def test_the_same_value_twice_an_input_and_a_constant() -> None:
 @pytest.mark.parametrize("length", [3, 50])
 def test_memory_is_used_again(length: int) -> None:
     # A long chain of steps whose every value is needed only once, beside one that is needed at the very end.
-    tape = Tape()
+    tape = ExpressionGraph()
     x = tape.input()
     early = tape.apply("cos", x)
     value: Value = x
@@ -167,7 +169,7 @@ def test_memory_is_used_again(length: int) -> None:
 
 
 def test_a_program_runs_again_and_into_strided_rows() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     program = Program(tape, [x * y + x, tape.apply("exp", x * y)])
     for seed in range(3):

@@ -21,7 +21,7 @@ from ident_service.estimation.least_squares import ordinary_least_squares, weigh
 from ident_service.estimation.robust_regression import huber
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
-from ident_service.model.information import Information, information_of, supports
+from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.parameter_file import parameters_document, write_parameters
 
@@ -40,7 +40,7 @@ def rows(seed: int, deviations: tuple[float, ...], samples: int = 150) -> tuple[
     states = rng.uniform(-2.0, 2.0, size=(3, samples, 3))
     H_b = joint_regressor(model.chain, model.layout, *states, base.base)
     torque = np.einsum("jps,p->sj", H_b, base.K @ delta) + rng.normal(size=(samples, 3)) * np.array(deviations)
-    felt = supports(model.chain, model.layout, base.base)
+    felt = sparsity(model.chain, model.layout, base.base)
     return H_b, torque, information_of(H_b, torque, np.ones(torque.shape, dtype=bool), felt)
 
 

@@ -10,10 +10,18 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.design import family, settled
+from ident_service.excitation.design import complete_task, family
 from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.search import Candidate, Interrupted, Stopped, climbed, keeps, kept, random_variables
+from ident_service.excitation.search import (
+    Candidate,
+    Interrupted,
+    InterruptedWithResult,
+    best_feasible,
+    local_search,
+    random_variables,
+    within_limits,
+)
 
 Array = np.ndarray
 SEEDS = st.integers(0, 2**32 - 1)
@@ -22,7 +30,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 def bench() -> tuple[Problem, Array]:
     """A small problem, and standing still in its safe posture."""
     model, design = small(), quick()
-    task = settled(model, design, *family(design, model))
+    task = complete_task(model, design, *family(design, model))
     return Problem(task, 60), task.basis.standing(safe_posture(model, task.limits))
 
 
@@ -46,9 +54,9 @@ def after(calls: int) -> Callable[[], None]:
 @given(seed=SEEDS, size=st.sampled_from([0.0, 1e-3, 1.0, 10.0, 1e3, 1e6]))
 def test_what_is_kept_keeps_all_limits_even_from_absurd_motions(seed: int, size: float) -> None:
     x = size * np.random.default_rng(seed).normal(size=PROBLEM.size)
-    candidate = kept(PROBLEM, x, SAFE, 7)
+    candidate = best_feasible(PROBLEM, x, SAFE, 7)
     assert candidate.start == 7
-    assert keeps(PROBLEM, candidate.coefficients)
+    assert within_limits(PROBLEM, candidate.coefficients)
     assert np.isfinite(candidate.value)
 
 
@@ -57,14 +65,14 @@ def test_what_is_kept_keeps_all_limits_even_from_absurd_motions(seed: int, size:
 @given(seed=SEEDS, size=st.sampled_from([0.3, 1.0, 3.0]))
 def test_what_is_kept_is_the_largest_motion_that_keeps_the_limits(seed: int, size: float) -> None:
     X = PROBLEM.coefficients(size * np.random.default_rng(seed).normal(size=PROBLEM.size))
-    candidate = kept(PROBLEM, PROBLEM.variables(X), SAFE, 0)
-    if keeps(PROBLEM, X):
+    candidate = best_feasible(PROBLEM, PROBLEM.variables(X), SAFE, 0)
+    if within_limits(PROBLEM, X):
         np.testing.assert_allclose(candidate.coefficients, X, atol=1e-12)
         return
     middle = PROBLEM.task.basis.still(X)
-    anchor = middle if keeps(PROBLEM, middle) else SAFE
+    anchor = middle if within_limits(PROBLEM, middle) else SAFE
     larger = anchor + 1.01 * (candidate.coefficients - anchor)
-    assert not keeps(PROBLEM, larger)
+    assert not within_limits(PROBLEM, larger)
 
 
 @settings(max_examples=40)
@@ -81,39 +89,39 @@ def test_a_random_start_is_a_motion_about_a_posture_within_the_limits(seed: int)
 @pytest.mark.parametrize("size", [0.1, 1.0])
 def test_a_climb_ends_in_a_moving_motion_that_keeps_all_limits(size: float) -> None:
     x = size * np.random.default_rng(1).normal(size=PROBLEM.size)
-    candidate = climbed(PROBLEM, x, SAFE, 3, lambda: None)
-    assert keeps(PROBLEM, candidate.coefficients)
+    candidate = local_search(PROBLEM, x, SAFE, 3, lambda: None)
+    assert within_limits(PROBLEM, candidate.coefficients)
     assert np.ptp(PROBLEM.task.basis.path(candidate.coefficients).at(np.linspace(0.0, 7.0, 200))[0], axis=0).min() > 0.1
-    assert candidate.value < kept(PROBLEM, x, SAFE, 3).value
+    assert candidate.value < best_feasible(PROBLEM, x, SAFE, 3).value
 
 
 @pytest.mark.parametrize("calls", [0, 1, 5, 40, 100])
 def test_an_interrupted_climb_hands_over_what_it_has(calls: int) -> None:
     x = random_variables(PROBLEM, np.random.default_rng(2), SAFE)
-    with pytest.raises(Stopped) as caught:
-        climbed(PROBLEM, x, SAFE, 3, after(calls))
-    assert keeps(PROBLEM, caught.value.candidate.coefficients)
+    with pytest.raises(InterruptedWithResult) as caught:
+        local_search(PROBLEM, x, SAFE, 3, after(calls))
+    assert within_limits(PROBLEM, caught.value.candidate.coefficients)
 
 
 @pytest.fixture(scope="module")
 def good() -> Candidate:
     """What one start has climbed to."""
-    return climbed(PROBLEM, random_variables(PROBLEM, np.random.default_rng(2), SAFE), SAFE, 3, lambda: None)
+    return local_search(PROBLEM, random_variables(PROBLEM, np.random.default_rng(2), SAFE), SAFE, 3, lambda: None)
 
 
 @pytest.mark.parametrize("calls", [0, 1, 30, 65, 80, 120])
 def test_a_polish_makes_nothing_worse_however_early_it_ends(good: Candidate, calls: int) -> None:
     try:
-        polished = climbed(PROBLEM, PROBLEM.variables(good.coefficients), SAFE, 3, after(calls), polish=True)
-    except Stopped as stopped:
+        polished = local_search(PROBLEM, PROBLEM.variables(good.coefficients), SAFE, 3, after(calls), polish=True)
+    except InterruptedWithResult as stopped:
         polished = stopped.candidate
-    assert keeps(PROBLEM, polished.coefficients)
+    assert within_limits(PROBLEM, polished.coefficients)
     assert polished.value <= good.value + 1e-9
 
 
 @pytest.mark.slow
 def test_the_same_start_climbs_the_same_way_twice() -> None:
     x = random_variables(PROBLEM, np.random.default_rng(4), SAFE)
-    one, other = (climbed(PROBLEM, x.copy(), SAFE, 4, lambda: None) for _ in range(2))
+    one, other = (local_search(PROBLEM, x.copy(), SAFE, 4, lambda: None) for _ in range(2))
     assert one.value == other.value
     np.testing.assert_array_equal(one.coefficients, other.coefficients)

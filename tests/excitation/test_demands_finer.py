@@ -17,7 +17,7 @@ from ident_service.config.motion_design import Supply
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import per_period
-from ident_service.excitation.limit_proof import Demands, demands, power_bounds, stretches, torque_enclosures
+from ident_service.excitation.limit_proof import PeakBounds, demands, power_bounds, stretches, torque_enclosures
 from ident_service.excitation.trajectory import FourierBasis, FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model, control_model
 from ident_service.model.parameter_layout import Layout
@@ -73,7 +73,7 @@ def fine_samples(path: FourierPath | PosturePath, finer: int) -> Iterator[Array]
 
 
 def sampled(path: FourierPath | PosturePath, model: ArmModel, finer: int) -> dict[str, Array]:
-    """The largest that is found of everything, by the names of `Demands`."""
+    """The largest that is found of everything, by the names of `PeakBounds`."""
     found: dict[str, Array] = {}
     delta = control_model(model).prior
     for time in fine_samples(path, finer):
@@ -89,7 +89,7 @@ def sampled(path: FourierPath | PosturePath, model: ArmModel, finer: int) -> dic
     return found
 
 
-def assert_bounds(asked: Demands, found: dict[str, Array]) -> None:
+def assert_bounds(asked: PeakBounds, found: dict[str, Array]) -> None:
     assert (asked.lowest <= found["lowest"] + ROUNDING).all()
     for name in ("highest", "velocity", "acceleration", "jerk", "torque", "power"):
         bound = np.asarray(getattr(asked, name))

@@ -12,7 +12,7 @@ from design_bench import ONE_START, moves, quick, small, unproven
 
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.design import Designed, criterion_of, design_motion, family, settled
+from ident_service.excitation.design import Designed, complete_task, criterion_of, design_motion, family
 from ident_service.excitation.motion_file import excitation_from_json
 from ident_service.excitation.optimal_design import usable_limits
 from ident_service.excitation.search import Budget
@@ -90,7 +90,7 @@ def test_the_file_says_how_the_motion_was_made_and_what_was_proven() -> None:
 def test_more_starts_are_never_worse(starts: int) -> None:
     model, design = small(), quick()
     basis, base = family(design, model)
-    task = settled(model, design, basis, base)
+    task = complete_task(model, design, basis, base)
     few, more = (designed_once("planar2", "d_optimal", n) for n in (1, starts))
     worse, better = (criterion_of(task, designed.excitation.path, base) for designed in (few, more))
     assert better <= worse + 0.02  # a proof may cost the better one a little

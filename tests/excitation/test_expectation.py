@@ -11,7 +11,7 @@ from motions import random_fourier_path
 
 from ident_service.config.arm import Control
 from ident_service.config.motion_limits import motion_limits
-from ident_service.excitation.design import criterion_of, design_motion, family, settled
+from ident_service.excitation.design import complete_task, criterion_of, design_motion, family
 from ident_service.excitation.prediction import (
     NoiseModel,
     described_noise,
@@ -130,7 +130,7 @@ def test_a_motion_designed_with_earlier_information_teaches_more_of_the_rest(see
     added = np.diag(np.where(known, 1e6 / expected_deviations(without, model, base, noise) ** 2, 0.0))
     with_added = design_motion(model, design, seed=seed, budget=ONE_START, added=added).excitation.path
     deviations = [expected_deviations(path, model, base, noise, added) for path in (without, with_added)]
-    task = settled(model, design, basis, base, added=added)
+    task = complete_task(model, design, basis, base, added=added)
     assert criterion_of(task, with_added, base) < criterion_of(task, without, base)
     assert task.scale is not None
     before, after = ((part / task.scale)[~known] ** 2 for part in deviations)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.motion_limits import motion_limits
-from ident_service.excitation.prediction import forecast, rate_of_change
+from ident_service.excitation.prediction import predict_following_error, rate_of_change
 from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.regressor import joint_regressor
 
@@ -40,7 +40,7 @@ def test_the_forecast_is_friction_through_the_mass_matrix_and_the_gains(seed: in
     rate = model.chain.coupling @ dq
     torque = model.chain.coupling.T @ (task.friction.coulomb * np.sign(rate) + task.friction.viscous * rate)
     expected = UNKNOWN * np.abs(np.linalg.solve(M, torque) / task.limits.kp)
-    found = forecast(model, task.limits, task.friction, q[None], dq[None])
+    found = predict_following_error(model, task.limits, task.friction, q[None], dq[None])
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
 
@@ -56,7 +56,7 @@ def test_the_mass_matrix_above_is_pinocchio_s() -> None:
     M = pin.crba(reference, reference.createData(), q)
     M = np.triu(M) + np.triu(M, 1).T + np.diag(model.layout.term_values("drive_inertia", model.prior))
     friction = ExpectedFriction(np.array([1.0, 2.0, 3.0]), np.zeros(3), np.zeros(3))
-    found = forecast(model, task.limits, friction, q[None], np.ones((1, 3)))
+    found = predict_following_error(model, task.limits, friction, q[None], np.ones((1, 3)))
     expected = UNKNOWN * np.abs(np.linalg.solve(M, friction.coulomb)) / task.limits.kp
     np.testing.assert_allclose(found, expected, rtol=1e-8)
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.excitation.design import family, settled
+from ident_service.excitation.design import complete_task, family
 from ident_service.excitation.optimal_design import Problem, usable_limits
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.search import keeps
+from ident_service.excitation.search import within_limits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 
@@ -58,8 +58,8 @@ def test_a_posture_is_not_at_the_end_of_a_range() -> None:
     posture = safe_posture(model, limits)
     assert ((limits.lower < posture) & (posture < limits.upper)).all()
     basis, base = family(quick(), model)
-    problem = Problem(settled(model, quick(), basis, base), 40)
-    assert keeps(problem, basis.standing(posture))
+    problem = Problem(complete_task(model, quick(), basis, base), 40)
+    assert within_limits(problem, basis.standing(posture))
 
 
 def test_the_same_seed_finds_the_same_posture() -> None:

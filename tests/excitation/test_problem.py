@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from ident_service.config.motion_design import Design, Workspace
 from ident_service.config.motion_limits import MotorLimits
-from ident_service.excitation.design import family, settled
+from ident_service.excitation.design import complete_task, family
 from ident_service.excitation.optimal_design import Problem, usable_limits
-from ident_service.excitation.search import keeps
+from ident_service.excitation.search import within_limits
 from ident_service.excitation.trajectory import Basis
 from ident_service.model.base_parameters import static_base_parameters
 from ident_service.model.regressor import joint_regressor
@@ -162,18 +162,18 @@ def test_what_keeps_the_limits_keeps_them_at_every_sample(basis: Basis, seed: in
     assert room <= 0.0 or not inside or room <= 0.004 + 1e-9
     if found["torque"].max() <= 0.0:
         assert (torque <= limits.torque).all()
-    assert keeps(problem, X) == (max(float(values.max()) for values in found.values()) <= 0.0)
+    assert within_limits(problem, X) == (max(float(values.max()) for values in found.values()) <= 0.0)
 
 
 def test_standing_still_in_a_good_posture_keeps_all_limits_and_ten_times_a_motion_does_not() -> None:
     model, design = small(), quick()
     basis, base = family(design, model)
-    problem = Problem(settled(model, design, basis, base), 60)
+    problem = Problem(complete_task(model, design, basis, base), 60)
     hanging = basis.standing(np.array([-1.5, 0.0]))
-    assert keeps(problem, hanging)
+    assert within_limits(problem, hanging)
     slight = 0.05 * np.where(basis.moving, 1.0, 0.0)
-    assert keeps(problem, hanging + slight)
-    assert not keeps(problem, hanging + 100.0 * slight)
+    assert within_limits(problem, hanging + slight)
+    assert not within_limits(problem, hanging + 100.0 * slight)
 
 
 def test_a_model_without_a_prior_has_no_torque_to_look_at() -> None:

@@ -12,17 +12,17 @@ import pytest
 from design_bench import quick, small
 
 from ident_service.excitation import search as searching
-from ident_service.excitation.design import family, settled
+from ident_service.excitation.design import complete_task, family
 from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.search import Budget, Found, Progress, keeps, search
+from ident_service.excitation.search import Budget, Progress, SearchResult, search, within_limits
 
 GRID = 60
 
 
 def bench() -> tuple[Any, np.ndarray]:
     model, design = small(), quick()
-    task = settled(model, design, *family(design, model))
+    task = complete_task(model, design, *family(design, model))
     return task, safe_posture(model, task.limits)
 
 
@@ -30,12 +30,12 @@ TASK, SAFE = bench()
 COARSE, FINE = Problem(TASK, GRID), Problem(TASK, 2 * GRID)
 
 
-def starts(number: int | None, workers: int = 1, seconds: float | None = None, **options: Any) -> Found:
+def starts(number: int | None, workers: int = 1, seconds: float | None = None, **options: Any) -> SearchResult:
     return search(TASK, SAFE, options.pop("seed", 5), Budget(seconds, number, workers), GRID, **options)
 
 
 @lru_cache
-def searched(number: int) -> tuple[Found, tuple[Progress, ...]]:
+def searched(number: int) -> tuple[SearchResult, tuple[Progress, ...]]:
     """A search in this process that several tests look at, and what it told."""
     told: list[Progress] = []
     return starts(number, tell=told.append), tuple(told)
@@ -48,7 +48,7 @@ def ticking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(searching, "time", SimpleNamespace(monotonic=lambda: 2e-3 * next(ticks)))
 
 
-def assert_same(one: Found, other: Found) -> None:
+def assert_same(one: SearchResult, other: SearchResult) -> None:
     assert (one.seed, one.finished, len(one.candidates)) == (other.seed, other.finished, len(other.candidates))
     for first, second in zip(one.candidates, other.candidates, strict=True):
         assert (first.start, first.value) == (second.start, second.value)
@@ -80,7 +80,7 @@ def test_candidates_keep_all_limits_and_the_best_comes_first() -> None:
     values = [candidate.value for candidate in found.candidates]
     assert values == sorted(values)
     for candidate in found.candidates:
-        assert keeps(FINE, candidate.coefficients)
+        assert within_limits(FINE, candidate.coefficients)
 
 
 @pytest.mark.slow
@@ -112,13 +112,13 @@ def test_without_a_single_start_the_arm_stands_still() -> None:
     assert found.finished == 0
     (candidate,) = found.candidates
     np.testing.assert_array_equal(candidate.coefficients, TASK.basis.standing(SAFE))
-    assert keeps(COARSE, candidate.coefficients)
+    assert within_limits(COARSE, candidate.coefficients)
 
 
 def test_a_search_that_is_cancelled_at_once_has_a_candidate() -> None:
     found = starts(100, cancelled=lambda: True)
     assert found.finished == 0
-    assert keeps(COARSE, found.candidates[0].coefficients)
+    assert within_limits(COARSE, found.candidates[0].coefficients)
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_cancelling_ends_a_search_soon_with_what_it_has() -> None:
     # What is under way is let go at the next question; a few more are asked on the way out.
     assert asked[0] < 420
     assert 0 < found.finished < 100
-    assert keeps(COARSE, found.candidates[0].coefficients)
+    assert within_limits(COARSE, found.candidates[0].coefficients)
     assert found.candidates[0].start >= 0
 
 
@@ -151,16 +151,16 @@ def test_a_budget_of_time_is_kept(ticking: None) -> None:
     found = starts(None, seconds=1.0)
     assert 0.6 < found.seconds < 1.05
     assert found.finished > 0
-    assert keeps(COARSE, found.candidates[0].coefficients)
+    assert within_limits(COARSE, found.candidates[0].coefficients)
 
 
 def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate(ticking: None) -> None:
     found = starts(None, seconds=0.01)
-    assert keeps(COARSE, found.candidates[0].coefficients)
+    assert within_limits(COARSE, found.candidates[0].coefficients)
 
 
 def test_time_spent_is_added_up(ticking: None) -> None:
-    found = starts(0, earlier=Found(5, 3, 100.0, ()))
+    found = starts(0, earlier=SearchResult(5, 3, 100.0, ()))
     assert found.finished == 3
     assert 100.0 < found.seconds < 100.1
 

@@ -16,13 +16,13 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.active_limits import binding, binding_words, gain_words, needed_stiffness, stiffer_gains
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import criterion_of, design_motion, family, per_period, settled
-from ident_service.excitation.limit_proof import certified_clearance, largest_proven, objections, proof_of
+from ident_service.excitation.design import complete_task, criterion_of, design_motion, family, per_period
+from ident_service.excitation.limit_proof import certified_clearance, proof_of, scale_to_verified, violations
 from ident_service.excitation.mending import Prover
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import Problem, Task
 from ident_service.excitation.postures import safe_posture
-from ident_service.excitation.search import Candidate, climbed, random_variables
+from ident_service.excitation.search import Candidate, local_search, random_variables
 from ident_service.excitation.tracking import cases, track, way_width
 from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
@@ -85,7 +85,7 @@ def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -
     model = small(joints=soft, **SLOW)
     path = excitation(model, "identification").path
     limits = motion_limits(model.config)
-    found = objections(proof_of(path, model, limits, CollisionModel(model)), model, limits)
+    found = violations(proof_of(path, model, limits, CollisionModel(model)), model, limits)
     assert any("falls behind" in one or "catches up" in one for one in found)
     with pytest.raises(MotionRefused, match="none is one that the arm can follow"):
         design_motion(model, quick(), budget=ONE_START)
@@ -118,16 +118,16 @@ def test_the_last_ramp_of_a_motion_of_many_periods_has_the_tube_of_the_simulated
 
 def polished(model: ArmModel, design: Design) -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
     """A task, the best motion of one start, and what a polish from there finds for another task."""
-    task = settled(model, design, *family(design, model))
+    task = complete_task(model, design, *family(design, model))
     safe = task.basis.standing(safe_posture(model, task.limits))
     problem = Problem(task, per_period(task.basis))
     x = random_variables(problem, np.random.default_rng(1), safe)
-    start = climbed(problem, x, safe, 0, lambda: None).coefficients
-    best = climbed(problem, problem.variables(start), safe, 0, lambda: None, polish=True)
+    start = local_search(problem, x, safe, 0, lambda: None).coefficients
+    best = local_search(problem, problem.variables(start), safe, 0, lambda: None, polish=True)
 
     def from_there(other: Task) -> Candidate:
         problem = Problem(other, per_period(other.basis))
-        return climbed(problem, problem.variables(best.coefficients), safe, 0, lambda: None, polish=True)
+        return local_search(problem, problem.variables(best.coefficients), safe, 0, lambda: None, polish=True)
 
     return task, best, from_there
 
@@ -219,7 +219,7 @@ def test_where_a_motion_s_own_middle_is_a_bad_place_it_shrinks_towards_the_safe_
         """Next to an obstacle at one hardly anything can be proven, farther away half of the motion."""
         return coefficients if coefficients[0, 0] <= (0.05 if coefficients[0, -1] > 0.6 else 0.6) else None
 
-    found = largest_proven(FOURIER, motion, safe, proven)
+    found = scale_to_verified(FOURIER, motion, safe, proven)
     assert found is not None
     assert found[0][0, 0] > 0.5
 
@@ -263,7 +263,7 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
     assert mended is not None
     assert mended.value < smaller.value - 0.01
     assert mended.result is not None
-    assert not objections(mended.result[1], model, task.limits)
+    assert not violations(mended.result[1], model, task.limits)
 
 
 def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:

@@ -18,7 +18,7 @@ from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.dynamic_model import DynamicModel
-from ident_service.model.friction_state import direction as directions
+from ident_service.model.friction_state import friction_direction as directions
 from ident_service.model.regressor import joint_regressor
 from ident_service.results import load_model
 from ident_service.results.export import c_header as writer

@@ -33,7 +33,7 @@ from ident_service.model.urdf import urdf_text
 from ident_service.results.export import urdf as urdf_file
 from ident_service.results.export.bodies import is_real, moved
 from ident_service.results.export.identified_arm import IdentifiedArm
-from ident_service.results.export.round_trip import carried
+from ident_service.results.export.round_trip import supported_terms
 from ident_service.results.export.urdf import original_urdf, urdf_export, xml_places
 
 Array = np.ndarray
@@ -380,7 +380,7 @@ def test_what_is_no_body_is_told_from_what_is() -> None:
 
 def test_shared_drives_carry_nothing(tmp_path: Path) -> None:
     model = arm_model(load_arm("tx40"))
-    has = carried(model, some_delta(model), ("viscous", "coulomb"))
+    has = supported_terms(model, some_delta(model), ("viscous", "coulomb"))
     np.testing.assert_array_equal(has["viscous"], [True] * 4 + [False] * 2)
     assert bodies_of(model.layout, some_delta(model)).shape == (6, 10)
 

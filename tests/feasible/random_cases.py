@@ -10,7 +10,7 @@ from helpers.random_arms import random_chain
 from ident_service.config.arm import ArmConfig, JointTerm
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
 from ident_service.model.base_parameters import BaseParameters, base_parameters
-from ident_service.model.information import Information, information_of, supports
+from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
@@ -75,7 +75,7 @@ def random_case(seed: int, joints: int | None = None, noise: float | None = None
     share = 10.0 ** rng.uniform(-4.0, -0.5) if noise is None else noise
     torque = torque + share * torque.std(axis=0) * rng.normal(size=torque.shape)
     information = information_of(
-        np.ascontiguousarray(H[:, base.base]), torque, np.ones(torque.shape, bool), supports(chain, layout, base.base)
+        np.ascontiguousarray(H[:, base.base]), torque, np.ones(torque.shape, bool), sparsity(chain, layout, base.base)
     )
     return RandomCase(layout, base, delta, information, ordinary_least_squares(information))
 

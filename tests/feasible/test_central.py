@@ -11,9 +11,9 @@ from feasible.random_cases import random_case
 
 from ident_service.config.arm import FeasibleSetName
 from ident_service.config.load import load_arm
-from ident_service.estimation.feasible.central import Near, central
+from ident_service.estimation.feasible.central import ChangeEllipsoid, centre
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, reference, symmetric
-from ident_service.estimation.feasible.formulation import EPSILON, Lift
+from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap
 from ident_service.estimation.feasible.problems import constrained_least_squares, feasibility_test
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters
@@ -29,7 +29,7 @@ def of(name: str) -> tuple[ArmModel, BaseParameters]:
 
 def other_body(delta: np.ndarray, base: BaseParameters, inside: FeasibleSet, seed: int) -> np.ndarray:
     """Another feasible body with the same base parameters, two thirds of the way to the boundary."""
-    direction = Lift(base).of_dependent @ np.random.default_rng(seed).normal(size=len(base.dependent))
+    direction = LinkParameterMap(base).of_dependent @ np.random.default_rng(seed).normal(size=len(base.dependent))
     length = 1.0
     while inside.margin(delta + 1.5 * length * direction)[0] <= 0.0:
         length *= 0.7
@@ -44,11 +44,11 @@ def test_every_body_with_the_same_base_parameters_leads_to_the_same_one(arm: str
     conditions = feasible_set(kind, base.names, model.config)
     start = feasibility_test(base.K @ model.layout.vector(model.config.driver.truth), base, conditions).delta  # type: ignore[union-attr, arg-type]
     assert conditions.margin(start)[0] > 0.0
-    found = central(start, base, conditions)
+    found = centre(start, base, conditions)
     np.testing.assert_allclose(base.K @ found, base.K @ start, rtol=0, atol=1e-12 * np.abs(base.K @ start).max())
     assert conditions.margin(found)[0] > 0.0
     for seed in range(3):
-        again = central(other_body(start, base, conditions, seed), base, conditions)
+        again = centre(other_body(start, base, conditions, seed), base, conditions)
         np.testing.assert_allclose(again, found, rtol=1e-7, atol=1e-9)
 
 
@@ -61,8 +61,8 @@ def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool
     metric, may = 30.0 * rng.normal(size=(base.size, base.size)), np.arange(base.size) < base.size - 2
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
     start = feasibility_test(base.K @ model.layout.vector(model.config.driver.truth), base, conditions).delta  # type: ignore[union-attr, arg-type]
-    near = Near(base.K @ start, metric, may) if moves else None
-    found = central(start, base, conditions, bodies, near)
+    near = ChangeEllipsoid(base.K @ start, metric, may) if moves else None
+    found = centre(start, base, conditions, bodies, near)
     delta = cp.Variable(len(start))
     terms = []
     inset = 0.5 * min(EPSILON, conditions.margin(start)[0])
@@ -107,7 +107,7 @@ def test_symmetry_planes_stay_exact_and_what_is_determined_stays_where_it_is() -
     conditions = feasible_set("pseudo_inertia", base.names, config)
     assert conditions.equalities
     start = feasibility_test(base.K @ model.prior, base, conditions).delta  # type: ignore[operator]
-    found = central(start, base, conditions)
+    found = centre(start, base, conditions)
     assert conditions.violation(found)[0] < 1e-9
     np.testing.assert_allclose(base.K @ found, base.K @ start, rtol=0, atol=1e-12)
 

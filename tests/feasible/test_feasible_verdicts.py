@@ -10,7 +10,7 @@ from feasible.random_cases import one_link, random_case
 from ident_service.config.arm import Constraints, FeasibleSetName
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, symmetric
-from ident_service.estimation.feasible.formulation import ConditionsError, contradiction
+from ident_service.estimation.feasible.formulation import ConditionsError, conflicting_constraints
 from ident_service.estimation.feasible.problems import EPSILON, feasibility_correction, feasibility_test
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions
 from ident_service.model.parameter_layout import INERTIAL
@@ -87,7 +87,7 @@ def test_conditions_that_contradict_each_other_are_named() -> None:
     base = base_from_expressions(("Lzz1",), NAMES)
     conditions = torn(mass=[5.0, 6.0])
     wanted = {"link 1: mass within 5..6 kg", "total mass at most 3 kg"}
-    assert set(contradiction(conditions)) == wanted
+    assert set(conflicting_constraints(conditions)) == wanted
     for error in (ParameterError, SolverError, ConditionsError):
         with pytest.raises(error, match="total mass at most 3 kg") as caught:
             feasibility_correction(np.array([1.0]), base, conditions)
@@ -100,12 +100,12 @@ def test_a_symmetry_that_contradicts_a_box_is_named() -> None:
     box = {"lower": [-0.1, -0.1, 0.1], "upper": [0.1, 0.1, 0.2]}
     conditions = torn(center_of_mass=box, symmetry=["xy"], mass=[1.0, 2.0])
     assert {"link 1: centre of mass inside its box", "link 1: symmetric about its xy plane"} <= set(
-        contradiction(conditions)
+        conflicting_constraints(conditions)
     )
 
 
 def test_conditions_that_some_body_fulfils_contradict_nothing() -> None:
-    assert contradiction(torn(mass=[1.0, 2.0], symmetry=["xy"])) == ()
+    assert conflicting_constraints(torn(mass=[1.0, 2.0], symmetry=["xy"])) == ()
 
 
 def covariance_of(case_covariance: np.ndarray, mix: np.ndarray) -> np.ndarray:

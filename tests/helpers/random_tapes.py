@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 
-from ident_service.model.symbolic import Symbol, Tape, Value
+from ident_service.model.symbolic import ExpressionGraph, Symbol, Value
 
 Recipe = list[tuple[str, int, int]]
 OPERATIONS = ("add", "sub", "mul", "neg", "sin", "cos", "exp", "abs", "sign", "constant")
@@ -20,7 +20,7 @@ def recipes(longest: int = 25) -> st.SearchStrategy[Recipe]:
     return st.lists(st.tuples(st.sampled_from(OPERATIONS), operand, operand), min_size=1, max_size=longest)
 
 
-def followed(recipe: Recipe, tape: Tape, inputs: list[np.ndarray]) -> list[tuple[Value, np.ndarray]]:
+def followed(recipe: Recipe, tape: ExpressionGraph, inputs: list[np.ndarray]) -> list[tuple[Value, np.ndarray]]:
     """Every value of a recipe, as the tape has it and as numpy has it; steps that grow too large are left out.
 
     Args:
@@ -39,7 +39,11 @@ def followed(recipe: Recipe, tape: Tape, inputs: list[np.ndarray]) -> list[tuple
 
 
 def _step(
-    operation: str, tape: Tape, first: tuple[Value, np.ndarray], second: tuple[Value, np.ndarray], constant: float
+    operation: str,
+    tape: ExpressionGraph,
+    first: tuple[Value, np.ndarray],
+    second: tuple[Value, np.ndarray],
+    constant: float,
 ) -> tuple[Value, np.ndarray] | None:
     (a, x), (b, y) = first, second
     if operation == "constant":

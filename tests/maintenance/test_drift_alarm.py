@@ -11,8 +11,8 @@ from maintenance.drifting import reidentified
 
 from ident_service.cli import main
 from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.maintenance_schedule import When, add_schedule, dues
-from ident_service.registry.database import Database, trail
+from ident_service.operations.maintenance_schedule import DueRule, add_schedule, pending
+from ident_service.registry.database import Database, audit_log
 from ident_service.registry.state_folder import fault_file
 from ident_service.results.manifest import verified_files
 
@@ -24,14 +24,14 @@ SEEDS = 20
 def test_an_unchanged_arm_is_due_no_more_and_raises_nothing(
     db: Database, state: Path, accepted: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    add_schedule(db, ARM, When(maintenance=True), "me", 0.0)
+    add_schedule(db, ARM, DueRule(maintenance=True), "me", 0.0)
     assert main(["maintenance", ARM, "--what", "gear oil changed", "--state", str(state)]) == 0
     assert "gear oil changed" in capsys.readouterr().out
-    assert len(dues(db)) == 1
+    assert len(pending(db)) == 1
     for seed in (11, 12):
         again = reidentified(state, seed, 1.0, lambda: capsys.readouterr().out)
         assert (again.code, again.answer["verdict"], again.alarms) == (0, "unchanged", [])
-    assert dues(db) == []
+    assert pending(db) == []
     assert main(["alarm", "list", "--state", str(state)]) == 0
 
 
@@ -66,7 +66,7 @@ def test_a_drier_joint_raises_an_alarm_that_stands_until_a_person_acts(
     assert alarms(db) == []
     assert alarms(db, closed=True)[0]["closed_by"] == "terminal:ann"
     assert reidentified(state, 23, DRIER, lambda: capsys.readouterr().out).code == 0
-    told = [line["what"] for line in trail(db, most=500)]
+    told = [line["what"] for line in audit_log(db, most=500)]
     assert told.count("drift alarm") == 2
     assert told.count("alarm acknowledged") == 1
 

@@ -15,22 +15,22 @@ from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import explain_interrupted, mark_interrupted, outcome, said
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.jobs.requests import Check, Run
-from ident_service.daemon.maintenance.reidentification import Wanted, reidentifications
-from ident_service.daemon.maintenance.scheduler import Keeper
+from ident_service.daemon.maintenance.reidentification import ReidentificationRequest, reidentifications
+from ident_service.daemon.maintenance.scheduler import MaintenanceScheduler
 from ident_service.daemon.maintenance.webhook import deliveries
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.operations.acceptance import accepted_set, rollback
 from ident_service.operations.maintenance_schedule import (
-    When,
+    DueRule,
     add_event,
     add_schedule,
-    dues,
     enable_schedule,
+    pending,
     schedules,
 )
 from ident_service.registry import jobs
 from ident_service.registry.arms import add_arm
-from ident_service.registry.database import Database, Row, trail
+from ident_service.registry.database import Database, Row, audit_log
 from ident_service.registry.state_folder import fault_file
 
 HOUR = 3600.0
@@ -48,7 +48,7 @@ class Scene:
     def restart(self) -> None:
         """Another process on the same state folder."""
         self.engine = Engine(self.db, self.state)
-        self.keeper = Keeper(self.engine, None, self.clock)
+        self.keeper = MaintenanceScheduler(self.engine, None, self.clock)
         mark_interrupted(self.db, self.state)
 
     def allow(self, **changes: object) -> None:
@@ -56,7 +56,7 @@ class Scene:
 
     def at_six(self) -> None:
         """A schedule of six o'clock, and its time has come."""
-        add_schedule(self.db, ARM, When(cron="0 6 * * *"), "me", self.clock())
+        add_schedule(self.db, ARM, DueRule(cron="0 6 * * *"), "me", self.clock())
         self.clock.at = MONDAY + 6 * HOUR - 0.5
         self.keeper.look()
         self.clock.forward(1.0)
@@ -84,7 +84,7 @@ class Scene:
     @property
     def why(self) -> list[str]:
         """Why persons were asked."""
-        return [line["detail"]["why"] for line in trail(self.db) if line["what"] == "due asks for a person"]
+        return [line["detail"]["why"] for line in audit_log(self.db) if line["what"] == "due asks for a person"]
 
 
 @pytest.fixture
@@ -97,12 +97,12 @@ def test_an_arm_whose_description_says_nothing_never_moves_by_itself(scene: Scen
     scene.at_six()
     for _ in range(3):
         scene.keeper.look()
-    assert len(dues(scene.db, ARM)) == 1
+    assert len(pending(scene.db, ARM)) == 1
     assert scene.queued == []
     assert reidentifications(scene.db) == []
     assert scene.why == ["the arm's description does not allow motion without a person"]
     with pytest.raises(MotionRefused, match="does not allow"):
-        scene.keeper.reidentifications.begin(Wanted(ARM, unattended=True), "service")
+        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM, unattended=True), "service")
     # A description that allows it later does not set off what waits already.
     scene.allow()
     scene.keeper.look()
@@ -129,7 +129,7 @@ def test_a_preflight_that_is_refused_begins_no_run_and_asks_for_a_person(scene: 
         scene.keeper.look()
     assert (scene.only["state"], scene.queued) == ("refused", [])
     assert "gravity torque" in scene.only["detail"]
-    assert len(dues(scene.db, ARM)) == 1
+    assert len(pending(scene.db, ARM)) == 1
 
 
 def _faulted(scene: Scene) -> str:
@@ -162,7 +162,7 @@ def _restarted(scene: Scene) -> str:
 @pytest.mark.parametrize("spoil", [_faulted, _waited_for, _disabled, _late, _restarted])
 def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: Callable[[Scene], str]) -> None:
     scene.allow()
-    add_schedule(scene.db, ARM, When(maintenance=True), "me", scene.clock())
+    add_schedule(scene.db, ARM, DueRule(maintenance=True), "me", scene.clock())
     if spoil is not _disabled:
         scene.at_six()
     words = spoil(scene)
@@ -181,7 +181,7 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
 
 
 def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     job = scene.only["job"]
     jobs.ended(scene.db, job, "done", "")
     scene.engine.live._jobs.pop(job)
@@ -190,19 +190,19 @@ def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
     assert "asked for a stop" in scene.only["detail"]
     # The next one is not stopped by it.
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     assert scene.queued == [("check", False)]
 
 
 def test_one_at_a_time(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     with pytest.raises(MotionRefused, match="already"):
-        scene.keeper.reidentifications.begin(Wanted(ARM), "bob")
+        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "bob")
     assert scene.queued == [("check", False)]  # the second one's was not entered either
 
 
 def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     jobs.ended(scene.db, scene.only["job"], "done", "")
     scene.restart()
     scene.keeper.look()
@@ -212,7 +212,7 @@ def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> N
 
 @pytest.mark.parametrize("running", [False, True])
 def test_a_restart_during_a_motion_is_told_when_it_is_known(scene: Scene, running: bool) -> None:
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     if running:
         jobs.started(scene.db, scene.only["job"], "")
     scene.restart()
@@ -228,7 +228,7 @@ def test_a_restart_during_a_motion_is_told_when_it_is_known(scene: Scene, runnin
 
 
 def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str) -> None:
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     scene.ended()
     jobs.ended(scene.db, scene.only["job"], "done", "")
     # The run that a process would have left: the accepted one's recording.
@@ -256,7 +256,7 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
 
 
 def test_what_was_stopped_is_no_verdict(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     stopped = {"exit_code": 0, "report": {"state": "stopped"}}
     (scene.state / JOBS / scene.only["job"] / "answer.json").write_text(json.dumps(stopped))
     assert outcome(said(scene.state / JOBS / scene.only["job"]), 0, "").state == "cancelled"
@@ -267,11 +267,11 @@ def test_what_was_stopped_is_no_verdict(scene: Scene) -> None:
 def test_nothing_accepted_or_another_mechanism_cannot_be_compared(scene: Scene) -> None:
     add_arm(scene.db, scene.state, description(name="new"), {}, "me")
     with pytest.raises(UsageError, match="nothing has been accepted"):
-        scene.keeper.reidentifications.begin(Wanted("new"), "ann")
+        scene.keeper.reidentifications.begin(ReidentificationRequest("new"), "ann")
     longer = description().replace("shoulder: {a: 0.5}", "shoulder: {a: 0.6}")
     add_arm(scene.db, scene.state, longer, {}, "me", replace=True)
     with pytest.raises(UsageError, match="kinematics"):
-        scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     assert scene.queued == []
 
 
@@ -279,7 +279,7 @@ def test_an_accepted_set_that_was_changed_on_the_disk_is_compared_with_nothing(s
     _, folder = accepted_set(scene.state, ARM)
     (folder / "parameters.json").write_text("{}")
     with pytest.raises(ValueError, match="was changed since"):
-        scene.keeper.reidentifications.begin(Wanted(ARM), "ann")
+        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
 
 
 def test_what_is_rolled_back_to_is_the_same_to_the_last_bit(scene: Scene, accepted: str) -> None:
@@ -318,11 +318,11 @@ def test_a_notice_is_kept_with_what_says_that_it_was_told(scene: Scene) -> None:
     scene.at_six()
     with pytest.raises(sqlite3.OperationalError):
         scene.keeper.look()
-    assert ([row["told"] for row in dues(scene.db)], deliveries(scene.db)) == ([0], [])
+    assert ([row["told"] for row in pending(scene.db)], deliveries(scene.db)) == ([0], [])
     broken.broken = False
     for _ in range(3):
         scene.keeper.look()
-    assert ([row["told"] for row in dues(scene.db)], len(deliveries(scene.db))) == ([1], 1)
+    assert ([row["told"] for row in pending(scene.db)], len(deliveries(scene.db))) == ([1], 1)
 
 
 def test_a_check_by_hand_is_untouched(scene: Scene) -> None:

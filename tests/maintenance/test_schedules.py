@@ -10,20 +10,20 @@ from maintenance.conftest import ARM, MONDAY, Clock
 from ident_service.errors import UnknownId, UsageError
 from ident_service.operations.drift_alarms import acknowledge_alarm, alarms, raise_alarm
 from ident_service.operations.maintenance_schedule import (
-    When,
+    DueRule,
     add_event,
     add_schedule,
     dismiss,
-    dues,
     enable_schedule,
     events,
-    fall_due,
     known_schedule,
+    mark_due,
+    pending,
     remove_schedule,
     schedules,
 )
 from ident_service.registry.arms import add_arm
-from ident_service.registry.database import Database, trail
+from ident_service.registry.database import Database, audit_log
 from ident_service.registry.runs import _driven
 
 HOUR, DAY = 3600.0, 86400.0
@@ -39,86 +39,86 @@ def drove(db: Database, run: str, hours: float) -> None:
 
 def done(db: Database) -> int:
     """How many are due; they are done now."""
-    rows = dues(db, ARM)
+    rows = pending(db, ARM)
     for row in rows:
         dismiss(db, row["id"], "done", "me", 0.0)
     return len(rows)
 
 
 def test_a_time_comes_once_however_often_somebody_looks(db: Database, clock: Clock) -> None:
-    row = add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    row = add_schedule(db, ARM, DueRule(cron="0 6 * * *"), "me", clock())
     assert row["next"] == MONDAY + 6 * HOUR
     for _ in range(3):
-        fall_due(db, clock())
-    assert dues(db) == []
+        mark_due(db, clock())
+    assert pending(db) == []
     clock.forward(6 * HOUR)
     for _ in range(3):
-        fall_due(db, clock())
-    assert [(one["cause"], one["late"]) for one in dues(db)] == [("cron 0 6 * * *", 0)]
+        mark_due(db, clock())
+    assert [(one["cause"], one["late"]) for one in pending(db)] == [("cron 0 6 * * *", 0)]
     clock.forward(5 * DAY)  # due still, and not five times
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     clock.forward(DAY)
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
 
 
 def test_times_that_were_missed_are_due_once_and_late(db: Database, clock: Clock) -> None:
-    add_schedule(db, ARM, When(cron="0 * * * *"), "me", clock())
+    add_schedule(db, ARM, DueRule(cron="0 * * * *"), "me", clock())
     clock.forward(30 * DAY + HOUR / 2)
-    fall_due(db, clock())
-    assert [one["late"] for one in dues(db)] == [1]
+    mark_due(db, clock())
+    assert [one["late"] for one in pending(db)] == [1]
     assert done(db) == 1
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     assert known_schedule(db, 1)["next"] == MONDAY + 30 * DAY + HOUR
 
 
 def test_a_clock_that_is_put_back_makes_nothing_due_again(db: Database, clock: Clock) -> None:
-    add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    add_schedule(db, ARM, DueRule(cron="0 6 * * *"), "me", clock())
     clock.forward(6 * HOUR)
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
     clock.forward(-HOUR)
     for _ in range(13):
-        fall_due(db, clock())
+        mark_due(db, clock())
         clock.forward(HOUR / 6)
-    assert dues(db) == []
+    assert pending(db) == []
     clock.at = MONDAY + DAY + 6 * HOUR
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
 
 
 def test_a_clock_that_was_wrong_by_years_silences_nothing(db: Database, clock: Clock) -> None:
-    add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    add_schedule(db, ARM, DueRule(cron="0 6 * * *"), "me", clock())
     clock.forward(20 * 365 * DAY)
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
     clock.at = MONDAY
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     clock.forward(6 * HOUR)
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
 
 
 def test_operating_hours_count_from_when_it_was_due_last(db: Database, clock: Clock) -> None:
     drove(db, "before", 100.0)
-    add_schedule(db, ARM, When(hours=10.0), "me", clock())
+    add_schedule(db, ARM, DueRule(hours=10.0), "me", clock())
     drove(db, "a", 9.9)
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     drove(db, "b", 0.2)
-    fall_due(db, clock())
-    assert [one["cause"] for one in dues(db)] == ["10 operating hours"]
+    mark_due(db, clock())
+    assert [one["cause"] for one in pending(db)] == ["10 operating hours"]
     assert done(db) == 1
     drove(db, "c", 9.9)
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     drove(db, "d", 35.0)
-    fall_due(db, clock())
+    mark_due(db, clock())
     assert done(db) == 1
 
 
@@ -130,12 +130,12 @@ def test_hours_are_those_that_a_run_was_driven() -> None:
 
 def test_maintenance_makes_due_what_is_scheduled_after_it(db: Database, clock: Clock) -> None:
     assert add_event(db, ARM, " gear oil changed ", "joint 2", "me", clock())["what"] == "gear oil changed"
-    assert dues(db) == []
-    add_schedule(db, ARM, When(maintenance=True), "me", clock())
-    add_schedule(db, ARM, When(cron="0 6 * * *"), "me", clock())
+    assert pending(db) == []
+    add_schedule(db, ARM, DueRule(maintenance=True), "me", clock())
+    add_schedule(db, ARM, DueRule(cron="0 6 * * *"), "me", clock())
     add_event(db, ARM, "belt changed", "", "me", clock())
     add_event(db, ARM, "and the other", "", "me", clock())
-    assert [one["cause"] for one in dues(db)] == ["maintenance: belt changed"]
+    assert [one["cause"] for one in pending(db)] == ["maintenance: belt changed"]
     assert [one["what"] for one in events(db, ARM)] == ["and the other", "belt changed", "gear oil changed"]
     for what, note in (("", ""), (" ", ""), ("x" * 201, ""), ("x", "y" * 2001)):
         with pytest.raises(UsageError, match="say what was done"):
@@ -143,30 +143,35 @@ def test_maintenance_makes_due_what_is_scheduled_after_it(db: Database, clock: C
 
 
 def test_disabled_ones_count_nothing_and_enabled_ones_count_from_then(db: Database, clock: Clock) -> None:
-    for when in (When(cron="0 6 * * *"), When(hours=1.0), When(maintenance=True)):
+    for when in (DueRule(cron="0 6 * * *"), DueRule(hours=1.0), DueRule(maintenance=True)):
         number = add_schedule(db, ARM, when, "me", clock())["id"]
         enable_schedule(db, number, "me", clock(), enabled=False)
     clock.forward(2 * DAY)
     drove(db, "a", 5.0)
     add_event(db, ARM, "belt", "", "me", clock())
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     for row in schedules(db):
         enable_schedule(db, row["id"], "me", clock(), enabled=True)
-    fall_due(db, clock())
-    assert dues(db) == []
+    mark_due(db, clock())
+    assert pending(db) == []
     clock.forward(7 * HOUR)
     drove(db, "b", 1.0)
-    fall_due(db, clock())
-    assert sorted(one["schedule"] for one in dues(db)) == [1, 2]
+    mark_due(db, clock())
+    assert sorted(one["schedule"] for one in pending(db)) == [1, 2]
 
 
 def test_what_cannot_be_meant_is_refused(db: Database, state: Path, clock: Clock) -> None:
-    for when in (When(), When(cron="0 6 * * *", maintenance=True), When(hours=0.0), When(hours=float("nan"))):
+    for when in (
+        DueRule(),
+        DueRule(cron="0 6 * * *", maintenance=True),
+        DueRule(hours=0.0),
+        DueRule(hours=float("nan")),
+    ):
         with pytest.raises(UsageError):
             add_schedule(db, ARM, when, "me", clock())
     with pytest.raises(UnknownId):
-        add_schedule(db, ARM, When(maintenance=True), "me", clock(), "nothing")
+        add_schedule(db, ARM, DueRule(maintenance=True), "me", clock(), "nothing")
     add_arm(
         db,
         state,
@@ -176,7 +181,7 @@ def test_what_cannot_be_meant_is_refused(db: Database, state: Path, clock: Clock
         {},
         "me",
     )
-    add_schedule(db, "other", When(maintenance=True), "me", clock())
+    add_schedule(db, "other", DueRule(maintenance=True), "me", clock())
     assert schedules(db, ARM) == []
     for act in (lambda: known_schedule(db, 9), lambda: remove_schedule(db, 9, "me")):
         with pytest.raises(UnknownId):
@@ -186,12 +191,12 @@ def test_what_cannot_be_meant_is_refused(db: Database, state: Path, clock: Clock
 
 
 def test_a_number_never_comes_twice_and_the_trail_names_who(db: Database, clock: Clock) -> None:
-    first = add_schedule(db, ARM, When(maintenance=True), "ann", clock())["id"]
+    first = add_schedule(db, ARM, DueRule(maintenance=True), "ann", clock())["id"]
     add_event(db, ARM, "belt", "", "bob", clock())
     remove_schedule(db, first, "carl")
-    assert add_schedule(db, ARM, When(maintenance=True), "ann", clock())["id"] != first
-    assert len(dues(db)) == 1  # what was due by the one that is gone still is
-    told = {line["what"]: line["who"] for line in trail(db)}
+    assert add_schedule(db, ARM, DueRule(maintenance=True), "ann", clock())["id"] != first
+    assert len(pending(db)) == 1  # what was due by the one that is gone still is
+    told = {line["what"]: line["who"] for line in audit_log(db)}
     assert told["schedule added"] == "ann"
     assert told["maintenance"] == "bob"
     assert told["schedule removed"] == "carl"

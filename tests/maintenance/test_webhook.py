@@ -23,7 +23,7 @@ from standardwebhooks.webhooks import WebhookVerificationError
 from ident_service.daemon.maintenance.webhook import WAITS, Webhook, deliveries, read_secret, require_address
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
-from ident_service.registry.database import Database, trail
+from ident_service.registry.database import Database, audit_log
 
 SECRET = b"0123456789abcdef0123456789abcdef"
 NOTICE = {"id": 7, "arm": "quick", "what": "maintenance: öl"}
@@ -159,7 +159,7 @@ def test_it_is_tried_later_and_later_and_given_up_after_days(receiver: Receiver,
     assert 2.0 < at[-1] / 86_400.0 < 4.0
     # A redirection is not followed.
     assert (deliveries(db)[0]["why"], len(receiver.heard)) == ("answered 302", len(WAITS) + 1)
-    line = trail(db)[0]
+    line = audit_log(db)[0]
     assert (line["what"], line["about"], line["detail"]["why"]) == ("webhook failed", "quick", "answered 302")
 
 
@@ -168,7 +168,7 @@ def test_nothing_more_is_sent_to_who_is_gone(receiver: Receiver, db: Database, c
     with sending(db, receiver.url, clock) as webhook:
         webhook.send("arm.due", clock.at, NOTICE)
         until(lambda: deliveries(db)[0]["next"] is None)
-    assert (deliveries(db)[0]["tries"], trail(db)[0]["what"]) == (1, "webhook failed")
+    assert (deliveries(db)[0]["tries"], audit_log(db)[0]["what"]) == (1, "webhook failed")
 
 
 def test_nobody_there_keeps_nobody_else_waiting(receiver: Receiver, db: Database, clock: Clock) -> None:

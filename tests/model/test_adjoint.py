@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.errors import ModelError
-from ident_service.model.symbolic import Differentiable, Symbol, Tape, Value
+from ident_service.model.symbolic import Differentiable, ExpressionGraph, Symbol, Value
 
 INPUTS, SAMPLES = 4, 5
 
 
-def symbols_of(tape: Tape) -> list[Symbol]:
+def symbols_of(tape: ExpressionGraph) -> list[Symbol]:
     return [Symbol(tape, at) for at, step in enumerate(tape.steps) if step[0] == "input"]
 
 
@@ -25,7 +25,7 @@ def test_the_pull_is_the_derivative_of_any_program(recipe: Recipe, seed: int, da
     states = rng.uniform(-1.5, 1.5, size=(INPUTS, SAMPLES))
     # Direction j, the second axis, goes along input j; the imaginary part carries its derivative without rounding.
     inputs = [states[k] + 1j * STEP * np.repeat(np.eye(INPUTS)[:, k, None], SAMPLES, axis=1) for k in range(INPUTS)]
-    tape = Tape()
+    tape = ExpressionGraph()
     values = followed(recipe, tape, inputs)
     # Any may be wanted, more than once and in any order, inputs and constants too.
     chosen = data.draw(st.lists(st.integers(0, len(values) - 1), min_size=1, max_size=6))
@@ -40,7 +40,7 @@ def test_the_pull_is_the_derivative_of_any_program(recipe: Recipe, seed: int, da
 
 def every_operation() -> Differentiable:
     """Two outputs of three inputs that need every operation there is."""
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y, z = (tape.input() for _ in range(3))
     product = x * y
     assert isinstance(product, Symbol)
@@ -79,7 +79,7 @@ def test_one_run_can_be_pulled_many_times() -> None:
 
 
 def test_what_an_output_does_not_depend_on_has_no_slope() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     program = Differentiable(tape, [x, y], [x * 2.0, 7.0])
     np.testing.assert_array_equal(program.run(np.ones((2, 3))), [[2.0] * 3, [7.0] * 3])
@@ -87,14 +87,14 @@ def test_what_an_output_does_not_depend_on_has_no_slope() -> None:
 
 
 def test_a_program_without_outputs_has_no_slope_either() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     program = Differentiable(tape, [tape.input()], [])
     assert program.run(np.ones((1, 3))).shape == (0, 3)
     np.testing.assert_array_equal(program.pull(np.ones((0, 3))), np.zeros((1, 3)))
 
 
 def test_only_the_inputs_asked_for_are_differentiated() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     program = Differentiable(tape, [y], [x * y])
     program.run(np.array([[3.0], [5.0]]))
@@ -102,7 +102,7 @@ def test_only_the_inputs_asked_for_are_differentiated() -> None:
 
 
 def test_the_forward_run_s_own_cosine_is_used_for_the_slope_of_a_sine() -> None:
-    tape = Tape()
+    tape = ExpressionGraph()
     x = tape.input()
     alone = Differentiable(tape, [x], [tape.apply("sin", x)])
     beside = Differentiable(tape, [x], [tape.apply("sin", x), tape.apply("cos", x)])

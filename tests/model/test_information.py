@@ -15,7 +15,7 @@ from ident_service.errors import ModelError
 from ident_service.model import information
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.chain import Chain
-from ident_service.model.information import Information, empty_information, information_of, supports
+from ident_service.model.information import Information, empty_information, information_of, sparsity
 from ident_service.model.parameter_layout import Layout
 from ident_service.model.regressor import joint_regressor
 
@@ -37,7 +37,7 @@ class Equations:
         self.beta = self.base.K @ random_delta(rng, self.layout)
         self.torque = np.einsum("jps,p->sj", self.H_b, self.beta) + rng.normal(size=(samples, joints))
         self.keep = rng.random((samples, joints)) < 0.9
-        self.supports = supports(self.chain, self.layout, self.base.base)
+        self.supports = sparsity(self.chain, self.layout, self.base.base)
 
     def information(self, part: slice = slice(None)) -> Information:
         return information_of(self.H_b[:, :, part], self.torque[part], self.keep[part], self.supports)

@@ -23,12 +23,12 @@ from ident_service.model.chain import Chain
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
 from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.symbolic import Program, Tape, Value
+from ident_service.model.symbolic import ExpressionGraph, Program, Value
 
 Array = np.ndarray
 
 
-def run(tape: Tape, outputs: list[Value], states: tuple[Array, ...]) -> Array:
+def run(tape: ExpressionGraph, outputs: list[Value], states: tuple[Array, ...]) -> Array:
     """Outputs for every sample, shape (samples, outputs)."""
     found = np.empty((len(outputs), len(states[0])))
     Program(tape, outputs).run([np.ascontiguousarray(column) for state in states for column in state.T], list(found))
@@ -48,7 +48,7 @@ def test_links_weigh_as_in_pinocchio(seed: int, joints: int, square: bool) -> No
     layout = Layout(chain.revolute, ())
     delta, states = random_delta(rng, layout), random_states(rng, 5, joints)
     model = reference_model(chain, bodies_of(layout, delta))
-    tape = Tape()
+    tape = ExpressionGraph()
     q, dq, ddq = ([tape.input() for _ in range(joints)] for _ in range(3))
     torque = run(tape, rigid_torque(tape, chain, layout, numbers(delta), q, dq, ddq), states)
     meant = reference_torque(model, *states)
@@ -67,7 +67,7 @@ def test_links_weigh_as_in_pinocchio(seed: int, joints: int, square: bool) -> No
 
 
 def whole(chain: Chain, layout: Layout, parameters: dict[int, Value], states: tuple[Array, Array, Array]) -> Array:
-    tape = Tape()
+    tape = ExpressionGraph()
     q, dq, ddq = ([tape.input() for _ in range(chain.joints)] for _ in range(3))
     parts = (
         rigid_torque(tape, chain, layout, parameters, q, dq, ddq),
@@ -102,7 +102,7 @@ def test_shipped_arms_with_their_drives(name: str) -> None:
     found = whole(arm.chain, arm.layout, numbers(delta), states)
     np.testing.assert_allclose(found, meant, rtol=0, atol=1e-12 * np.abs(meant).max())
     drives = arm.chain.coupling.T @ np.diag(arm.layout.term_values("drive_inertia", delta)) @ arm.chain.coupling
-    tape = Tape()
+    tape = ExpressionGraph()
     q = [tape.input() for _ in range(arm.chain.joints)]
     links = np.setdiff1d(np.arange(len(delta)), arm.layout.term_columns("drive_inertia"))
     with_drives, without = (

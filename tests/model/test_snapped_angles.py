@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from ident_service.cli import main
-from ident_service.config.kinematics import snapped
+from ident_service.config.kinematics import snap_angles
 from ident_service.config.load import load_arm
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model
@@ -68,11 +68,11 @@ def test_rounded_angles_are_told_and_snapped(exact: Path, rounded: Path, capsys:
 
 def test_what_is_no_multiple_stays() -> None:
     text = '<origin xyz="1.5708 0 0" rpy="1.5708 -3.14  0.3"/><origin rpy=\'0.785398 1e-5 1.5650\'/><a rpy="x 1 2"/>'
-    assert snapped(text) == (
+    assert snap_angles(text) == (
         f'<origin xyz="1.5708 0 0" rpy="{math.pi / 2!r} {-math.pi!r} 0.3"/>'
         f"<origin rpy='{math.pi / 4!r} 0.0 1.5650'/><a rpy=\"x 1 2\"/>"
     )
-    assert snapped(snapped(text)) == snapped(text)
+    assert snap_angles(snap_angles(text)) == snap_angles(text)
 
 
 def test_snapping_is_of_a_urdf(tmp_path: Path) -> None:

@@ -8,21 +8,21 @@ from helpers.random_tapes import Recipe, followed, recipes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.model.symbolic import Program, Symbol, Tape, Taylor, Value, enclose
+from ident_service.model.symbolic import ExpressionGraph, Program, Symbol, TaylorModel, Value, enclose
 
 Array = np.ndarray
 INPUTS, FINER = 4, 1000
 
 
-def wave(rng: np.random.Generator, time: Array, half: Array) -> tuple[Taylor, Array]:
+def wave(rng: np.random.Generator, time: Array, half: Array) -> tuple[TaylorModel, Array]:
     """A sine as enclosures over stretches about `time`, and its values at `FINER` times in each of them."""
     size, rate, phase = rng.uniform(0.1, 1.5), rng.uniform(0.2, 5.0), rng.uniform(0.0, 6.0)
     inside = time[:, None] + half[:, None] * np.linspace(-1.0, 1.0, FINER)
     middle, slope = size * np.sin(rate * time + phase), size * rate * np.cos(rate * time + phase)
-    return Taylor(middle, slope, 0.5 * size * (rate * half) ** 2, half), size * np.sin(rate * inside + phase)
+    return TaylorModel(middle, slope, 0.5 * size * (rate * half) ** 2, half), size * np.sin(rate * inside + phase)
 
 
-def assert_inside(enclosure: Taylor, values: Array, size: float) -> None:
+def assert_inside(enclosure: TaylorModel, values: Array, size: float) -> None:
     """Every one of `values`, shape (stretches, FINER), lies where the enclosure says."""
     rounding = 1e-11 * size
     s = enclosure.h[:, None] * np.linspace(-1.0, 1.0, FINER)
@@ -40,7 +40,7 @@ def test_a_thousand_times_finer_values_of_any_program_lie_inside(recipe: Recipe,
     rng = np.random.default_rng(seed)
     time, half = rng.uniform(0.0, 10.0, size=6), rng.uniform(0.1, 1.0, size=6) * longest
     waves = [wave(rng, time, half) for _ in range(INPUTS)]
-    tape = Tape()
+    tape = ExpressionGraph()
     values = followed(recipe, tape, [fine.astype(complex) for _, fine in waves])
     enclosures = enclose(tape, [taylor for taylor, _ in waves], [value for value, _ in values])
     size = max(float(np.abs(numbers.real).max()) for _, numbers in values)
@@ -60,7 +60,7 @@ def test_functions_hold_where_their_argument_crosses_zero_and_where_it_is_wide(n
 
 def test_the_sign_of_what_may_be_zero_is_anything_between_both() -> None:
     h = np.ones(3)
-    value = Taylor(np.array([0.5, -0.5, 2.0]), h, 0.0 * h, h)
+    value = TaylorModel(np.array([0.5, -0.5, 2.0]), h, 0.0 * h, h)
     sign = value.function("sign")
     np.testing.assert_array_equal(sign.lowest, [-1.0, -1.0, 1.0 - 1e-12])
     np.testing.assert_array_equal(sign.highest, [1.0, 1.0, 1.0 + 1e-12])
@@ -69,13 +69,13 @@ def test_the_sign_of_what_may_be_zero_is_anything_between_both() -> None:
 def test_the_exponential_of_a_very_negative_argument_stays_small() -> None:
     # Stribeck's term far above its velocity: exp(-(v / v_s)^2) over stretches on which the square changes by thousands.
     h = np.ones(1)
-    value = Taylor(-1e5 * h, 5e4 * h, 1e3 * h, h).function("exp")
+    value = TaylorModel(-1e5 * h, 5e4 * h, 1e3 * h, h).function("exp")
     np.testing.assert_array_equal([value.lowest, value.highest], 0.0)
 
 
 def test_a_straight_line_is_enclosed_exactly() -> None:
     h = np.array([0.5])
-    line = Taylor(np.array([1.0]), np.array([2.0]), np.zeros(1), h)
+    line = TaylorModel(np.array([1.0]), np.array([2.0]), np.zeros(1), h)
     both = (line + line - line.scaled(0.5)).shifted(3.0)
     assert (both.c, both.d, both.r) == (4.5, 3.0, 0.0)
     assert both.reach == 1.5
@@ -85,7 +85,7 @@ def test_at_a_peak_the_excess_is_of_second_order() -> None:
     # cos(t)^2 about its peak: halving the stretch quarters the excess.
     def excess(half: float) -> float:
         h = np.array([half])
-        x = Taylor(np.zeros(1), np.ones(1), np.zeros(1), h).function("cos")
+        x = TaylorModel(np.zeros(1), np.ones(1), np.zeros(1), h).function("cos")
         return float((x * x).highest[0] - 1.0)
 
     assert excess(0.01) == pytest.approx(1e-4, rel=1e-2)
@@ -97,13 +97,13 @@ def test_many_stretches_are_many_single_stretches() -> None:
     rng = np.random.default_rng(2)
     time, half = rng.uniform(0.0, 10.0, size=5000), rng.uniform(1e-3, 0.1, size=5000)
     x, _ = wave(rng, time, half)
-    tape = Tape()
+    tape = ExpressionGraph()
     symbol = tape.input()
     outputs: list[Value] = [tape.apply("sin", symbol) * symbol, symbol, 4.0, 1.0 - symbol]
     together = enclose(tape, [x], outputs)
     for begin in (0, 2047, 2048, 4999):
         part = slice(begin, begin + 1)
-        alone = enclose(tape, [Taylor(x.c[part], x.d[part], x.r[part], x.h[part])], outputs)
+        alone = enclose(tape, [TaylorModel(x.c[part], x.d[part], x.r[part], x.h[part])], outputs)
         for one, many in zip(alone, together, strict=True):
             for name in ("c", "d", "r", "h"):
                 np.testing.assert_array_equal(getattr(one, name), getattr(many, name)[part])
@@ -113,7 +113,7 @@ def test_the_middle_of_an_enclosure_is_what_the_program_computes() -> None:
     rng = np.random.default_rng(3)
     time, half = rng.uniform(0.0, 10.0, size=20), np.full(20, 0.1)
     x, _ = wave(rng, time, half)
-    tape = Tape()
+    tape = ExpressionGraph()
     symbol = tape.input()
     assert isinstance(symbol, Symbol)
     outputs: list[Value] = [tape.apply("exp", symbol) - 2.0 * symbol, 5.0 - symbol * symbol]

@@ -21,7 +21,7 @@ from helpers.forks import fork
 from motion_bench import Story, WatchedArm
 
 from ident_service.errors import ArmFault
-from ident_service.motion.faults import Latch
+from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import run
 from ident_service.motion.state_machine import State
 from sim_backend.arm import Truth
@@ -177,7 +177,7 @@ def outcomes(
         finish: whether the run is finished early.
     """
     truth: list[Truth] = []
-    arm, story, latch = built(which, (), truth.append), Story(), Latch()
+    arm, story, latch = built(which, (), truth.append), Story(), ActiveFaults()
     branches = _Branches(arm)
     branches.faults.extend(faults)
 

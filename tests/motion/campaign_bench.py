@@ -25,8 +25,8 @@ from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
-from ident_service.motion.command_channel import Switches
-from ident_service.motion.faults import Latch
+from ident_service.motion.command_channel import LocalCommands
+from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import Sink, run
 from ident_service.motion.safety_monitor import MAX_AGE
 from ident_service.motion.state_machine import State
@@ -187,7 +187,7 @@ class Case:
         return f"{self.arm}-{self.kind}-{self.state.value}-{self.share:.2f}-{self.joint}{slow}{early}"
 
 
-class Script(Switches):
+class Script(LocalCommands):
     """Somebody who pauses and goes on, stops, or finishes the run, at given cycles of the loop."""
 
     def __init__(
@@ -219,7 +219,7 @@ class Outcome:
     story: Story
     arm: WatchedArm
     truth: list[Truth]
-    latch: Latch
+    latch: ActiveFaults
     fault: ArmFault | None
 
 
@@ -261,7 +261,7 @@ def play(
     """One run on a new arm, with what the script of a state does, recorded if a path is given."""
     truth: list[Truth] = []
     arm = built(which, faults, truth.append)
-    story, latch, fault = Story(), Latch(), None
+    story, latch, fault = Story(), ActiveFaults(), None
     options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
     script = Script(arm, which, state, speed, finish=finish)
     try:

@@ -22,7 +22,7 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.safety_monitor import MAX_AGE
-from sim_backend.emulator.faults import PUCK_FAULTS, PuckFault
+from sim_backend.emulator.faults import PUCK_FAULTS, DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth
 
@@ -132,7 +132,7 @@ class EmulatedArm(WatchedArm):
             self.taps[-1].disturb([FOREIGN[strike.kind]])
             return
         duration = None if strike.duration is None else strike.duration * PERIOD
-        self.behind.inject(PuckFault(strike.kind, strike.joint, strike.later * PERIOD, duration, strike.size))
+        self.behind.inject(DriveFault(strike.kind, strike.joint, strike.later * PERIOD, duration, strike.size))
 
     def strike(self, fault: Strike) -> None:
         self._strike = fault

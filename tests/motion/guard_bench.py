@@ -10,7 +10,7 @@ from motion_bench import bench_limits
 
 from drivers.arm import Sample
 from ident_service.motion.faults import FAULTS, Fault, Reaction
-from ident_service.motion.safety_monitor import JUMP, Guard
+from ident_service.motion.safety_monitor import JUMP, SafetyMonitor
 from ident_service.motion.trajectory import rest
 
 Array = np.ndarray
@@ -32,7 +32,7 @@ class Bench:
     """A guard that is shown one position after another."""
 
     def __init__(self, position: Array = HOME, **options: Any) -> None:
-        self.guard = Guard(NAMES, LIMITS, PERIOD, position, **options)
+        self.guard = SafetyMonitor(NAMES, LIMITS, PERIOD, position, **options)
         self.cycle = 0
 
     def see(

@@ -13,7 +13,7 @@ from ident_service.excitation.trajectory import FourierPath, FourierSeries, Post
 from ident_service.motion.sequencer import Paused
 from ident_service.motion.speed_scaling import Slowed, SpeedChange
 from ident_service.motion.stop_trajectory import after, stop
-from ident_service.motion.trajectory import PathReference, Reference, Setpoint, rest, way
+from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest
 
 Array = np.ndarray
 Motion = FourierPath | PosturePath
@@ -83,7 +83,7 @@ def random_reference(rng: np.random.Generator, limits: MotionLimits, path: Motio
                     return Paused(motion, time, limits).resume(), kind
                 start = motion.at(float(rng.uniform(0.0, motion.duration)))
                 here = rest(start.position) if kind == "approach" else start
-                return way(here, motion.at(time), limits), kind
+                return plan_trajectory(here, motion.at(time), limits), kind
             except MotionRefused:
                 return motion, "path"
         case _:

@@ -13,7 +13,7 @@ from motion_bench import Story, WatchedArm, bench_excitation, bench_limits, benc
 from ident_service.errors import ArmFault, DriverError
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath, FourierSeries
-from ident_service.motion.command_channel import StopWhen
+from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.run import RunReport, run
 from sim_backend.arm import Truth
 
@@ -39,7 +39,7 @@ class Bench:
     def run(self, stop_requested: Callable[[], bool] = lambda: False, motion: Excitation = MOTION) -> RunReport:
         """Run; whatever comes of it, no torque was too large and none is left."""
         try:
-            return run(self.arm, self.model, motion, self.story, StopWhen(stop_requested), hold_seconds=HOLD)
+            return run(self.arm, self.model, motion, self.story, StopCondition(stop_requested), hold_seconds=HOLD)
         finally:
             assert all((np.abs(torque) <= LIMITS.torque).all() for torque in self.arm.torques)
             self.arm.inner.faults = ()  # mended, to see what is left of the run

@@ -17,12 +17,12 @@ from ident_service.errors import ArmFault, MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
-from ident_service.motion.command_channel import ControlFile, Homing, Lifeline, Switches
+from ident_service.motion.command_channel import ControlFile, Homing, LocalCommands, SupervisedCommands
 from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
-from ident_service.motion.faults import Latch
+from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.lowering import SPEED, lowest_point
 from ident_service.motion.run import RunReport, follow, run
-from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.state_machine import State
 from sim_backend.arm import Truth, from_config
 from sim_backend.faults import Fault, FaultKind
@@ -45,7 +45,7 @@ def on_a_table() -> Any:
     return loose("hold", control={"after_stop": "hold", "floor": 2.0})
 
 
-class Person(Switches):
+class Person(LocalCommands):
     """Stops in one cycle, and confirms some cycles after the arm has begun to wait for it."""
 
     def __init__(self, arm: WatchedArm, *, stop: int = STOP, confirm: int | None = None) -> None:
@@ -71,7 +71,7 @@ class Rig:
         self.limits = motion_limits(config)
         self.truth: list[Truth] = []
         self.arm = WatchedArm(from_config(config, faults=faults, observer=self.truth.append))
-        self.story, self.latch = Story(), Latch()
+        self.story, self.latch = Story(), ActiveFaults()
 
     def run(self, **person: Any) -> RunReport:
         self.arm.open()
@@ -186,7 +186,7 @@ def test_a_long_hold_is_not_recorded(held: Rig) -> None:
 def test_a_word_that_was_given_too_early_does_not_count() -> None:
     rig = Rig(on_a_table())
     rig.arm.open()
-    switches = Switches()
+    switches = LocalCommands()
     switches.supported = True
     ended = 0
 
@@ -282,7 +282,7 @@ def test_a_way_home_ends_held() -> None:
     rig = Rig(on_a_table())
     rig.arm.open()
     controls = Person(rig.arm, stop=10**9, confirm=1000)
-    report = follow(rig.arm, rig.model, GoTo(Destination.HOME), rig.story, controls, hold_seconds=HOLD)
+    report = follow(rig.arm, rig.model, PointToPointPlan(Destination.HOME), rig.story, controls, hold_seconds=HOLD)
     assert report.state is State.DONE
     assert rig.told(LOWERS) - rig.told(WAITS) >= 1000
 
@@ -365,7 +365,7 @@ def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(
     now = 10**9
     ours, theirs = os.pipe()
     with ControlFile.take(tmp_path / "controls", 0.5, lambda: now) as controls:
-        lifeline = Lifeline(controls, ours, lock_step=False)
+        lifeline = SupervisedCommands(controls, ours, lock_step=False)
         person = ControlFile.reach(tmp_path / "controls", lambda: now)
         with pytest.raises(UsageError, match="not held"):
             person.ask_home()

@@ -19,7 +19,7 @@ from ident_service.errors import DriverError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.realtime import asked
-from ident_service.motion.run import attended
+from ident_service.motion.run import keep_host_alive
 from ident_service.preflight import static_checks as plan
 
 
@@ -42,7 +42,7 @@ class Looked:
 
 
 def during(arm: Looked, work: Callable[[], None]) -> None:
-    with attended(arm):  # type: ignore[arg-type]
+    with keep_host_alive(arm):  # type: ignore[arg-type]
         work()
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from drivers.arm import Watchdog
 from ident_service.motion.cycle_timing import LATE, LONGEST_GAP, LONGEST_STALL, Deadlines, Elapsed, longest_stall
-from ident_service.motion.faults import WINDOW, Fault, Findings
+from ident_service.motion.faults import WINDOW, Fault, FaultCounter
 
 MS = 1_000_000
 
@@ -18,7 +18,7 @@ class Times:
     """Deadlines, and cycles that come one period after another unless something else is said."""
 
     def __init__(self, *, scheduled: bool = True) -> None:
-        self.deadlines = Deadlines(Findings(), 1e-3, scheduled_stamps=scheduled)
+        self.deadlines = Deadlines(FaultCounter(), 1e-3, scheduled_stamps=scheduled)
         self.stamp = self.woken = 0
         self.cycle()
 
@@ -152,7 +152,7 @@ def test_a_stamp_that_may_be_too_late_tells_no_velocity() -> None:
 
 
 def test_a_computer_that_is_always_in_doubt_is_too_late_and_its_stamps_are_believed_at_last() -> None:
-    deadlines, known, codes = Deadlines(Findings(), 1e-3), [], []
+    deadlines, known, codes = Deadlines(FaultCounter(), 1e-3), [], []
     for cycle in range(100):
         codes.append(code(deadlines.cycle(cycle * MS, cycle * MS + MS // 2, 300_000 if cycle else 0)))
         known.append(deadlines.known)
@@ -177,7 +177,7 @@ def test_a_long_silence_is_one_whatever_the_stamps_say() -> None:
 
 @pytest.mark.parametrize("scheduled", [False, True])
 def test_the_first_cycle_has_no_schedule(scheduled: bool) -> None:
-    deadlines = Deadlines(Findings(), 1e-3, scheduled_stamps=scheduled)
+    deadlines = Deadlines(FaultCounter(), 1e-3, scheduled_stamps=scheduled)
     assert deadlines.cycle(10**12, 10**15) is None
     assert deadlines.lateness_ns == 0
 

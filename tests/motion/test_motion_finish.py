@@ -16,9 +16,9 @@ from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench
 from drivers.arm import StopKind
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.clearance import Surroundings
+from ident_service.motion.clearance import ClearanceChecker
 from ident_service.motion.run import RunReport, follow, run
-from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.sequencer import Paused
 from ident_service.motion.state_machine import State
 from ident_service.motion.trajectory import Reference, rest
@@ -177,7 +177,9 @@ def test_one_way_is_not_finished_early(make: Callable[..., Bench]) -> None:
     away = {"joints": {name: joint | {"home": 0.6} for name, joint in JOINTS.items()}}
     for hands in (Hands(), Hands(finished=30)):
         bench = make(**away)
-        report = follow(bench.arm, bench.model, GoTo(Destination.HOME), bench.story, hands, hold_seconds=HOLD)
+        report = follow(
+            bench.arm, bench.model, PointToPointPlan(Destination.HOME), bench.story, hands, hold_seconds=HOLD
+        )
         assert (report.state, report.finished_at) == (State.DONE, None)
         ways.append((bench.story.states, bench.arm.cycle))
     assert ways[0] == ways[1]
@@ -211,17 +213,17 @@ def test_a_stop_is_not_finished(make: Callable[..., Bench]) -> None:
 def test_where_the_straight_way_back_is_not_free_the_run_goes_on(
     make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    free = Surroundings.require_clear
+    free = ClearanceChecker.require_clear
     judged: list[float] = []
 
-    def home_is_blocked(self: Surroundings, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
+    def home_is_blocked(self: ClearanceChecker, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
         judged.append(float(np.abs(way.at(way.duration).position - HOME).max()))
         yield
         if judged[-1] < 1e-9:
             raise MotionRefused("the table is in the way")
         yield from free(self, way, limits)
 
-    monkeypatch.setattr(Surroundings, "require_clear", home_is_blocked)
+    monkeypatch.setattr(ClearanceChecker, "require_clear", home_is_blocked)
     bench = make()
     report = played(bench, Hands(finished=MIDWAY, paused=(1600, 1700)))
     assert (report.state, report.finished_at) == (State.DONE, None)
@@ -267,7 +269,7 @@ def test_the_way_back_keeps_clear(make: Callable[..., Bench]) -> None:
     ball = {"from": tip.tolist(), "to": tip.tolist(), "radius": 0.01}
     model = bench_model(geometry=bodies, workspace={"obstacles": {"ball": {"capsule": ball}}, "clearance": 0.001})
     paused = Paused(_Standing(back[0]), 0.0, LIMITS)
-    search = paused.leave_in_slices(_Standing(back[-1]).at(0.0), LIMITS, Surroundings(model, LIMITS))
+    search = paused.leave_in_slices(_Standing(back[-1]).at(0.0), LIMITS, ClearanceChecker(model, LIMITS))
     with pytest.raises(MotionRefused, match="at elbow - obstacle ball"):
         for _ in search:
             pass

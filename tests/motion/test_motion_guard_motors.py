@@ -13,7 +13,7 @@ from motion_bench import bench_config
 
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.config.recording import Transmission
-from ident_service.motion.safety_monitor import Guard
+from ident_service.motion.safety_monitor import SafetyMonitor
 
 Array = np.ndarray
 RATIOS, COUPLING, MOST = (20.0, -30.0), ((1.0, -0.5), (1.0, 0.5)), (0.8, 0.5)
@@ -27,8 +27,8 @@ def coupled_limits() -> MotionLimits:
     return motion_limits(bench_config(transmission=gears.model_dump()))
 
 
-def guard() -> Guard:
-    return Guard(NAMES, coupled_limits(), PERIOD, HOME)
+def guard() -> SafetyMonitor:
+    return SafetyMonitor(NAMES, coupled_limits(), PERIOD, HOME)
 
 
 def motors(torque: Array) -> Array:
@@ -86,5 +86,5 @@ def test_the_sentence_names_the_motor() -> None:
 
 
 def test_a_joint_alone_is_told_as_before() -> None:
-    one = Guard(NAMES, replace(coupled_limits(), motors=None), PERIOD, HOME)
+    one = SafetyMonitor(NAMES, replace(coupled_limits(), motors=None), PERIOD, HOME)
     is_fault(one.torque(1.01 * LIMITS.torque * np.array([1.0, 0.0]))[1], "torque_saturated", 0)

@@ -13,7 +13,7 @@ from motion_bench import bench_model
 from drivers.arm import StopKind
 from drivers.axis_status import AxisEventCode, AxisStatus
 from ident_service.model.collision import Contact
-from ident_service.motion.faults import FAULTS, Fault, Findings, Reaction, Severity
+from ident_service.motion.faults import FAULTS, Fault, FaultCounter, Reaction, Severity
 from ident_service.motion.safety_monitor import (
     ABSURD,
     ENVELOPE,
@@ -272,7 +272,7 @@ def test_every_warning_becomes_something_worse() -> None:
 
 
 def test_old_warnings_are_forgotten() -> None:
-    findings = Findings()
+    findings = FaultCounter()
     for _ in range(1000):
         findings.cycle += 5
         assert findings.found("torque_rate", "x").code == "torque_rate"

@@ -17,7 +17,7 @@ from ident_service.model.collision import Contact
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion import safety_monitor as checks
 from ident_service.motion import safety_monitor as guard
-from ident_service.motion.encoder_observer import Owed
+from ident_service.motion.encoder_observer import FrozenEncoderObserver
 from ident_service.motion.safety_monitor import approach_speed
 
 Array = np.ndarray
@@ -36,7 +36,7 @@ def test_the_thresholds_are_the_ones_decided_on() -> None:
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fail where a sample is looked at threshold by threshold."""
 
-    def asked(seen: checks.Seen, limits: Any) -> NoReturn:
+    def asked(seen: checks.MonitoredSample, limits: Any) -> NoReturn:
         pytest.fail("a healthy sample was looked at threshold by threshold")
 
     monkeypatch.setattr(guard, "checks", asked)
@@ -118,7 +118,7 @@ def test_what_is_just_healthy_is_found_so_at_once(
 def test_what_is_just_healthy_is_so_threshold_by_threshold(
     healthy: Callable[[int, float], None], joint: int, side: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(guard.Guard, "_quiet", lambda *_: False)
+    monkeypatch.setattr(guard.SafetyMonitor, "_quiet", lambda *_: False)
     healthy(joint, side)
 
 
@@ -174,11 +174,11 @@ def test_a_torque_that_changes_as_fast_as_it_may_is_not_led() -> None:
 
 def test_a_small_joint_may_go_from_no_torque_to_all_in_ten_milliseconds() -> None:
     small = replace(LIMITS, torque=np.array([4.0, 15.0]))
-    rate = guard.Guard(NAMES, small, PERIOD, HOME).rate
+    rate = guard.SafetyMonitor(NAMES, small, PERIOD, HOME).rate
     np.testing.assert_allclose(rate, [4.0 / 10.0, 1.0])
 
 
-class Heard(Owed):
+class Heard(FrozenEncoderObserver):
     """An observer that keeps the directions it was told."""
 
     def update(self, direction: Vector, *others: Vector) -> Array:

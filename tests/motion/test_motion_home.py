@@ -14,10 +14,10 @@ from run_bench import HOLD, HOME, LIMITS, PERIOD, Bench
 from drivers.arm import StopKind
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.clearance import admitting, just_inside
-from ident_service.motion.command_channel import Switches
+from ident_service.motion.clearance import just_inside, relaxed_limits
+from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.run import RunReport, follow
-from ident_service.motion.run_plan import Destination, GoTo
+from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.state_machine import State
 
 Array = np.ndarray
@@ -31,7 +31,7 @@ def standing(shoulder: float, elbow: float) -> dict[str, Any]:
 
 
 def go(bench: Bench, destination: Destination = Destination.HOME, controls: Any = None) -> RunReport:
-    return follow(bench.arm, bench.model, GoTo(destination), bench.story, controls, hold_seconds=HOLD)
+    return follow(bench.arm, bench.model, PointToPointPlan(destination), bench.story, controls, hold_seconds=HOLD)
 
 
 def refused(bench: Bench, match: str, destination: Destination = Destination.HOME) -> None:
@@ -112,7 +112,7 @@ def test_a_push_outwards_on_the_way_in_stops_the_arm(make: Callable[..., Bench])
 
 @pytest.mark.slow
 def test_a_stop_on_the_way_home_is_a_stop(make: Callable[..., Bench]) -> None:
-    bench, switches = make(**standing(-1.2, 1.0)), Switches()
+    bench, switches = make(**standing(-1.2, 1.0)), LocalCommands()
     bench.arm.before_exchange = lambda cycle: setattr(switches, "stop", cycle > 1500)
     assert go(bench, controls=switches).state is State.STOPPED
     assert bench.story.states[-2:] == ["stopping", "stopped"]
@@ -121,7 +121,7 @@ def test_a_stop_on_the_way_home_is_a_stop(make: Callable[..., Bench]) -> None:
 
 @pytest.mark.slow
 def test_a_pause_on_the_way_home_ends_at_home(make: Callable[..., Bench]) -> None:
-    bench, switches = make(**standing(-1.2, 1.0)), Switches()
+    bench, switches = make(**standing(-1.2, 1.0)), LocalCommands()
     bench.arm.before_exchange = lambda cycle: setattr(switches, "pause", 1500 < cycle < 3000)
     assert go(bench, controls=switches).state is State.DONE
     assert bench.story.states[3:7] == ["pausing", "paused", "resuming", "returning"]
@@ -138,9 +138,9 @@ def test_a_way_through_an_obstacle_is_refused(make: Callable[..., Bench]) -> Non
 
 
 def test_limits_are_widened_only_where_the_arm_stands_outside() -> None:
-    inside = admitting(HOME, LIMITS)
+    inside = relaxed_limits(HOME, LIMITS)
     np.testing.assert_array_equal([inside.lower, inside.upper], [LIMITS.lower, LIMITS.upper])
-    out = admitting(np.array([OUT, 0.0]), LIMITS)
+    out = relaxed_limits(np.array([OUT, 0.0]), LIMITS)
     np.testing.assert_allclose(out.upper, [OUT + 0.05, LIMITS.upper[1]])
     np.testing.assert_array_equal(out.lower, LIMITS.lower)
     np.testing.assert_allclose(just_inside(np.array([OUT, 0.0]), LIMITS), [LIMITS.upper[0] - 0.05, 0.0])

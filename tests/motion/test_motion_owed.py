@@ -8,7 +8,15 @@ from guard_bench import HOME, LIMITS, PERIOD, Bench, is_fault, unit
 from motion_bench import PRIOR, bench_model
 
 from ident_service.model.pinocchio_models import InverseDynamics
-from ident_service.motion.encoder_observer import OWED, SLID, SLIDING, STANDING, STEPS, Owed, owed_ways
+from ident_service.motion.encoder_observer import (
+    OWED,
+    SLID,
+    SLIDING,
+    STANDING,
+    STEPS,
+    FrozenEncoderObserver,
+    frozen_encoder_observer,
+)
 from ident_service.motion.safety_monitor import FROZEN_CYCLES, FROZEN_EFFORT
 
 Array = np.ndarray
@@ -21,16 +29,16 @@ HIDDEN = OWED * LIMITS.following_error + STEPS * STEP
 NONE, STILL = np.zeros(2), np.zeros(2)
 
 
-def observer() -> Owed:
-    return Owed(DYNAMICS, LIMITS, PERIOD, FRICTION, STEP)
+def observer() -> FrozenEncoderObserver:
+    return FrozenEncoderObserver(DYNAMICS, LIMITS, PERIOD, FRICTION, STEP)
 
 
-def shown(owed: Owed, direction: Array, correction: Array) -> Array:
+def shown(owed: FrozenEncoderObserver, direction: Array, correction: Array) -> Array:
     """Corrections that are each joint's own."""
     return owed.update(direction, correction, correction / INERTIA, HOME)
 
 
-def cycles_until(owed: Owed, correction: Array, most: int = 3000) -> int | None:
+def cycles_until(owed: FrozenEncoderObserver, correction: Array, most: int = 3000) -> int | None:
     """After how many cycles of standing still under a correction something is owed."""
     for cycle in range(1, most + 1):
         if shown(owed, STILL, correction).any():
@@ -48,7 +56,7 @@ def test_what_is_owed_is_what_the_push_beyond_friction_would_have_moved(joint: i
     assert cycles_until(observer(), side * unit(joint) * STANDING * FRICTION) is None
 
 
-def slid(owed: Owed, direction: float, apart: int, correction: Array = NONE) -> None:
+def slid(owed: FrozenEncoderObserver, direction: float, apart: int, correction: Array = NONE) -> None:
     """Two steps of the elbow, so many cycles apart."""
     shown(owed, direction * unit(1), correction)
     for _ in range(apart - 1):
@@ -121,6 +129,6 @@ def test_losing_an_axis_excuses_nothing() -> None:
 @pytest.mark.parametrize(("known", "expected"), [(None, 0.3), (0.1, 0.3), (0.7, 0.7)])
 def test_friction_is_the_guess_or_more_if_the_prior_has_more(known: float | None, expected: float) -> None:
     model = bench_model(prior=PRIOR if known is None else PRIOR | {"fc2": known})
-    owed = owed_ways(DYNAMICS, model, LIMITS, PERIOD, STEP)
+    owed = frozen_encoder_observer(DYNAMICS, model, LIMITS, PERIOD, STEP)
     assert cycles_until(owed, 0.99 * STANDING * expected * unit(1)) is None
     assert cycles_until(owed, 1.2 * STANDING * expected * unit(1)) is not None

@@ -12,7 +12,7 @@ from run_bench import HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy, with
 
 from drivers.arm import Sample
 from ident_service.errors import UsageError
-from ident_service.motion.command_channel import StopWhen
+from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.control_loop import REST_CYCLES
 from ident_service.motion.run import run
 from ident_service.motion.state_machine import State
@@ -128,7 +128,7 @@ def test_a_stop_out_of_a_rehearsal_is_not_slowed(make: Callable[..., Bench]) -> 
         bench.model,
         MOTION,
         bench.story,
-        StopWhen(lambda: len(bench.story.samples) >= stopping - LOOKED),
+        StopCondition(lambda: len(bench.story.samples) >= stopping - LOOKED),
         speed=0.2,
     )
     assert report.state is State.STOPPED

@@ -13,9 +13,9 @@ from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench
 
 from drivers.arm import StopKind
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, Switches
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LocalCommands
 from ident_service.motion.control_loop import HOLD_SPEED, REST_CYCLES, REST_SPEED
-from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, Latch
+from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, ActiveFaults
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.sequencer import Paused
 from ident_service.motion.state_machine import State
@@ -143,7 +143,7 @@ def test_no_way_back_ends_the_pause(make: Callable[..., Bench], monkeypatch: pyt
 @pytest.mark.parametrize("cycle", [300, MIDWAY, 1900])
 @pytest.mark.parametrize(("wish", "code"), [("gone", "lease_lost"), ("dead", "controls_failed")])
 def test_an_arm_that_nobody_watches_stops(make: Callable[..., Bench], wish: str, code: str, cycle: int) -> None:
-    bench, latch = make(), Latch()
+    bench, latch = make(), ActiveFaults()
     with pytest.raises(ArmFault) as caught:
         played(bench, Hands(**{wish: cycle}), latch=latch)
     assert caught.value.code == code
@@ -176,7 +176,7 @@ def test_a_lease_lost_in_a_pause_stops_and_one_lost_in_a_stop_is_nothing(make: C
 
 
 def test_hold_to_run_is_a_short_lease(make: Callable[..., Bench]) -> None:
-    bench, switches = make(), Switches(HOLD_TO_RUN_SECONDS)
+    bench, switches = make(), LocalCommands(HOLD_TO_RUN_SECONDS)
     clock = bench.arm.clock
     bench.arm.before_exchange = lambda cycle: switches.renew(clock.now_ns()) if cycle <= MIDWAY else None
     with pytest.raises(ArmFault, match="lease_lost"):
@@ -252,9 +252,9 @@ def test_an_arm_that_is_pushed_while_it_is_held_is_left_to_its_drives(make: Call
 
 @pytest.mark.slow
 def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> None:
-    bench, latch = make(Fault(700, FaultKind.LOAD_ATTACHED, None, None, 3.0)), Latch()
+    bench, latch = make(Fault(700, FaultKind.LOAD_ATTACHED, None, None, 3.0)), ActiveFaults()
     with pytest.raises(ArmFault, match="following_lost: ") as caught:
-        played(bench, Switches(), latch=latch)
+        played(bench, LocalCommands(), latch=latch)
     assert caught.value.code == "following_lost"
     assert [fault.code for fault in latch.faults] == ["following_error", "following_lost"]
     assert bench.story.states[-2:] == ["stopping", "faulted"]
@@ -267,18 +267,18 @@ def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> N
 
 
 def test_a_latched_fault_refuses_the_next_run_until_it_is_acknowledged(make: Callable[..., Bench]) -> None:
-    bench, latch = make(Fault(MIDWAY, FaultKind.NAN_POSITION, 0)), Latch()
+    bench, latch = make(Fault(MIDWAY, FaultKind.NAN_POSITION, 0)), ActiveFaults()
     with pytest.raises(ArmFault):
-        played(bench, Switches(), latch=latch)
+        played(bench, LocalCommands(), latch=latch)
     (fault,) = latch.faults
     assert fault.cause.startswith("shoulder: position is not a number: ")
     assert fault.since_ns == MIDWAY * 1_000_000
     again = make()
     with pytest.raises(MotionRefused, match=r"nobody has acknowledged: feedback_not_finite \(shoulder: "):
-        played(again, Switches(), latch=latch)
+        played(again, LocalCommands(), latch=latch)
     again.nothing_was_enabled()
     latch.acknowledge("feedback_not_finite")
-    assert played(again, Switches(), latch=latch).state is State.DONE
+    assert played(again, LocalCommands(), latch=latch).state is State.DONE
     assert latch.faults == ()
 
 
@@ -286,13 +286,13 @@ def test_rest_is_seen_in_all_samples_before_a_run(make: Callable[..., Bench]) ->
     bench = make()
     bench.arm.shown = lambda sample: replace(sample, position=HOME + 0.01 * (sample.cycle % 10 == 5))
     with pytest.raises(MotionRefused, match="moving"):
-        played(bench, Switches())
+        played(bench, LocalCommands())
     bench.nothing_was_enabled()
 
 
 def test_a_warning_is_told_once_and_counted(make: Callable[..., Bench]) -> None:
     bench = make(*(Fault(cycle, FaultKind.LOST_FEEDBACK, 1) for cycle in (700, 800, 900)))
-    report = played(bench, Switches())
+    report = played(bench, LocalCommands())
     assert report.warnings == {"lost_feedback": 3}
     warnings = [message for _, level, message in bench.story.events if level == 30]
     assert warnings == ["lost_feedback: elbow: no feedback in this cycle: a frame was lost or came too late"]

@@ -246,12 +246,12 @@ def test_a_fault_that_the_table_does_not_know_takes_the_torque_away_all_the_same
     from types import SimpleNamespace
 
     from ident_service.errors import ArmFault
-    from ident_service.motion.faults import Latch
+    from ident_service.motion.faults import ActiveFaults
     from ident_service.motion.run import _Run
     from ident_service.motion.state_machine import State
 
     stopped: list[StopKind] = []
-    latch = Latch()
+    latch = ActiveFaults()
     arm = SimpleNamespace(stop=stopped.append, clock=SimpleNamespace(now_ns=lambda: 0))
     run_ = SimpleNamespace(arm=arm, latch=latch, states=SimpleNamespace(state=State.FAULTED))
     _Run._halt(run_, ArmFault("from_a_foreign_driver", "who knows"), SimpleNamespace(lowered=False))  # type: ignore[arg-type]

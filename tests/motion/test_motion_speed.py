@@ -13,7 +13,7 @@ from reachable import PathPeaks, close, keeps_to, path_peaks, random_limits, ran
 
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.motion.speed_scaling import Slowed, SpeedChange, slowed_limits
-from ident_service.motion.trajectory import PathReference, Setpoint, rest, way
+from ident_service.motion.trajectory import PathReference, Setpoint, plan_trajectory, rest
 
 LIMITS = bench_limits()
 PATH = bench_excitation().path
@@ -48,7 +48,10 @@ def test_a_motion_at_full_speed_is_itself() -> None:
 
 def test_a_slowed_way_is_the_way_within_slowed_limits() -> None:
     start, end = rest(np.zeros(2)), rest(np.array([1.0, -0.4]))
-    slow, other = Slowed(way(start, end, LIMITS), 0.2), way(start, end, slowed_limits(LIMITS, 0.2))
+    slow, other = (
+        Slowed(plan_trajectory(start, end, LIMITS), 0.2),
+        plan_trajectory(start, end, slowed_limits(LIMITS, 0.2)),
+    )
     assert slow.duration == pytest.approx(other.duration)
     for time in np.linspace(0.0, slow.duration, 9):
         close(slow.at(float(time)), other.at(float(time)))
@@ -100,7 +103,7 @@ def test_a_change_takes_as_long_as_the_limits_ask_for() -> None:
 
 
 def test_the_limits_are_the_peaks_of_a_way() -> None:
-    reference = way(rest(np.array([-1.7, -1.9])), rest(np.array([1.7, 1.9])), LIMITS)
+    reference = plan_trajectory(rest(np.array([-1.7, -1.9])), rest(np.array([1.7, 1.9])), LIMITS)
     change = SpeedChange(reference, 0.5, (0.2, 0.9), LIMITS, LIMITS)
     # The jerk of a way has steps, so only sizes are looked at.
     keeps_to(LIMITS, change, 1e-5, 3000)

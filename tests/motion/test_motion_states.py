@@ -7,8 +7,8 @@ from itertools import product
 import pytest
 
 from ident_service.errors import ArmError, UsageError
-from ident_service.motion.faults import Latch
-from ident_service.motion.state_machine import LAWFUL, MOVING, STOPPABLE, State, States
+from ident_service.motion.faults import ActiveFaults
+from ident_service.motion.state_machine import MOVING, STOPPABLE, TRANSITIONS, State, StateMachine
 
 MOVES = ("approaching", "exciting", "returning")
 WAYS = {
@@ -35,8 +35,8 @@ WAYS = {
 }
 
 
-def states_in(state: State, latch: Latch | None = None) -> States:
-    states = States(latch or Latch())
+def states_in(state: State, latch: ActiveFaults | None = None) -> StateMachine:
+    states = StateMachine(latch or ActiveFaults())
     states.state = state
     return states
 
@@ -55,23 +55,23 @@ def test_exactly_the_lawful_ways_are_open(current: State, wanted: State) -> None
 
 @pytest.mark.parametrize("state", STOPPABLE)
 def test_whatever_is_energised_can_stop_and_fault(state: State) -> None:
-    assert {State.STOPPING, State.FAULTED} <= set(LAWFUL[state])
+    assert {State.STOPPING, State.FAULTED} <= set(TRANSITIONS[state])
 
 
 def test_nothing_moves_on_from_a_stop_but_a_held_arm_that_is_led_home() -> None:
     for state in (State.STOPPING, State.STOPPED, State.FAULTED, State.DONE):
         moves = {*MOVING, State.RESUMING, State.PAUSING, State.ARMED}
-        assert set(LAWFUL[state]) & moves == ({State.RETURNING} if state is State.STOPPED else set())
+        assert set(TRANSITIONS[state]) & moves == ({State.RETURNING} if state is State.STOPPED else set())
 
 
 def test_every_state_is_reached_and_left() -> None:
-    assert set(LAWFUL) == set(State)
-    assert {state for ways in LAWFUL.values() for state in ways} == set(State)
+    assert set(TRANSITIONS) == set(State)
+    assert {state for ways in TRANSITIONS.values() for state in ways} == set(State)
 
 
 def test_who_wants_to_know_is_told() -> None:
     told: list[State] = []
-    states = States(Latch(), told.append)
+    states = StateMachine(ActiveFaults(), told.append)
     states.enter(State.CHECKED)
     states.enter(State.ARMED)
     assert told == [State.CHECKED, State.ARMED]
@@ -79,7 +79,7 @@ def test_who_wants_to_know_is_told() -> None:
 
 @pytest.mark.parametrize(("state", "wanted"), [(State.CHECKED, State.ARMED), (State.FAULTED, State.IDLE)])
 def test_a_latched_fault_stands_in_the_way(state: State, wanted: State) -> None:
-    latch = Latch()
+    latch = ActiveFaults()
     latch.set("runaway", "elbow: fast", 5)
     latch.set("driver", "bus: gone", 6)
     states = states_in(state, latch)
@@ -91,7 +91,7 @@ def test_a_latched_fault_stands_in_the_way(state: State, wanted: State) -> None:
 
 
 def test_a_fault_is_acknowledged_by_its_name_and_no_other() -> None:
-    latch = Latch()
+    latch = ActiveFaults()
     with pytest.raises(UsageError, match="latched: none"):
         latch.acknowledge("runaway")
     latch.set("runaway", "elbow: fast", 5)

@@ -26,7 +26,13 @@ from reachable import (
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.trajectory import PosturePath
-from ident_service.motion.stop_trajectory import ToRest, require_stops_within_limits, stop, stop_extent, stop_overshoot
+from ident_service.motion.stop_trajectory import (
+    StopProfile,
+    require_stops_within_limits,
+    stop,
+    stop_extent,
+    stop_overshoot,
+)
 from ident_service.motion.trajectory import PathReference, Setpoint, rest
 
 Array = np.ndarray
@@ -232,7 +238,7 @@ def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
     rng = np.random.default_rng(seed)
     start = Setpoint(*rng.normal(size=(3, 2)))
     pieces = [(rng.choice([-5.0, 0.0, 5.0], 2), rng.uniform(0.0, 1.0, 2)) for _ in range(4)]
-    reference = ToRest(start, pieces)
+    reference = StopProfile(start, pieces)
     lowest, highest = reference.extent()
     _, position, _, _ = sampled(reference, 800)
     np.testing.assert_allclose(lowest, position.min(axis=0), atol=5e-3)

@@ -15,11 +15,11 @@ from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.motion.clearance import Surroundings, require_clear, stops_touching
-from ident_service.motion.command_channel import Switches
+from ident_service.motion.clearance import ClearanceChecker, require_clear, stops_touching
+from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.run import run
 from ident_service.motion.sequencer import Paused, Resumed
-from ident_service.motion.trajectory import PathReference, Reference, Setpoint, at_once, rest, way
+from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest, run_to_end
 
 Array = np.ndarray
 LIMITS = bench_limits()
@@ -54,7 +54,7 @@ def beside_the_way_back(left: float, radius: float = 0.01) -> tuple[Paused, Resu
 
 
 def searched(paused: Paused, model: ArmModel) -> Resumed:
-    return at_once(paused.resume_in_slices(None, Surroundings(model, LIMITS)))
+    return run_to_end(paused.resume_in_slices(None, ClearanceChecker(model, LIMITS)))
 
 
 @pytest.mark.parametrize("left", np.linspace(0.3, 0.9 * MOTION.duration, 6).tolist())
@@ -101,11 +101,13 @@ def test_half_of_what_a_stop_left_is_kept(gap: float) -> None:
     """The tip stands `gap` from a ball and swings towards it or away."""
     start = np.array([0.0, 0.0])
     above = tip(start) + np.array([0.0, 0.02 + 0.1 + gap, 0.0])
-    surroundings = Surroundings(with_ball(above, 0.1), LIMITS)
+    surroundings = ClearanceChecker(with_ball(above, 0.1), LIMITS)
     least = min(0.02, 0.5 * gap)
 
     def judged(angle: float) -> None:
-        at_once(surroundings.require_clear(way(rest(start), rest(np.array([angle, 0.0])), LIMITS), LIMITS))
+        run_to_end(
+            surroundings.require_clear(plan_trajectory(rest(start), rest(np.array([angle, 0.0])), LIMITS), LIMITS)
+        )
 
     judged(-0.3)
     judged(0.5 * (gap - least))
@@ -131,10 +133,10 @@ def test_a_stop_out_of_a_way_that_would_touch_is_told() -> None:
     ahead = tip(np.array([0.2, 0.0])) + np.array([0.0, 0.03, 0.0])
     collision = CollisionModel(with_ball(ahead, 0.01))
     assert collision.distances(np.zeros((1, 2))).min() > 0.1
-    told = at_once(stops_touching(collision, Standing(moving), LIMITS))
+    told = run_to_end(stops_touching(collision, Standing(moving), LIMITS))
     assert told is not None
     assert told.startswith("a stop out of the way at 0.00 s would touch: elbow - obstacle ball, -0.")
-    assert at_once(stops_touching(collision, Standing(rest(np.zeros(2))), LIMITS)) is None
+    assert run_to_end(stops_touching(collision, Standing(rest(np.zeros(2))), LIMITS)) is None
 
 
 def test_a_run_is_refused_for_a_stop_out_of_its_approach_too() -> None:
@@ -157,7 +159,7 @@ def test_looking_takes_a_bearable_part_of_a_cycle(monkeypatch: pytest.MonkeyPatc
         looked[0] += len(position)
         return plain(self, position)
 
-    surroundings = Surroundings(model, LIMITS)
+    surroundings = ClearanceChecker(model, LIMITS)
     monkeypatch.setattr(CollisionModel, "distances", counted)
     most, slices = 0, paused.resume_in_slices(None, surroundings)
     while True:
@@ -175,17 +177,17 @@ def test_in_a_run_a_way_back_that_is_not_clear_is_none(
 ) -> None:
     asked: list[float] = []
 
-    def unclear(self: Surroundings, way_back: Reference, limits: MotionLimits) -> Generator[None, None, None]:
+    def unclear(self: ClearanceChecker, way_back: Reference, limits: MotionLimits) -> Generator[None, None, None]:
         asked.append(way_back.duration)
         yield
         raise MotionRefused("the table is in the way")
 
-    class Pausing(Switches):
+    class Pausing(LocalCommands):
         def lease_ok(self, now_ns: int) -> bool:
             self.pause = 700_000_000 <= now_ns < 1_500_000_000
             return True
 
-    monkeypatch.setattr(Surroundings, "require_clear", unclear)
+    monkeypatch.setattr(ClearanceChecker, "require_clear", unclear)
     bench = make()
     with pytest.raises(ArmFault, match="the table is in the way") as caught:
         run(bench.arm, bench.model, bench_excitation(), bench.story, Pausing(), hold_seconds=0.1)

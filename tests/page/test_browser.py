@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, Page, expect
 from ident_service.motion.command_channel import in_use
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
-from ident_service.registry.database import trail
+from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
@@ -248,7 +248,7 @@ def test_escape_pressed_ten_times_is_one_stop(browser: Browser, reached: Reached
         expect(page.locator("#stop-status")).to_have_text("Nothing was moving.")
         assert asked == [f"{reached.url}/api/v1/stop"] * times
     assert reached.service.engine.audit.flush(10.0)
-    assert [line["what"] for line in trail(reached.service.db)].count("stop") == 2
+    assert [line["what"] for line in audit_log(reached.service.db)].count("stop") == 2
 
 
 @pytest.mark.parametrize("width", [1280, 400])

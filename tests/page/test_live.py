@@ -12,11 +12,11 @@ import pytest
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.daemon.live import BIN_NS, LiveRun
 from ident_service.errors import RecordingError
-from ident_service.estimation.online import GrowingInformation
+from ident_service.estimation.online import SequentialLeastSquares
 from ident_service.model.arm_model import arm_model
 from ident_service.model.regressor import joint_regressor
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_follower import RecordingTail
+from ident_service.recordings.mcap_follower import RecordingFollower
 from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recording import Block
 
@@ -44,7 +44,7 @@ def cycle(k: int) -> Cycle:
     )
 
 
-def everything(tail: RecordingTail, most: int = 1 << 20) -> list[float]:
+def everything(tail: RecordingFollower, most: int = 1 << 20) -> list[float]:
     """Torque of the first joint of all samples that can be had now."""
     found = list[float]()
     while (samples := tail.read(most)) is not None:
@@ -58,7 +58,7 @@ def everything(tail: RecordingTail, most: int = 1 << 20) -> list[float]:
 @pytest.mark.parametrize("most", [1 << 20, 4096, 16])
 def test_a_tail_gives_each_flushed_sample_once(tmp_path: Path, most: int) -> None:
     with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
-        tail = RecordingTail(writer.partial)
+        tail = RecordingFollower(writer.partial)
         assert tail.read(most) is None
         writer.event(START_NS, 20, "approaching")
         seen, counts = list[float](), []
@@ -89,7 +89,7 @@ def test_a_torn_end_waits_and_damage_is_told(tmp_path: Path) -> None:
     whole = (tmp_path / "run.mcap").read_bytes()
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(whole[: len(whole) // 2])
-    tail = RecordingTail(torn)
+    tail = RecordingFollower(torn)
     first = everything(tail)
     assert 0 < len(first) < 500
     torn.write_bytes(whole)
@@ -98,12 +98,12 @@ def test_a_torn_end_waits_and_damage_is_told(tmp_path: Path) -> None:
     damaged = bytearray(whole)
     damaged[len(whole) // 2] ^= 0xFF
     torn.write_bytes(damaged)
-    tail = RecordingTail(torn)
+    tail = RecordingFollower(torn)
     with pytest.raises(RecordingError):
         everything(tail)
     tail.close()
     torn.write_bytes(whole[:8] + b"\x06" + (1 << 40).to_bytes(8, "little") + b"x")
-    tail = RecordingTail(torn)
+    tail = RecordingFollower(torn)
     with pytest.raises(RecordingError, match="above the limit"):
         tail.read()
     tail.close()
@@ -154,10 +154,10 @@ def test_a_run_that_cannot_be_read_says_so_once(tmp_path: Path, caplog: pytest.L
 
 def growing_run(
     seconds: float, noise: float, *, in_blocks: bool = False
-) -> tuple[GrowingInformation, np.ndarray, list[np.ndarray]]:
+) -> tuple[SequentialLeastSquares, np.ndarray, list[np.ndarray]]:
     """Doubt of a motion of the planar arm that comes in pieces; the true base parameters; deviations on the way."""
     model = arm_model(load_arm(shipped_arms()["planar2"]))
-    growing = GrowingInformation(model, in_blocks=in_blocks)
+    growing = SequentialLeastSquares(model, in_blocks=in_blocks)
     rng, step = np.random.default_rng(3), 0.002
     time_s = np.arange(0.0, seconds, step)
     w = 2 * np.pi * np.array([[0.31], [0.47]])
@@ -218,7 +218,7 @@ def test_what_is_remembered_stays_bounded() -> None:
 
 
 def test_nothing_is_known_before_the_arm_has_moved() -> None:
-    growing = GrowingInformation(arm_model(load_arm(shipped_arms()["planar2"])))
+    growing = SequentialLeastSquares(arm_model(load_arm(shipped_arms()["planar2"])))
     assert not growing.step()
     assert growing.doubt() is None
     stamp = np.arange(0, 10_000_000_000, 2_000_000)

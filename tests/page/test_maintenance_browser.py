@@ -17,10 +17,10 @@ from playwright.sync_api import Browser, Page, expect
 from ident_service.daemon.maintenance.reidentification import reidentifications
 from ident_service.motion.command_channel import in_use
 from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.maintenance_schedule import dues
+from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
-from ident_service.registry.database import trail
+from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
@@ -118,7 +118,7 @@ def test_what_is_due_is_seen_and_done(browser: Browser, reached: Reached) -> Non
     expect(page.locator("#step-again")).not_to_have_attribute("aria-current", "step")
     expect(page.locator("#step-run")).to_contain_text("nothing recorded yet")
     db = reached.service.db
-    assert (dues(db), alarms(db), [row["state"] for row in reidentifications(db)]) == ([], [], ["unchanged"])
+    assert (pending(db), alarms(db), [row["state"] for row in reidentifications(db)]) == ([], [], ["unchanged"])
     assert problems == []
 
 
@@ -151,7 +151,7 @@ def test_a_drier_joint_raises_an_alarm_that_a_person_acknowledges(browser: Brows
     assert alarms(db) == []
     (closed,) = alarms(db, closed=True)
     assert (closed["closed_by"], closed["how"]) == ("owner", "seal ordered")
-    assert [line["who"] for line in trail(db) if line["what"] == "alarm acknowledged"] == ["owner"]
+    assert [line["who"] for line in audit_log(db) if line["what"] == "alarm acknowledged"] == ["owner"]
 
 
 def test_leaving_its_page_stops_the_arm_and_ends_it(browser: Browser, reached: Reached) -> None:

@@ -16,10 +16,10 @@ from page.test_pages import daemon as daemon
 
 from ident_service.daemon.maintenance.reidentification import reidentifications
 from ident_service.operations.drift_alarms import alarms, verdict_of
-from ident_service.operations.maintenance_schedule import dues, events, schedules
+from ident_service.operations.maintenance_schedule import events, pending, schedules
 from ident_service.operations.parameter_files import compare_into
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import trail
+from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import fault_file
 
 
@@ -83,14 +83,14 @@ def test_maintenance_is_entered_and_what_is_due_is_dismissed(daemon: Asked) -> N
     status, text = sent(daemon, f"/arms/{ARM}/maintenance", what="", note="kept words")
     assert (status, 'value="kept words"' in text, len(events(db, ARM))) == (422, True, 1)
     assert sent(daemon, f"/arms/{ARM}/maintenance", what="w" * 201, note="")[0] == 422
-    (due,) = dues(db, ARM)
+    (due,) = pending(db, ARM)
     assert sent(daemon, f"/due/{due['id']}/dismiss", note=" ")[0] == 422
-    assert len(dues(db, ARM)) == 1
+    assert len(pending(db, ARM)) == 1
     assert sent(daemon, f"/due/{due['id']}/dismiss", note="the same belt")[0] == 303
-    assert dues(db, ARM) == []
+    assert pending(db, ARM) == []
     assert sent(daemon, f"/due/{due['id']}/dismiss", note="again")[0] == 400
     assert sent(daemon, f"/arms/{ARM}/maintenance", what="belt & pulley", note="")[0] == 303
-    assert [row["cause"] for row in dues(db, ARM)] == ["maintenance: belt & pulley"]
+    assert [row["cause"] for row in pending(db, ARM)] == ["maintenance: belt & pulley"]
     for address in ("/", f"/arms/{ARM}", f"/arms/{ARM}/maintenance"):
         assert "maintenance: belt &amp; pulley" in daemon.get(address).text
 
@@ -122,7 +122,7 @@ def test_the_ladder_says_re_identify_when_something_asks_for_it(daemon: Asked) -
     assert current() == "again"
     sent(daemon, f"/alarms/{alarms(db)[0]['id']}/ack", note="known")
     assert current() == "again"  # it is due still
-    sent(daemon, f"/due/{dues(db, ARM)[0]['id']}/dismiss", note="not now")
+    sent(daemon, f"/due/{pending(db, ARM)[0]['id']}/dismiss", note="not now")
     assert current() == "check"
     # An arm of which nothing was accepted cannot be compared, whatever is due.
     sent(daemon, "/arms/planar2/schedules", when="maintenance")
@@ -161,7 +161,7 @@ def test_a_re_identification_needs_the_typed_name_and_a_fresh_page(daemon: Asked
     assert complaints(page) == []
     assert 'data-lease="keep"' in page
     assert "as planned" in page
-    assert [line["detail"] for line in trail(db) if line["what"] == "re-identification note"] == [
+    assert [line["detail"] for line in audit_log(db) if line["what"] == "re-identification note"] == [
         {"note": "as planned"}
     ]
     assert f'<a href="{where.split("?")[0]}">show</a>' in daemon.get(f"/arms/{ARM}").text

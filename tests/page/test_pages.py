@@ -20,7 +20,7 @@ from ident_service.daemon.maintenance.reidentification import enter_concluded
 from ident_service.daemon.web.render import STATIC, mark, static
 from ident_service.daemon.web.routes import PAGES
 from ident_service.operations.drift_alarms import Verdict, alarms
-from ident_service.operations.maintenance_schedule import When, add_event, add_schedule, dues, events, schedules
+from ident_service.operations.maintenance_schedule import DueRule, add_event, add_schedule, events, pending, schedules
 from ident_service.operations.run_archive import import_run
 from ident_service.registry import jobs as rows
 from ident_service.registry.state_folder import arm_folder, fault_file
@@ -50,7 +50,7 @@ def daemon(state: Path, commissioned: Path) -> Iterator[Asked]:
         (state / "jobs" / "j1").mkdir(parents=True)
         (state / "jobs" / "j1" / "log").write_text(EVIL)
         now = time.time()
-        for when in (When(cron="0 6 29 2 *"), When(hours=500.0), When(maintenance=True)):
+        for when in (DueRule(cron="0 6 29 2 *"), DueRule(hours=500.0), DueRule(maintenance=True)):
             add_schedule(db, ARM, when, EVIL, now)
         add_event(db, ARM, EVIL, EVIL, EVIL, now)  # and so it is due
         verdict = Verdict("changed", f"changed: {EVIL}")
@@ -199,7 +199,7 @@ def test_a_viewer_may_do_nothing_with_forms(daemon: Asked, commissioned: Path) -
     for address in others:
         assert daemon.post(address, content=sent, headers=FORM).status_code == 403, address
     db = daemon.service.db
-    assert (len(schedules(db)), len(dues(db)), len(alarms(db)), len(events(db, ARM))) == (3, 1, 1, 1)
+    assert (len(schedules(db)), len(pending(db)), len(alarms(db)), len(events(db, ARM))) == (3, 1, 1, 1)
     assert daemon.get("/new").status_code == 403
     assert list(fault_file(daemon.service.state, ARM).latched()) == ["FOLLOWING_ERROR"]
 

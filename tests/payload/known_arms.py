@@ -11,7 +11,7 @@ from ident_service.estimation.equations import Equations
 from ident_service.estimation.payload import KnownArm
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
-from ident_service.model.information import Information, information_of, supports
+from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 
 JOINTS = 4
@@ -54,7 +54,7 @@ def blocks_of(
     noise: np.ndarray = NOISE,
 ) -> Equations:
     """Equations at random states with white noise; `speed` 0 for states at rest."""
-    joint_supports = supports(ARM.chain, ARM.layout, BASE.base)
+    joint_supports = sparsity(ARM.chain, ARM.layout, BASE.base)
     made: list[Information] = []
     for H in regressors(blocks, samples, speed):
         torque = np.einsum("jps,p->sj", H, BASE.K @ delta) + noise * rng.normal(size=(samples, JOINTS))

@@ -9,8 +9,8 @@ import pytest
 from flight_bench import Flight, check_of, flight_config
 
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.ticket import Verdict, judged
-from ident_service.preflight.delay import FREQUENCY, MOST, Delay, delay_measures, delay_of
+from ident_service.motion.ticket import Verdict, check_from_measures
+from ident_service.preflight.delay import FREQUENCY, MOST, Delay, delay_measures, hidden_delay
 from ident_service.preflight.passive_checks import loop_rate_check
 from ident_service.preflight.session import Trace
 from sim_backend.faults import Fault, FaultKind
@@ -41,7 +41,7 @@ def shaken(hidden: float, *, inertia: float = 0.7, dry: float = 0.4, viscous: fl
 
 @pytest.mark.parametrize("hidden", [0.0, 0.001, 0.002, 0.004])
 def test_the_delay_is_measured_beside_friction(hidden: float) -> None:
-    found = delay_of(*shaken(hidden), 0)
+    found = hidden_delay(*shaken(hidden), 0)
     assert found is not None
     assert found.seconds == pytest.approx(hidden, abs=3.0 * found.deviation + 1e-4)
     assert found.deviation < 5e-4
@@ -50,21 +50,24 @@ def test_the_delay_is_measured_beside_friction(hidden: float) -> None:
 def test_a_joint_that_does_not_slide_says_nothing() -> None:
     trace, expected = shaken(0.0)
     still = Trace(0.0 * trace.position, trace.torque, trace.reference, trace.rate, PERIOD)
-    assert delay_of(still, expected, 0) is None
-    assert delay_of(Trace(trace.position, trace.torque, trace.reference, 0.0 * trace.rate, PERIOD), expected, 0) is None
+    assert hidden_delay(still, expected, 0) is None
+    assert (
+        hidden_delay(Trace(trace.position, trace.torque, trace.reference, 0.0 * trace.rate, PERIOD), expected, 0)
+        is None
+    )
 
 
 def test_all_joints_together_are_held_against_the_configured_delay() -> None:
     model = arm_model(flight_config())
     sure = [Delay(0, 0.0019, 2e-4), Delay(1, 0.0021, 2e-4)]
-    assert judged("direction", delay_measures(sure, model, PERIOD), "").verdict is Verdict.FAILED
+    assert check_from_measures("direction", delay_measures(sure, model, PERIOD), "").verdict is Verdict.FAILED
     fine = [Delay(0, MOST * PERIOD - 1e-4, 2e-4), Delay(1, 0.0, 2e-4)]
-    assert judged("direction", delay_measures(fine, model, PERIOD), "").verdict is Verdict.PASSED
+    assert check_from_measures("direction", delay_measures(fine, model, PERIOD), "").verdict is Verdict.PASSED
     vague = [Delay(0, 0.0019, 2e-3), Delay(1, 0.0021, 2e-3)]
-    assert judged("direction", delay_measures(vague, model, PERIOD), "").verdict is Verdict.PASSED
+    assert check_from_measures("direction", delay_measures(vague, model, PERIOD), "").verdict is Verdict.PASSED
     options = model.config.identification.model_copy(update={"delay": 0.002})
     told = arm_model(model.config.model_copy(update={"identification": options}))
-    assert judged("direction", delay_measures(sure, told, PERIOD), "").verdict is Verdict.PASSED
+    assert check_from_measures("direction", delay_measures(sure, told, PERIOD), "").verdict is Verdict.PASSED
 
 
 @pytest.mark.slow
@@ -77,7 +80,7 @@ def test_positions_that_are_a_cycle_old_are_refused() -> None:
 
 
 def test_lateness_with_torque_is_stated_beside_the_look_and_judged() -> None:
-    before = judged("rate", [], "")
+    before = check_from_measures("rate", [], "")
     stamps = np.arange(0.0, 60e9, 2e6)
     late = stamps.copy()
     late[1000:] += 50e6

@@ -19,7 +19,7 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion import last_position
 from ident_service.motion.last_position import FILE, LastPosition, PositionFile, turned
 from ident_service.motion.ticket import Check, Verdict
-from ident_service.operations.recovery import take_home
+from ident_service.operations.recovery import set_home
 from ident_service.preflight.preflight import preflight
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
@@ -179,5 +179,5 @@ def test_a_new_zero_forgets_where_the_arm_stood(behind: LockStepArm, tmp_path: P
     folder = tmp_path / "arms" / config.name
     folder.mkdir(parents=True)
     (folder / FILE).write_text("{}")
-    take_home(config, tmp_path, lambda question: config.name, opened_by(LockStepArm(config), config))
+    set_home(config, tmp_path, lambda question: config.name, opened_by(LockStepArm(config), config))
     assert not (folder / FILE).exists()

@@ -12,7 +12,7 @@ from flight_bench import Flight, Flown, check_of, verdicts
 from drivers.arm import Arm
 from ident_service.errors import DriverError
 from ident_service.excitation.motion_file import Excitation
-from ident_service.motion.command_channel import StoppableArm
+from ident_service.motion.command_channel import InterruptibleArm
 from ident_service.motion.ticket import Ticket, Verdict
 from ident_service.preflight.preflight import preflight
 
@@ -31,7 +31,7 @@ def bus_goes(flight: Flight, after: int) -> Arm:
 
 def stopped(flight: Flight, after: int) -> Arm:
     """The arm, of which somebody asks a stop after so many torques."""
-    return StoppableArm(flight.arm, lambda: len(flight.arm.torques) >= after)
+    return InterruptibleArm(flight.arm, lambda: len(flight.arm.torques) >= after)
 
 
 def checked(flight: Flight, arm: Arm, motion: Excitation | None) -> Ticket:
@@ -82,7 +82,7 @@ def test_a_stop_that_is_asked_for_while_a_person_thinks_keeps_the_drives_off() -
         flight.arm.calls.append("asked")
         return flight.typed
 
-    arm = StoppableArm(flight.arm, lambda: "asked" in flight.arm.calls)
+    arm = InterruptibleArm(flight.arm, lambda: "asked" in flight.arm.calls)
     ticket = preflight(arm, flight.model, flight.motion, confirm=confirm, clock=flight.clock, look_seconds=0.2)
     assert "asked" in flight.arm.calls
     assert "enable" not in flight.arm.calls

@@ -23,8 +23,8 @@ from ident_service.motion.ticket import (
     Subject,
     Ticket,
     Verdict,
+    check_from_measures,
     failed,
-    judged,
     measure,
     new_ticket,
     read_ticket,
@@ -46,7 +46,7 @@ SUBJECT = subject_of(MODEL, MOTION, ARM)
 def ticket(*changed: Check, subject: Subject = SUBJECT) -> Ticket:
     by_code = {check.code: check for check in changed}
     good = measure("drift", 0.01, "rad/s", joint="elbow", most=0.1)
-    checks = [by_code.get(code, judged(code, [good], "do something")) for code in CODES]
+    checks = [by_code.get(code, check_from_measures(code, [good], "do something")) for code in CODES]
     return new_ticket(subject, checks, NOW_NS)
 
 
@@ -131,7 +131,7 @@ def test_a_ticket_is_kept_to_the_last_bit(tmp_path: Path) -> None:
     made = ticket(
         failed("noise", "elbow: 1/3", "shield it", [measure("std", 1.0 / 3.0, "rad", joint="elbow", most=0.1)]),
         skipped("rate", "virtual"),
-        judged("gravity", [measure("difference", float("nan"), "N m")], "x"),
+        check_from_measures("gravity", [measure("difference", float("nan"), "N m")], "x"),
     )
     path = tmp_path / "ticket.json"
     write_ticket(path, made)

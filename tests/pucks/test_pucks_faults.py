@@ -13,7 +13,7 @@ from pucks_bench import MS, Host, pucks_config
 
 from ident_service.config.simulation import FAULT_RULES, FaultKind
 from ident_service.errors import DriverError
-from sim_backend.emulator.faults import _NO_COUNTERPART, PUCK_FAULTS, PuckFault, parse_fault
+from sim_backend.emulator.faults import _NO_COUNTERPART, PUCK_FAULTS, DriveFault, parse_fault
 from sim_backend.emulator.motor import Power
 
 NAMES = ("shoulder", "elbow")
@@ -249,7 +249,7 @@ def test_faults_that_no_drive_can_have_are_refused(tmp_path: Path, fault: dict[s
 
 
 def test_a_fault_in_words() -> None:
-    assert parse_fault("encoder_jump joint=elbow at=1.5 duration=0.2 size=-0.1", NAMES) == PuckFault(
+    assert parse_fault("encoder_jump joint=elbow at=1.5 duration=0.2 size=-0.1", NAMES) == DriveFault(
         "encoder_jump", 1, 1.5, 0.2, -0.1
     )
     assert parse_fault("emergency size=0x4310", NAMES).size == 0x4310

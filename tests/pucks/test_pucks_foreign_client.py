@@ -144,10 +144,10 @@ def test_frames_are_of_the_kind_they_were_sent_as() -> None:
     """A bus that nobody listens on must not hinder the sender; python-can's virtual bus keeps kinds apart."""
     from drivers.can.can_frame import Frame
     from ident_service.config.canopen import CanBus
-    from sim_backend.emulator.process import Station
+    from sim_backend.emulator.process import PythonCanBuses
 
     with can.Bus(interface="virtual", channel="pucks-kinds") as other:
-        station = Station([CanBus(interface="virtual", channel="pucks-kinds")])
+        station = PythonCanBuses([CanBus(interface="virtual", channel="pucks-kinds")])
         station.send([(0, Frame(0x123, b"\x01")), (0, Frame(0x040, bytes(8), error=True))])
         first, second = other.recv(1.0), other.recv(1.0)
         assert first is not None

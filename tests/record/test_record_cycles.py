@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ident_service.errors import RecordingError, UsageError
-from ident_service.recordings.cached_recording import KeptRecording
+from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_reader import read_cycles
 from ident_service.recordings.mcap_writer import RecordingWriter
@@ -90,13 +90,13 @@ class Counted:
             yield Block(stamp_ns, stamp_ns[:, None] * 1.0, stamp_ns[:, None] * 2.0)
 
 
-def stamps_of(recording: KeptRecording, samples: int) -> list[int]:
+def stamps_of(recording: CachedRecording, samples: int) -> list[int]:
     return [int(stamp) for block in recording.blocks(samples) for stamp in block.stamp_ns]
 
 
 def test_a_kept_recording_is_read_once() -> None:
     whole = Counted()
-    kept = KeptRecording(whole)
+    kept = CachedRecording(whole)
     for _ in range(3):
         assert stamps_of(kept, 100) == list(range(1000))
     assert whole.readings == 1
@@ -108,7 +108,7 @@ def test_a_kept_recording_is_read_once() -> None:
 
 def test_a_reading_that_was_given_up_keeps_nothing() -> None:
     whole = Counted()
-    kept = KeptRecording(whole)
+    kept = CachedRecording(whole)
     next(iter(kept.blocks(100)))
     assert stamps_of(kept, 100) == list(range(1000))
     assert whole.readings == 2
@@ -116,14 +116,14 @@ def test_a_reading_that_was_given_up_keeps_nothing() -> None:
 
 def test_a_large_recording_is_not_kept() -> None:
     whole = Counted()
-    kept = KeptRecording(whole, max_bytes=500)
+    kept = CachedRecording(whole, max_bytes=500)
     for _ in range(2):
         assert stamps_of(kept, 100) == list(range(1000))
     assert whole.readings == 2
 
 
 def test_nobody_writes_into_what_is_kept() -> None:
-    kept = KeptRecording(Counted())
+    kept = CachedRecording(Counted())
     (block,) = kept.blocks()
     with pytest.raises(ValueError, match="read-only"):
         block.position[0, 0] = 1.0
@@ -132,7 +132,7 @@ def test_nobody_writes_into_what_is_kept() -> None:
 def test_a_kept_file_is_the_file(tmp_path: Path) -> None:
     write(tmp_path / "run.mcap", 50)
     whole = open_recording(tmp_path / "run.mcap", JOINTS)
-    kept = KeptRecording(whole)
+    kept = CachedRecording(whole)
     assert (kept.path, kept.sha256, kept.joints, kept.torn, kept.torque_held) == (
         *(whole.path, whole.sha256, whole.joints, whole.torn, whole.torque_held),
     )

@@ -10,7 +10,7 @@ from report.conftest import Made
 
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.report.verdict import reservations, unidentified, verdict
+from ident_service.results.report.verdict import limitations, unidentified, verdict
 
 CERTIFIED = "has a certificate of that: `ident verify --arm` checks it in exact arithmetic"
 
@@ -105,7 +105,7 @@ def test_without_a_second_recording_the_joints_of_the_fit_are_judged(alone: Made
 
 def test_the_verdict_and_the_warnings_agree(good: Made, alone: Made, bare: Made) -> None:
     for one in (good, alone, bare):
-        against = reservations(one.evidence, one.parameters)
+        against = limitations(one.evidence, one.parameters)
         judged = bool(one.evidence.estimates[one.evidence.chosen].validation)
         clean = judged and not against and not one.evidence.warnings
         assert said(one).endswith("Next: nothing stands against using it.") is clean

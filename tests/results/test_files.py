@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.errors import UsageError
-from ident_service.results.manifest import appearing_folder, write_atomically
+from ident_service.results.manifest import atomic_folder, write_atomically
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -71,7 +71,7 @@ def test_a_missing_folder_is_a_usage_error(tmp_path: Path) -> None:
 
 def test_a_folder_appears_at_the_end(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "run"
-    with appearing_folder(folder) as staging:
+    with atomic_folder(folder) as staging:
         (staging / "a").write_text("1")
         assert not folder.exists()
         assert staging.parent == folder.parent
@@ -81,7 +81,7 @@ def test_a_folder_appears_at_the_end(tmp_path: Path) -> None:
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, UsageError])
 def test_a_folder_does_not_appear_after_an_error(tmp_path: Path, error: type[BaseException]) -> None:
     def fill() -> None:
-        with appearing_folder(tmp_path / "run") as staging:
+        with atomic_folder(tmp_path / "run") as staging:
             (staging / "a").write_text("1")
             (staging / "inner").mkdir()
             (staging / "inner" / "b").write_text("2")
@@ -97,7 +97,7 @@ def test_an_existing_folder_keeps_its_other_files(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "mine").write_text("keep")
     (folder / "a").write_text("old")
-    with appearing_folder(folder) as staging:
+    with atomic_folder(folder) as staging:
         (staging / "a").write_text("new")
         (staging / "b").write_text("2")
     assert {path.name: path.read_text() for path in folder.iterdir()} == {"mine": "keep", "a": "new", "b": "2"}
@@ -110,7 +110,7 @@ def test_an_existing_folder_is_untouched_after_an_error(tmp_path: Path) -> None:
     (folder / "a").write_text("old")
 
     def fill() -> None:
-        with appearing_folder(folder) as staging:
+        with atomic_folder(folder) as staging:
             (staging / "a").write_text("new")
             raise RuntimeError
 
@@ -122,9 +122,9 @@ def test_an_existing_folder_is_untouched_after_an_error(tmp_path: Path) -> None:
 
 def test_a_file_in_the_folder_s_place_is_refused(tmp_path: Path) -> None:
     (tmp_path / "run").write_text("a file")
-    with pytest.raises(UsageError, match="is a file, not a folder"), appearing_folder(tmp_path / "run"):
+    with pytest.raises(UsageError, match="is a file, not a folder"), atomic_folder(tmp_path / "run"):
         pytest.fail("the block was entered")
     (tmp_path / "deep").write_text("a file")
-    with pytest.raises(UsageError, match="cannot be written"), appearing_folder(tmp_path / "deep" / "run"):
+    with pytest.raises(UsageError, match="cannot be written"), atomic_folder(tmp_path / "deep" / "run"):
         pytest.fail("the block was entered")
     assert everything_in(tmp_path) == ["deep", "run"]

@@ -10,7 +10,7 @@ import pytest
 
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.motion.command_channel import ControlFile
-from ident_service.motion.fault_store import CONTROLS, FaultFile
+from ident_service.motion.fault_store import CONTROLS, FaultStore
 
 KILLED = """
 import os, signal, sys
@@ -30,12 +30,12 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_fault_stays_until_it_is_acknowledged_by_name(folder: Path) -> None:
-    faults = FaultFile(folder)
+    faults = FaultStore(folder)
     assert faults.latched() == {}
     faults.latch("runaway", "a sign")
     faults.latch("driver", "a cable")
     faults.latch("runaway", "another cause")
-    assert list(FaultFile(folder).latched().items()) == [("runaway", "a sign"), ("driver", "a cable")]
+    assert list(FaultStore(folder).latched().items()) == [("runaway", "a sign"), ("driver", "a cable")]
     with pytest.raises(MotionRefused, match=r"small: faults .* runaway \(a sign\); driver \(a cable\); `ident ack"):
         faults.began(Path("run"))
     with pytest.raises(UsageError, match=r"small: no fault 'far_outside' is latched \(latched: runaway, driver\)"):
@@ -46,7 +46,7 @@ def test_a_fault_stays_until_it_is_acknowledged_by_name(folder: Path) -> None:
 
 def test_who_is_killed_while_the_arm_moves_leaves_a_fault(folder: Path) -> None:
     subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False)
-    faults = FaultFile(folder)
+    faults = FaultStore(folder)
     (cause,) = faults.latched().values()
     assert cause.endswith("died while it had the arm, in the run runs/7")
     with ControlFile.take(folder / CONTROLS, None), pytest.raises(MotionRefused, match="motion_process"):
@@ -57,7 +57,7 @@ def test_who_is_killed_while_the_arm_moves_leaves_a_fault(folder: Path) -> None:
 
 
 def test_an_arm_that_moves_has_no_fault_yet_and_one_that_ended_has_none(folder: Path) -> None:
-    faults = FaultFile(folder)
+    faults = FaultStore(folder)
     with ControlFile.take(folder / CONTROLS, None):
         faults.began(Path("run"))
         assert faults.latched() == {}
@@ -72,6 +72,6 @@ def test_an_arm_that_moves_has_no_fault_yet_and_one_that_ended_has_none(folder: 
 def test_a_damaged_file_is_not_taken_for_none(folder: Path, name: str, content: str) -> None:
     folder.mkdir(parents=True)
     (folder / name).write_text(content)
-    for ask in (FaultFile(folder).latched, lambda: FaultFile(folder).began(Path("run"))):
+    for ask in (FaultStore(folder).latched, lambda: FaultStore(folder).began(Path("run"))):
         with pytest.raises(UsageError, match=f"{name}: cannot be read .* look at the arm, then remove the file"):
             ask()

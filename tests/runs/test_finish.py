@@ -18,13 +18,13 @@ from ident_service.cli import main
 from ident_service.cli.motion_commands import _report_text
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
-from ident_service.estimation.online import Doubt
+from ident_service.estimation.online import ParameterUncertainty
 from ident_service.estimation.target import LEAST_BLOCKS, Target, worst_share
-from ident_service.estimation.uncertainty import shares
+from ident_service.estimation.uncertainty import relative_deviations
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
-from ident_service.operations.motion_run import Reaching, least_seconds, require_target
+from ident_service.operations.motion_run import TargetMonitor, least_seconds, require_target
 from ident_service.operations.target_process import missed as not_known
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
@@ -73,7 +73,7 @@ def test_a_run_ends_early_with_what_it_is_for(
     assert main(words) == 0
     content = json.loads((tmp_path / "result" / "parameters.json").read_text())
     table = content["base_parameters"]
-    found = shares(*(np.array(table[key]) for key in ("values", "standard_deviations", "negligible")))
+    found = relative_deviations(*(np.array(table[key]) for key in ("values", "standard_deviations", "negligible")))
     # Deviations from 40 blocks are known to 11 % themselves, and the result smooths otherwise than what is watched.
     assert (found <= 1.35 * SHARE).all(), found
     assert content["feasibility"]["feasible"]
@@ -128,9 +128,11 @@ def test_finish_is_refused_where_nobody_moves(virtual_arm: Path, tmp_path: Path,
 _AS_ZERO = 0.01
 
 
-def doubt(model: ArmModel, values: float, deviation: float, blocks: int = LEAST_BLOCKS) -> Doubt:
+def doubt(model: ArmModel, values: float, deviation: float, blocks: int = LEAST_BLOCKS) -> ParameterUncertainty:
     size = base_parameters(model.chain, model.layout).size
-    return Doubt(20.0, np.full(size, values), np.full(size, deviation), _AS_ZERO * np.arange(1.0, size + 1), (), blocks)
+    return ParameterUncertainty(
+        20.0, np.full(size, values), np.full(size, deviation), _AS_ZERO * np.arange(1.0, size + 1), (), blocks
+    )
 
 
 def test_the_rule(model: ArmModel) -> None:
@@ -163,7 +165,7 @@ def test_nothing_counts_before_the_first_period(model: ArmModel) -> None:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_one_that_looks_may_die_or_hang(tmp_path: Path, how: signal.Signals) -> None:
     told: list[str] = []
-    with Reaching(tmp_path, Target(0.1), 0.0, told.append) as reaching:
+    with TargetMonitor(tmp_path, Target(0.1), 0.0, told.append) as reaching:
         assert not reaching.reached()
         os.kill(reaching._process.pid, how)
         if how is signal.SIGKILL:

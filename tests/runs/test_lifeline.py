@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ident_service.motion.command_channel import ControlFile, Lifeline
+from ident_service.motion.command_channel import ControlFile, SupervisedCommands
 
 LEASE = 2_000_000_000
 
@@ -43,7 +43,7 @@ def test_a_parent_that_is_killed_is_gone_at_once(controls: ControlFile, lock_ste
     )
     assert parent.stdout is not None
     assert parent.stdout.readline() == b"\n"
-    lifeline = Lifeline(controls, parent.stdout.fileno(), lock_step=lock_step)
+    lifeline = SupervisedCommands(controls, parent.stdout.fileno(), lock_step=lock_step)
     assert lifeline.lease_ok(0)
     os.kill(parent.pid, signal.SIGKILL)
     parent.wait()
@@ -54,7 +54,7 @@ def test_a_parent_that_is_killed_is_gone_at_once(controls: ControlFile, lock_ste
 
 def test_what_is_written_into_the_pipe_does_not_end_it(controls: ControlFile) -> None:
     end, other = os.pipe()
-    lifeline = Lifeline(controls, end, lock_step=True)
+    lifeline = SupervisedCommands(controls, end, lock_step=True)
     os.write(other, b"more")
     assert lifeline.lease_ok(0)
     os.close(other)
@@ -64,7 +64,7 @@ def test_what_is_written_into_the_pipe_does_not_end_it(controls: ControlFile) ->
 
 def test_a_lease_lapses_in_real_time_only(controls: ControlFile, time: Time) -> None:
     end, other = os.pipe()
-    real, virtual = (Lifeline(controls, end, lock_step=lock_step) for lock_step in (False, True))
+    real, virtual = (SupervisedCommands(controls, end, lock_step=lock_step) for lock_step in (False, True))
     time.now = LEASE + 1
     assert not real.lease_ok(0)
     assert virtual.lease_ok(0)
@@ -76,7 +76,7 @@ def test_a_lease_lapses_in_real_time_only(controls: ControlFile, time: Time) -> 
 
 def test_stop_and_pause_are_those_of_the_control_file(controls: ControlFile) -> None:
     end, other = os.pipe()
-    lifeline = Lifeline(controls, end, lock_step=False)
+    lifeline = SupervisedCommands(controls, end, lock_step=False)
     assert (lifeline.stop, lifeline.pause, lifeline.finish) == (False, False, False)
     controls.ask_finish()
     assert (lifeline.stop, lifeline.pause, lifeline.finish) == (False, False, True)

@@ -15,10 +15,10 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
 from ident_service.motion.arm_factory import make_arm
-from ident_service.operations.recovery import let_go, recover
+from ident_service.operations.recovery import recover, release_held_drives
 from ident_service.registry.state_folder import fault_file
-from sim_backend.emulator.faults import PuckFault
-from sim_backend.emulator.lock_step import LockStepArm, standing
+from sim_backend.emulator.faults import DriveFault
+from sim_backend.emulator.lock_step import LockStepArm, keep_arm
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def config(tmp_path: Path) -> ArmConfig:
 
 @pytest.fixture
 def behind(config: ArmConfig) -> Iterator[LockStepArm]:
-    with standing(config) as arm:
+    with keep_arm(config) as arm:
         yield arm
 
 
@@ -56,7 +56,7 @@ def states(behind: LockStepArm) -> list[str]:
     return [face.state for face in behind.emulator.faces]
 
 
-def session(config: ArmConfig, behind: LockStepArm, *faults: PuckFault) -> None:
+def session(config: ArmConfig, behind: LockStepArm, *faults: DriveFault) -> None:
     """An arm that was enabled, had these faults, and was stopped."""
     with make_arm(config) as arm:
         arm.enable()
@@ -79,7 +79,7 @@ def test_after_an_ordinary_session_nothing_is_in_the_way(config: ArmConfig, behi
 def test_a_latched_drive_fault_is_reset_when_it_is_acknowledged(
     config: ArmConfig, behind: LockStepArm, state: Path
 ) -> None:
-    session(config, behind, PuckFault("emergency", 1, size=0x4310))
+    session(config, behind, DriveFault("emergency", 1, size=0x4310))
     assert "fault, error 0x4310" in states(behind)[1]
     faults = fault_file(state, config.name)
     faults.latch("drive_fault", "elbow: the drive reports a fault")
@@ -97,7 +97,7 @@ def test_a_latched_drive_fault_is_reset_when_it_is_acknowledged(
 
 
 def test_a_cause_that_lasts_is_not_reset_away(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    session(config, behind, PuckFault("drive_fault", 1))
+    session(config, behind, DriveFault("drive_fault", 1))
     found = recover(config, state)
     assert not found.usable
     assert found.tripped == {"elbow": "fault"}
@@ -123,14 +123,14 @@ def test_drives_whose_host_died_are_usable_again(config: ArmConfig, behind: Lock
 
 def test_drives_that_hold_the_arm_let_it_go_when_a_person_says_so(config: ArmConfig, state: Path) -> None:
     config = config.model_copy(update={"control": config.control.model_copy(update={"after_stop": "hold"})})
-    with standing(config) as behind:
+    with keep_arm(config) as behind:
         with pytest.raises(UsageError, match="its drives do not hold it"):
-            let_go(config, state)
+            release_held_drives(config, state)
         session(config, behind)
         assert all("quick stop active" in words for words in states(behind))
         found = recover(config, state)
         assert found.steps[0].startswith(f"Support the arm, then `ident supported {config.name}`")
         assert all("quick stop active" in words for words in states(behind))  # looked at, not touched
-        assert let_go(config, state) == tuple(config.joints)
+        assert release_held_drives(config, state) == tuple(config.joints)
         assert all("switch on disabled" in words for words in states(behind))
         assert recover(config, state).usable

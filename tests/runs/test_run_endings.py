@@ -23,7 +23,7 @@ from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, ArmFault, MotionRefused
 from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.motion.control_loop import LOWERS, WAITS
-from ident_service.operations.motion_run import Ending
+from ident_service.operations.motion_run import ProcessResult
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 
 Capture = pytest.CaptureFixture[str]
@@ -211,7 +211,7 @@ def test_the_first_fault_is_the_error_and_the_others_are_its_notes(tmp_path: Pat
     faults = fault_file(tmp_path, "planar2")
     for code, cause in (("drive_fault", "a cable"), ("following_error", "elbow"), ("bus_silent", "nothing")):
         faults.latch(code, cause)
-    ending = Ending({}, {"kind": "ArmFault", "code": "bus_silent", "message": "bus_silent: nothing"}, 4)
+    ending = ProcessResult({}, {"kind": "ArmFault", "code": "bus_silent", "message": "bus_silent: nothing"}, 4)
     with pytest.raises(ArmFault, match=r"^drive_fault: a cable") as raised:
         ending.raise_for(faults)
     assert raised.value.code == "drive_fault"
@@ -219,7 +219,9 @@ def test_the_first_fault_is_the_error_and_the_others_are_its_notes(tmp_path: Pat
 
 
 def test_a_fault_that_could_not_be_latched_is_still_the_error(tmp_path: Path) -> None:
-    ending = Ending({}, {"kind": "ArmFault", "code": "runaway", "message": "runaway: a sign; it could not be latched"})
+    ending = ProcessResult(
+        {}, {"kind": "ArmFault", "code": "runaway", "message": "runaway: a sign; it could not be latched"}
+    )
     with pytest.raises(ArmFault, match=r"^runaway: a sign; it could not be latched$"):
         ending.raise_for(fault_file(tmp_path, "planar2"))
 
@@ -227,10 +229,10 @@ def test_a_fault_that_could_not_be_latched_is_still_the_error(tmp_path: Path) ->
 def test_a_refusal_stays_one_and_a_death_without_a_word_is_none(tmp_path: Path) -> None:
     faults = fault_file(tmp_path, "planar2")
     with pytest.raises(MotionRefused, match=r"^not at rest$"):
-        Ending({}, {"kind": "MotionRefused", "message": "not at rest"}).raise_for(faults)
+        ProcessResult({}, {"kind": "MotionRefused", "message": "not at rest"}).raise_for(faults)
     with pytest.raises(ArmError, match=r"without a word \(SIGKILL\) before it took the arm"):
-        Ending({}, {}, -signal.SIGKILL).raise_for(faults)
-    Ending({"state": "done"}, {}, os.EX_OK).raise_for(faults)
+        ProcessResult({}, {}, -signal.SIGKILL).raise_for(faults)
+    ProcessResult({"state": "done"}, {}, os.EX_OK).raise_for(faults)
 
 
 @pytest.fixture

@@ -20,11 +20,11 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile
 from ident_service.motion.ticket import Ticket, Verdict, subject_of
-from ident_service.operations.recovery import home_posture, recover, take_home
+from ident_service.operations.recovery import home_posture, recover, set_home
 from ident_service.preflight.preflight import preflight
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
-from sim_backend.emulator.faults import PuckFault
-from sim_backend.emulator.lock_step import LockStepArm, standing
+from sim_backend.emulator.faults import DriveFault
+from sim_backend.emulator.lock_step import LockStepArm, keep_arm
 
 HOME = np.array([0.3, -0.2])
 GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}
@@ -63,7 +63,7 @@ def config(tmp_path: Path) -> ArmConfig:
 
 @pytest.fixture
 def behind(config: ArmConfig) -> Iterator[LockStepArm]:
-    with standing(config) as arm:
+    with keep_arm(config) as arm:
         arm.settle(arm.clock.now_ns() + 50_000_000)
         yield arm
 
@@ -93,7 +93,7 @@ def test_a_person_who_says_so_makes_the_arm_usable(config: ArmConfig, behind: Lo
     assert "drives 1, 2 do not know where the arm stands" in found.zero_lost
     assert any("`ident home pucks2 --zero`" in step for step in found.steps), found.steps
     assert not any("Check power" in step for step in found.steps), found.steps
-    done = take_home(config, state, sure)
+    done = set_home(config, state, sure)
     assert [(one.joint, one.position, one.unit) for one in done.posture] == [
         ("shoulder", HOME[0], "rad"),
         ("elbow", HOME[1], "rad"),
@@ -108,7 +108,7 @@ def test_a_person_who_says_so_makes_the_arm_usable(config: ArmConfig, behind: Lo
 
 @pytest.mark.slow
 def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    take_home(config, state, sure)
+    set_home(config, state, sure)
     ticket = checked(config)
     assert ticket.verdict is Verdict.PASSED, [check.reason for check in ticket.checks]
     with make_arm(config) as arm:
@@ -117,12 +117,12 @@ def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behin
 
 @pytest.mark.slow
 def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    assert not take_home(config, state, sure).ticket_removed
+    assert not set_home(config, state, sure).ticket_removed
     ticket = checked(config)
     path = ticket_path(state, config.name)
     path.write_text(ticket.to_json())
     lead(behind, HOME + 0.01)
-    assert take_home(config, state, sure).ticket_removed
+    assert set_home(config, state, sure).ticket_removed
     assert not path.exists()
     with make_arm(config) as arm:  # where the file of another state folder was left
         why = ticket.valid_for(subject_of(arm_model(config), None, arm.describe()), ticket.created)
@@ -134,7 +134,7 @@ def test_no_ticket_outlives_a_zeroing_that_is_cut_short(
     config: ArmConfig, behind: LockStepArm, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Switched off and on, drives count from 0 again, so that a ticket cannot tell one zero from the other."""
-    take_home(config, state, sure)
+    set_home(config, state, sure)
     ticket = checked(config)
     path = ticket_path(state, config.name)
     path.write_text(ticket.to_json())
@@ -147,34 +147,34 @@ def test_no_ticket_outlives_a_zeroing_that_is_cut_short(
 
     monkeypatch.setattr(arm, "zero", cut_short)
     with pytest.raises(KeyboardInterrupt):
-        take_home(config, state, sure, arm)
+        set_home(config, state, sure, arm)
     assert not path.exists()
 
 
 def test_nothing_changes_when_nobody_says_so(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     for typed in ("", "yes", "pucks"):
         with pytest.raises(MotionRefused, match="nothing has changed"):
-            take_home(config, state, lambda question, typed=typed: typed)
+            set_home(config, state, lambda question, typed=typed: typed)
     with (
         ControlFile.take(control_path(state, config.name), None),
         pytest.raises(DriverError, match="in use by process"),
     ):
-        take_home(config, state, lambda question: pytest.fail("asked while a process moves the arm"))
+        set_home(config, state, lambda question: pytest.fail("asked while a process moves the arm"))
     with pytest.raises(PositionUnknown):
         make_arm(config).open()
 
 
 def test_latched_faults_are_said(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    take_home(config, state, sure)
+    set_home(config, state, sure)
     fault_file(state, config.name).latch("drive_restarted", "node 2: has booted")
-    behind.inject(PuckFault("reboot", 1))
+    behind.inject(DriveFault("reboot", 1))
     behind.settle(behind.clock.now_ns() + 100_000_000)
     found = recover(config, state)
     assert "drives 2 do not know" in found.zero_lost
     acknowledged = next(k for k, step in enumerate(found.steps) if "`ident ack pucks2 drive_restarted`" in step)
     zeroed = next(k for k, step in enumerate(found.steps) if "--zero" in step)
     assert acknowledged < zeroed < len(found.steps) - 1
-    done = take_home(config, state, sure)
+    done = set_home(config, state, sure)
     assert [fault.code for fault in done.faults] == ["drive_restarted"]
     assert not recover(config, state).usable
     fault_file(state, config.name).acknowledge("drive_restarted")

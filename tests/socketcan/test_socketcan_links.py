@@ -11,7 +11,7 @@ from can_links.link_bench import arm_on_bus, soon
 from socketcan_bench import ERROR, EXTENDED, REMOTE, Neighbour, command, content
 
 from drivers.can.bus_state import BUS_OFF, CONTROLLER, PASSIVE_TX, RESTARTED, RX_OVERFLOW, BusError
-from drivers.can.can_frame import HEARD, Frame
+from drivers.can.can_frame import RECEIVE_FILTER, Frame
 from drivers.can.can_link import Link, open_links
 from ident_service.errors import DriverError
 
@@ -43,7 +43,7 @@ def test_the_kernel_lets_pass_what_the_filters_say(link: Link, neighbour: Neighb
         neighbour.send(identifier | EXTENDED)
         if identifier % 64 == 63:  # before the queue is full
             heard += link.drain()
-    wanted = [k for k in range(0x800) if any(k & mask == value & mask for value, mask in HEARD)]
+    wanted = [k for k in range(0x800) if any(k & mask == value & mask for value, mask in RECEIVE_FILTER)]
     assert {0x000, 0x080, 0x181, 0x281, 0x581, 0x701} <= set(wanted)
     assert content(heard) == [Frame(k) for k in wanted]
 

@@ -27,7 +27,7 @@ RENEW: Final = b"\n"
 STOP: Final = b"stop\n"
 
 
-class Child(Protocol):
+class JobProcess(Protocol):
     """Process of one job."""
 
     def say(self, line: bytes) -> None:
@@ -52,7 +52,7 @@ class Child(Protocol):
 
 
 class OwnChild:
-    """Implement `Child` with a subprocess of the daemon."""
+    """Implement `JobProcess` with a subprocess of the daemon."""
 
     def __init__(self, words: tuple[str, ...], folder: Path) -> None:
         """Start `ident WORDS` with its files in `folder`."""
@@ -111,7 +111,7 @@ class OwnChild:
 
 
 class UnitChild:
-    """Implement `Child` with a process of the service manager, at the other end of a local socket."""
+    """Implement `JobProcess` with a process of the service manager, at the other end of a local socket."""
 
     def __init__(self, words: tuple[str, ...], folder: Path, door: Path) -> None:
         """Have `ident WORDS` started by the unit that listens at `door`.

@@ -29,7 +29,7 @@ from ident_service.daemon.jobs.requests import (
     LeaveLimit,
     Payload,
     Preview,
-    RecordingOf,
+    RecordingReference,
     Recover,
     Rehearse,
     Report,
@@ -47,10 +47,10 @@ from ident_service.registry.database import Database
 from ident_service.registry.motions import MOTIONS, motion_path, new_id
 from ident_service.registry.runs import (
     COLUMNS,
+    DOWNLOADABLE_KINDS,
     EXPORTS,
     REPORTS,
     RUNS,
-    TAKEN_AWAY,
     known_run,
     recording_name,
     run_file,
@@ -68,7 +68,7 @@ _VERBS: Final = {
     "bus_probe": ("bus", "probe"),
     "config_check": ("config", "check"),
 }
-FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(TAKEN_AWAY, EXPORTS)}
+FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(DOWNLOADABLE_KINDS, EXPORTS)}
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _about_a_run(
     asked: Report | Export | Verify | Compare | Feasible | Correct | Figures | Payload,
 ) -> Command:
     folder, arm = run_folder(db, state, asked.run), str(known_run(db, asked.run)["arm"])
-    made = new_id(arm) if asked.kind in TAKEN_AWAY else None
+    made = new_id(arm) if asked.kind in DOWNLOADABLE_KINDS else None
     place = state / (REPORTS if isinstance(asked, Report) else EXPORTS)
     if isinstance(asked, Verify):
         described = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
@@ -232,15 +232,15 @@ def _judgement(db: Database, state: Path, asked: Judge) -> Command:
     return Command((*words, *_always(state)), asked.arm, False, asked.run, (), LEASE_SECONDS)
 
 
-def _recordings(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+def _recordings(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
     return [f"{_recording(db, state, one)}{range_words(one)}" for one in asked]
 
 
-def _recording(db: Database, state: Path, one: RecordingOf) -> Path:
+def _recording(db: Database, state: Path, one: RecordingReference) -> Path:
     return run_file(db, state, one.run, one.name or recording_name(db, one.run))
 
 
-def _as_described(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+def _as_described(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
     """Return paths as `_recordings` does, for commands that take no columns file.
 
     Raises:
@@ -254,13 +254,13 @@ def _as_described(db: Database, state: Path, asked: Sequence[RecordingOf]) -> li
     return _recordings(db, state, asked)
 
 
-def _columns(db: Database, state: Path, asked: Sequence[RecordingOf]) -> list[str]:
+def _columns(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
     """Return `--columns` options for the uploaded recordings that came with a columns file."""
     files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in asked}
     return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 
-def range_words(one: RecordingOf) -> str:
+def range_words(one: RecordingReference) -> str:
     """Format a recording's range as the command line has it; empty for a whole recording."""
     if one.start is None and one.end is None:
         return ""

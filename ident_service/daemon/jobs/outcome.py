@@ -51,7 +51,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Said:
+class ProcessOutput:
     """Output of a job's process, from its files.
 
     Attributes:
@@ -63,7 +63,7 @@ class Said:
     log: str = ""
 
 
-def said(folder: Path, most: int = _LAST) -> Said:
+def said(folder: Path, most: int = _LAST) -> ProcessOutput:
     """Read the answer and the last `most` bytes of the log of a job's process."""
     answer: dict[str, Any] = {}
     try:
@@ -79,10 +79,10 @@ def said(folder: Path, most: int = _LAST) -> Said:
             log = stream.read(most).decode("utf-8", "replace")
     except OSError:
         log = ""
-    return Said(answer, log)
+    return ProcessOutput(answer, log)
 
 
-def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
+def outcome(heard: ProcessOutput, exit_code: int | None, asked_to_end: str) -> Outcome:
     """Return the outcome of a process that has ended.
 
     Args:
@@ -105,7 +105,7 @@ def outcome(heard: Said, exit_code: int | None, asked_to_end: str) -> Outcome:
     return Outcome(state, message, code)
 
 
-def interrupted(heard: Said, folder: Path | None, *, moves: bool) -> str:
+def interrupted(heard: ProcessOutput, folder: Path | None, *, moves: bool) -> str:
     """Describe a job that was running when the service died, from its output and its folder.
 
     Args:
@@ -174,7 +174,7 @@ _MAKES_A_RUN = frozenset({"run", "rehearse", "home", "leave_limit", "identify", 
 _ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
-def keep(db: Database, state: Path, row: Row, by: str) -> None:
+def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
     """Enter the folder that a job's process has left, if any.
 
     Args:
@@ -241,7 +241,7 @@ def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool]
         folder = folder_of(state, row)
         detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
         try:
-            keep(db, state, row, row["created_by"])
+            register_outputs(db, state, row, row["created_by"])
         except (IdentError, OSError) as error:
             detail = f"{detail}; its folder could not be entered: {error}"
         rows.explain(db, row["id"], detail)

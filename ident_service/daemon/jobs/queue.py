@@ -26,9 +26,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.daemon.jobs.child_process import RENEW, STOP, Child, OwnChild, UnitChild
+from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, OwnChild, UnitChild
 from ident_service.daemon.jobs.commands import JOBS, Command, command
-from ident_service.daemon.jobs.outcome import explain_interrupted, keep, lateness_of, mark_interrupted, outcome, said
+from ident_service.daemon.jobs.outcome import (
+    explain_interrupted,
+    lateness_of,
+    mark_interrupted,
+    outcome,
+    register_outputs,
+    said,
+)
 from ident_service.daemon.jobs.requests import Asked
 from ident_service.daemon.metrics import Metrics
 from ident_service.errors import IdentError, MotionRefused, UsageError
@@ -115,7 +122,7 @@ class LiveJob:
     renewed: float
     asked_ns: int = 0
     entered: bool = False
-    child: Child | None = None
+    child: JobProcess | None = None
     asked_to_end: str = ""
     since: float = 0.0
     told: bool = False
@@ -223,14 +230,14 @@ class LiveJobs:
                     return False
             return True
 
-    def began(self, live: LiveJob, child: Child) -> None:
+    def began(self, live: LiveJob, child: JobProcess) -> None:
         """Store the process of a job; pass on a stop that was asked for while it was being started."""
         with self._lock:
             live.child = child
             if live.asked_to_end:
                 _say_stop(live)
 
-    def conclude(self, live: LiveJob, child: Child) -> None:
+    def conclude(self, live: LiveJob, child: JobProcess) -> None:
         """Close the input of a process that has ended."""
         with self._lock:
             child.close()
@@ -555,7 +562,7 @@ class Engine:
         if live.asked_to_end:  # cancelled while the registry was written
             self._finish(live, "cancelled", live.asked_to_end, None)
             return
-        child: Child
+        child: JobProcess
         try:
             # The unit for motions also has access to the buses.
             if live.order.resources and self._door is not None:
@@ -569,7 +576,7 @@ class Engine:
         self.db.write("UPDATE jobs SET process = ? WHERE id = ?", child.process, live.job)
         LOG.info("job started", extra={"job": live.job, "arm": live.order.arm})
 
-    def _watch(self, live: LiveJob, child: Child) -> None:
+    def _watch(self, live: LiveJob, child: JobProcess) -> None:
         """Check a running job; end a computation by SIGTERM, then by SIGKILL, and conclude a job that has ended."""
         if live.asked_to_end and not live.order.moves:
             if not live.told:
@@ -583,7 +590,7 @@ class Engine:
             live.concluding = True
             threading.Thread(target=self._conclude, args=(live, child), name=live.job, daemon=True).start()
 
-    def _conclude(self, live: LiveJob, child: Child) -> None:
+    def _conclude(self, live: LiveJob, child: JobProcess) -> None:
         """Enter what an ended job has made, then the job's end."""
         self.live.conclude(live, child)
         ended = outcome(said(self.state / JOBS / live.job), child.exit_code, live.asked_to_end)
@@ -603,7 +610,7 @@ class Engine:
     def _kept(self, live: LiveJob, detail: str) -> str:
         """Enter what a job made; return `detail`, with the error if that failed."""
         try:
-            keep(self.db, self.state, rows.known_job(self.db, live.job), live.by)
+            register_outputs(self.db, self.state, rows.known_job(self.db, live.job), live.by)
         except sqlite3.Error:
             raise  # as for the end of the job itself
         except Exception as error:  # whatever stands in its way, the job has ended

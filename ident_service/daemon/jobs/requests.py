@@ -15,13 +15,13 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 FeasibleSet = Literal["pseudo_inertia", "inertia", "none"]
 
 
-class Ask(BaseModel):
+class BaseJobRequest(BaseModel):
     """Request that refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class RecordingOf(Ask):
+class RecordingReference(BaseJobRequest):
     """Recording, named by its run; whole, or from `start` to `end` [s].
 
     `name` is that of the file in the run's manifest; left out, it is the run's only recording, or `run.mcap`.
@@ -33,7 +33,7 @@ class RecordingOf(Ask):
     end: Second | None = None
 
 
-class Design(Ask):
+class Design(BaseJobRequest):
     """Search for a motion; options left out are as the arm's description says."""
 
     kind: Literal["design"]
@@ -44,10 +44,10 @@ class Design(Ask):
     criterion: Literal["d_optimal", "condition_number", "a_optimal"] | None = None
     parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
     motion: Literal["fourier", "postures"] | None = None
-    after: Annotated[tuple[RecordingOf, ...], Field(max_length=16)] = ()
+    after: Annotated[tuple[RecordingReference, ...], Field(max_length=16)] = ()
 
 
-class Check(Ask):
+class Check(BaseJobRequest):
     """Do the preflight for a motion, the description's own without one, or for the motion home."""
 
     kind: Literal["check"]
@@ -62,7 +62,7 @@ class Check(Ask):
         return self
 
 
-class Rehearse(Ask):
+class Rehearse(BaseJobRequest):
     """Run the motion slowly, while the lease is renewed as fast as a held key repeats."""
 
     kind: Literal["rehearse"]
@@ -71,14 +71,14 @@ class Rehearse(Ask):
     speed: Speed = 0.2
 
 
-class Until(Ask):
+class Until(BaseJobRequest):
     """Accuracy at which a run ends early: standard deviations of at most this share of their parameters."""
 
     share: Annotated[float, Field(gt=0, lt=1)]
     parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
 
 
-class Run(Ask):
+class Run(BaseJobRequest):
     """Move the arm along a motion and record it."""
 
     kind: Literal["run"]
@@ -88,35 +88,35 @@ class Run(Ask):
     until: Until | None = None
 
 
-class Home(Ask):
+class Home(BaseJobRequest):
     """Move the arm to its home position, slowly."""
 
     kind: Literal["home"]
     arm: ArmName
 
 
-class Zero(Ask):
+class Zero(BaseJobRequest):
     """Set the encoders' zero: a person confirms that the arm stands at home; nothing moves, and it never waits."""
 
     kind: Literal["zero"]
     arm: ArmName
 
 
-class LeaveLimit(Ask):
+class LeaveLimit(BaseJobRequest):
     """Move an arm that stands outside its position limits back inside, slowly."""
 
     kind: Literal["leave_limit"]
     arm: ArmName
 
 
-class Recover(Ask):
+class Recover(BaseJobRequest):
     """Report after a fault or a stop what prevents motion, and what to do; nothing moves."""
 
     kind: Literal["recover"]
     arm: ArmName
 
 
-class Watch(Ask):
+class Watch(BaseJobRequest):
     """Read the arm's positions and drive status without torque and without changing its state."""
 
     kind: Literal["watch"]
@@ -124,7 +124,7 @@ class Watch(Ask):
     seconds: Annotated[float, Field(gt=0, le=60)] = 2.0
 
 
-class BusLoad(Ask):
+class BusLoad(BaseJobRequest):
     """Compute the load of every frame on the arm's buses, and whether all of them fit."""
 
     kind: Literal["bus_load"]
@@ -132,35 +132,35 @@ class BusLoad(Ask):
     rate: Annotated[float, Field(gt=0, le=1e6)] | None = None
 
 
-class BusScan(Ask):
+class BusScan(BaseJobRequest):
     """List the nodes on the arm's buses; reads only."""
 
     kind: Literal["bus_scan"]
     arm: ArmName
 
 
-class BusProbe(Ask):
+class BusProbe(BaseJobRequest):
     """Read the capabilities of the arm's drives, and what they lack; reads only."""
 
     kind: Literal["bus_probe"]
     arm: ArmName
 
 
-class ConfigCheck(Ask):
+class ConfigCheck(BaseJobRequest):
     """Check the arm's description: bus budget, and whether its gains are stable."""
 
     kind: Literal["config_check"]
     arm: ArmName
 
 
-class Base(Ask):
+class Base(BaseJobRequest):
     """List the base parameters and their expressions."""
 
     kind: Literal["base"]
     arm: ArmName
 
 
-class Preview(Ask):
+class Preview(BaseJobRequest):
     """Predict the demands of a motion on the arm, and the accuracy that it will give."""
 
     kind: Literal["preview"]
@@ -168,13 +168,13 @@ class Preview(Ask):
     motion: Id | None = None
 
 
-class Identify(Ask):
+class Identify(BaseJobRequest):
     """Identify parameters from recordings."""
 
     kind: Literal["identify"]
     arm: ArmName
-    recordings: Annotated[tuple[RecordingOf, ...], Field(min_length=1, max_length=16)]
-    validate_on: Annotated[tuple[RecordingOf, ...], Field(max_length=16)] = ()
+    recordings: Annotated[tuple[RecordingReference, ...], Field(min_length=1, max_length=16)]
+    validate_on: Annotated[tuple[RecordingReference, ...], Field(max_length=16)] = ()
     method: Literal["ols", "wls", "huber", "iv"] | None = None
     feasible_set: FeasibleSet | None = None
     prior: Literal["none", "euclidean", "entropic"] | None = None
@@ -182,7 +182,7 @@ class Identify(Ask):
     """Number of an acceptance whose stored description is used instead of today's, for comparison with its set."""
 
 
-class Simulate(Ask):
+class Simulate(BaseJobRequest):
     """Commission a simulated arm, and score the result against the known truth."""
 
     kind: Literal["simulate"]
@@ -192,14 +192,14 @@ class Simulate(Ask):
     feasible_set: FeasibleSet | None = None
 
 
-class Report(Ask):
+class Report(BaseJobRequest):
     """Write the report of a run as one page."""
 
     kind: Literal["report"]
     run: Id
 
 
-class Export(Ask):
+class Export(BaseJobRequest):
     """Write the parameters of a run for other tools."""
 
     kind: Literal["export"]
@@ -207,7 +207,7 @@ class Export(Ask):
     formats: Annotated[tuple[Literal["urdf", "mjcf", "sdf", "json", "csv", "c"], ...], Field(min_length=1)] = ("urdf",)
 
 
-class Verify(Ask):
+class Verify(BaseJobRequest):
     """Check the certificate in a run's parameters against its own conditions, or those of an arm's description."""
 
     kind: Literal["verify"]
@@ -215,7 +215,7 @@ class Verify(Ask):
     arm: ArmName | None = None
 
 
-class Feasible(Ask):
+class Feasible(BaseJobRequest):
     """Check whether a real body could have a run's parameters; `arm` adds the conditions of its description."""
 
     kind: Literal["feasible"]
@@ -224,7 +224,7 @@ class Feasible(Ask):
     arm: ArmName | None = None
 
 
-class Correct(Ask):
+class Correct(BaseJobRequest):
     """Find the feasible parameters nearest to a run's, as a file of their own; the run is unchanged."""
 
     kind: Literal["correct"]
@@ -234,7 +234,7 @@ class Correct(Ask):
     arm: ArmName | None = None
 
 
-class Figures(Ask):
+class Figures(BaseJobRequest):
     """Write the drawings of a run's report as files."""
 
     kind: Literal["figures"]
@@ -242,16 +242,16 @@ class Figures(Ask):
     format: Literal["svg", "png"] = "svg"
 
 
-class Payload(Ask):
+class Payload(BaseJobRequest):
     """Identify the payload that the arm of a run carries in recordings of other runs."""
 
     kind: Literal["payload"]
     run: Id
-    recordings: Annotated[tuple[RecordingOf, ...], Field(min_length=1, max_length=16)]
+    recordings: Annotated[tuple[RecordingReference, ...], Field(min_length=1, max_length=16)]
     refit_offsets: bool = False
 
 
-class Compare(Ask):
+class Compare(BaseJobRequest):
     """Compare two runs: what changed, and by how many standard deviations."""
 
     kind: Literal["compare"]
@@ -259,7 +259,7 @@ class Compare(Ask):
     other: Id
 
 
-class Judge(Ask):
+class Judge(BaseJobRequest):
     """Compare a run's parameters with those of an acceptance of its arm; the comparison is stored in the run."""
 
     kind: Literal["judge"]

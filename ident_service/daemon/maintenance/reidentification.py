@@ -24,7 +24,7 @@ from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import JOBS, accepted_description
 from ident_service.daemon.jobs.outcome import UNTOLD, said
 from ident_service.daemon.jobs.queue import Engine
-from ident_service.daemon.jobs.requests import Asked, Check, Identify, Judge, RecordingOf, Run
+from ident_service.daemon.jobs.requests import Asked, Check, Identify, Judge, RecordingReference, Run
 from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
 from ident_service.operations.acceptance import ARM, accepted_set
 from ident_service.operations.drift_alarms import Verdict, raise_alarm, verdict_of
@@ -131,7 +131,7 @@ def enter_concluded(
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ReidentificationRequest:
     """Request for a re-identification.
 
     Attributes:
@@ -164,7 +164,7 @@ class Reidentifications:
         """Return who began a running re-identification, and its present job; None for one unknown to this process."""
         return self._steps.get(name)
 
-    def begin(self, wanted: Wanted, by: str) -> Row:
+    def begin(self, wanted: ReidentificationRequest, by: str) -> Row:
         """Begin a re-identification by queuing its first step.
 
         Args:
@@ -240,7 +240,7 @@ class Reidentifications:
                 _require_allowed(known_arm(self._db, self._state, arm).config)
             following, asked, column = "run", Run(kind="run", arm=arm, motion=row["motion"]), "recorded"
         elif step == "run":
-            recording = RecordingOf(run=row["recorded"])
+            recording = RecordingReference(run=row["recorded"])
             following, column = "identify", "run"
             asked = Identify(kind="identify", arm=arm, recordings=(recording,), as_accepted=row["against"])
         else:

@@ -16,12 +16,12 @@ from collections.abc import Callable
 from typing import Any
 
 from ident_service.daemon.jobs.queue import Engine
-from ident_service.daemon.maintenance.reidentification import SERVICE, Reidentifications, Wanted
+from ident_service.daemon.maintenance.reidentification import SERVICE, ReidentificationRequest, Reidentifications
 from ident_service.daemon.maintenance.webhook import Webhook
 from ident_service.errors import IdentError
 from ident_service.motion.command_channel import in_use
 from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.maintenance_schedule import LATE, dues, fall_due, schedules
+from ident_service.operations.maintenance_schedule import LATE, mark_due, pending, schedules
 from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Row, note
 from ident_service.registry.jobs import LIVE, jobs
@@ -31,7 +31,7 @@ _TICK = 0.5  # s between passes
 LOG = logging.getLogger("ident.maintenance")
 
 
-class Keeper:
+class MaintenanceScheduler:
     """Scheduler of a service's re-identifications."""
 
     def __init__(self, engine: Engine, webhook: Webhook | None = None, now: Callable[[], float] = time.time) -> None:
@@ -69,9 +69,9 @@ class Keeper:
     def look(self) -> None:
         """Do one pass: mark what is due, advance re-identifications, begin what may begin, send notices."""
         now = self._now()
-        fall_due(self._db, now)
+        mark_due(self._db, now)
         self.reidentifications.advance()
-        for row in dues(self._db):
+        for row in pending(self._db):
             if not row["tried"] and not self._engine.closing:
                 self._decide(row, now)
         self._looked = now
@@ -94,7 +94,9 @@ class Keeper:
             why = self._against(row, now)
             if not why:
                 found = next(one for one in schedules(self._db, row["arm"]) if one["id"] == row["schedule"])
-                self.reidentifications.begin(Wanted(row["arm"], found["motion"], unattended=True), SERVICE)
+                self.reidentifications.begin(
+                    ReidentificationRequest(row["arm"], found["motion"], unattended=True), SERVICE
+                )
         except IdentError as error:
             why = str(error)
         if why:
@@ -121,7 +123,7 @@ class Keeper:
 
     def _tell(self) -> None:
         """Send each notice once; it is stored in the transaction that marks it as sent."""
-        for table, rows in (("dues", dues(self._db)), ("alarms", alarms(self._db))):
+        for table, rows in (("dues", pending(self._db)), ("alarms", alarms(self._db))):
             for row in rows:
                 if row["told"]:
                     continue

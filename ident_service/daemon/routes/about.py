@@ -16,8 +16,8 @@ from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.responses import PAGES, AuditLine, BeforeNumber, HealthAnswer, Most, Page, WhoAnswer
 from ident_service.errors import IdentError
 from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.maintenance_schedule import dues
-from ident_service.registry.database import trail
+from ident_service.operations.maintenance_schedule import pending
+from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import fault_file
 
 router = APIRouter(tags=["service"], responses=failures())
@@ -52,7 +52,7 @@ def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
         except IdentError:
             faults[folder.name] = 1  # a damaged file prevents motion like a fault
     jobs = {(row["kind"], row["state"]): row["number"] for row in rows}
-    due = Counter[str](row["arm"] for row in dues(service.db))
+    due = Counter[str](row["arm"] for row in pending(service.db))
     drifted = Counter[str](row["arm"] for row in alarms(service.db, most=10_000))
     text = service.metrics.text(jobs, service.engine.moving(), faults, due, drifted)
     return PlainTextResponse(text, media_type="text/plain; version=0.0.4")
@@ -97,4 +97,4 @@ def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
 def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, most: Most = 100) -> list[AuditLine]:
     """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
-    return [AuditLine(**row) for row in page(most, lambda n: trail(service.db, before=before, most=n))]
+    return [AuditLine(**row) for row in page(most, lambda n: audit_log(service.db, before=before, most=n))]

@@ -29,7 +29,7 @@ from ident_service.daemon.responses import (
 )
 from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.command_channel import mover
+from ident_service.motion.command_channel import controlling_pid
 from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
 from ident_service.operations.description_process import judge_apart
 from ident_service.registry import arms as known
@@ -224,7 +224,7 @@ def _arm(service: Service, arm: str) -> ArmAnswer:
         simulated=isinstance(config.driver, SimulatedDriver),
         unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),
-        moved_by=mover(control_path(service.state, found.name)),
+        moved_by=controlling_pid(control_path(service.state, found.name)),
         faults=[FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],
         accepted=AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
     )

@@ -12,11 +12,11 @@ from fastapi import APIRouter, Header, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from ident_service.daemon.dependencies import Service, Serving, Told, Viewer
+from ident_service.daemon.dependencies import Service, Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.live import LiveRuns
 from ident_service.daemon.live_stream import RECORDED
-from ident_service.daemon.news import News, Seen, Watch
+from ident_service.daemon.news import EventPoller, ViewerEvent, ViewerPosition
 from ident_service.registry import jobs as rows
 from ident_service.registry.runs import RUNS
 
@@ -46,7 +46,7 @@ Samples = Annotated[bool, Query(description="also `samples` and `doubt` of runs 
 async def watch_all(
     service: Serving,
     _: Viewer,
-    told: Told,
+    told: WhileAuthorized,
     request: Request,
     last_event_id: LastEvent = None,
     after: After = None,
@@ -58,14 +58,16 @@ async def watch_all(
     and then whenever that changes. With `samples`, there are `samples` and `doubt` as in the live stream of a job, each
     with its `job`.
     """
-    watch: Watch = request.app.state.watch
+    watch: EventPoller = request.app.state.watch
     # The header counts first: a browser that comes again sends it with the address of the first time.
     seen = await run_in_threadpool(watch.begin, after if last_event_id is None else last_event_id)
     live = request.app.state.live if samples else None
     return StreamingResponse(told(_events(service, watch, seen, live)), media_type="text/event-stream")
 
 
-async def _events(service: Service, watch: Watch, seen: Seen, live: LiveRuns | None) -> AsyncIterator[str]:
+async def _events(
+    service: Service, watch: EventPoller, seen: ViewerPosition, live: LiveRuns | None
+) -> AsyncIterator[str]:
     # A number without data: a client that reconnects before the first event resumes from here.
     yield f"retry: {_AGAIN}\nid: {seen.line}\n\n"
     silent, recorded = 0.0, _Recorded(service, live)
@@ -113,6 +115,6 @@ class _Recorded:
         return told
 
 
-def _event(one: News) -> str:
+def _event(one: ViewerEvent) -> str:
     number = "" if one.number is None else f"id: {one.number}\n"
     return f"{number}event: {one.kind}\ndata: {one.data}\n\n"

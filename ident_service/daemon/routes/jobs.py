@@ -17,7 +17,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Told, Viewer
+from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import said
@@ -174,7 +174,7 @@ def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
-async def watch_job(service: Serving, _: Viewer, told: Told, job: Id) -> StreamingResponse:
+async def watch_job(service: Serving, _: Viewer, told: WhileAuthorized, job: Id) -> StreamingResponse:
     """Watch a job by server-sent events; `job` whenever it changes, until it has ended."""
     row = await run_in_threadpool(rows.known_job, service.db, job)
     return StreamingResponse(told(_events(service, row["id"])), media_type="text/event-stream")

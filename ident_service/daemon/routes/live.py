@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from ident_service.daemon.dependencies import Serving, Told, Viewer
+from ident_service.daemon.dependencies import Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.jobs.requests import Id
 from ident_service.daemon.live_stream import live_events
@@ -22,7 +22,9 @@ _STREAM: dict[int | str, dict[str, Any]] = {
 
 
 @router.get("/jobs/{job}/live", response_class=StreamingResponse, responses=_STREAM)
-async def watch_live(service: Serving, _: Viewer, told: Told, request: Request, job: Id) -> StreamingResponse:
+async def watch_live(
+    service: Serving, _: Viewer, told: WhileAuthorized, request: Request, job: Id
+) -> StreamingResponse:
     """Watch a job and the run that it records, by server-sent events.
 
     `job` has its state and log; `samples` has time, position, torque and following error of every joint, one every

@@ -12,7 +12,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from ident_service.daemon.dependencies import LeaseKeeper, Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import failures
 from ident_service.daemon.jobs.requests import ArmName, Id
-from ident_service.daemon.maintenance.reidentification import Wanted, known_reidentification, reidentifications
+from ident_service.daemon.maintenance.reidentification import (
+    ReidentificationRequest,
+    known_reidentification,
+    reidentifications,
+)
 from ident_service.daemon.maintenance.webhook import deliveries
 from ident_service.daemon.responses import PAGES, BeforeId, BeforeNumber, LeaseAnswer, Most, Page
 from ident_service.daemon.routes.jobs import Confirmation, require_confirmed, without_paths
@@ -173,7 +177,7 @@ def list_schedules(service: Serving, _: Viewer, arm: ArmName | None = None) -> l
 @router.post("/schedules", status_code=201)
 def add_schedule(service: Serving, who: Operator, body: NewSchedule) -> ScheduleAnswer:
     """Schedule the re-identification of an arm."""
-    when = planned.When(body.cron, body.hours, body.maintenance)
+    when = planned.DueRule(body.cron, body.hours, body.maintenance)
     row = planned.add_schedule(service.db, _arm(service, body.arm), when, who.name, time.time(), body.motion)
     return ScheduleAnswer(**row)
 
@@ -214,7 +218,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
     """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
-    return [DueAnswer(**row) for row in planned.dues(service.db, arm)]
+    return [DueAnswer(**row) for row in planned.pending(service.db, arm)]
 
 
 @router.post("/due/{number}/dismiss", status_code=204)
@@ -240,7 +244,7 @@ def begin_reidentification(service: Serving, who: Operator, body: NewReidentific
     """
     arm = _arm(service, body.arm)
     require_confirmed(service, arm, body.confirm, who.name)
-    return _told(service, service.keeper.reidentifications.begin(Wanted(arm, body.motion), who.name))
+    return _told(service, service.keeper.reidentifications.begin(ReidentificationRequest(arm, body.motion), who.name))
 
 
 @router.get("/reidentifications/{name}")

@@ -46,7 +46,7 @@ def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
     """Delete old recordings of runs that nobody accepted and no job needs."""
     untold = rebuild_runs(service.db, service.state)
     gone = (
-        run_archive.let_go(service.db, service.state, body.keep, who.name)
+        run_archive.prune(service.db, service.state, body.keep, who.name)
         if body.yes
         else run_archive.expendable(service.db, service.state, body.keep)
     )

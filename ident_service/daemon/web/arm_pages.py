@@ -34,7 +34,7 @@ from ident_service.motion.ticket import Verdict, read_ticket
 from ident_service.operations import maintenance_schedule as planned
 from ident_service.operations.acceptance import Acceptance, acceptances
 from ident_service.operations.drift_alarms import alarms
-from ident_service.operations.maintenance_schedule import dues
+from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry import arms as known
 from ident_service.registry import jobs as rows
 from ident_service.registry import motions as known_motions
@@ -186,7 +186,7 @@ def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
 
 def _asks(db: Database, arm: str) -> list[str]:
     """Return the reasons for a re-identification, in words."""
-    due = [f"due: {row['cause']}" for row in dues(db, arm)]
+    due = [f"due: {row['cause']}" for row in pending(db, arm)]
     return [*due, *(["a drift alarm stands"] if alarms(db, arm, most=1) else [])]
 
 
@@ -273,7 +273,7 @@ def list_arms(service: Serving, who: Viewer) -> Response:
         lines.append({**row, "accepted": accepted.get(row["name"]), "faults": faults, "moving": moving})
     busy = rows.jobs(service.db, states=rows.LIVE, most=50)
     standing = _alarms(service, None)
-    due = planned.dues(service.db)
+    due = planned.pending(service.db)
     for line in lines:
         line["alarms"] = sum(one["arm"] == line["name"] for one in standing)
         line["dues"] = sum(one["arm"] == line["name"] for one in due)
@@ -302,7 +302,7 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
     """Show one arm: its commissioning steps, its runs, and its acceptances."""
     answer = arms.get_arm(service, who, arm)
     config = known.known_arm(service.db, service.state, arm).config
-    due = planned.dues(service.db, answer.name)
+    due = planned.pending(service.db, answer.name)
     scheduled = {row["id"]: row["motion"] for row in planned.schedules(service.db, answer.name)}
     sets = service.db.rows("SELECT run FROM parameter_sets WHERE arm = ?", answer.name)
     return page(

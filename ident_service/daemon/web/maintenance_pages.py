@@ -82,7 +82,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, form: Form) -
 @router.post("/due/{number}/dismiss")
 def dismiss(service: Serving, who: Operator, number: Number, form: Form) -> Response:
     """Dismiss a due re-identification, on a person's decision."""
-    arm = next((row["arm"] for row in planned.dues(service.db) if row["id"] == number), None)
+    arm = next((row["arm"] for row in planned.pending(service.db) if row["id"] == number), None)
     if arm is None:
         raise UsageError(f"nothing of number {number} is due any more")
     maintenance.dismiss_due(service, who, number, maintenance.Remark(note=form.get("note", "").strip()))
@@ -113,7 +113,7 @@ def _page(
         who,
         status,
         arm=answer,
-        dues=planned.dues(service.db, answer.name),
+        dues=planned.pending(service.db, answer.name),
         schedules=[_line(row, driven) for row in planned.schedules(service.db, answer.name)],
         events=planned.events(service.db, answer.name, most=50),
         motions=known_motions.motions(service.db, answer.name),

@@ -16,7 +16,7 @@ from ident_service.daemon.web.forms import PageRoute
 from ident_service.daemon.web.render import page
 from ident_service.errors import UsageError
 from ident_service.registry import runs as known
-from ident_service.registry.database import trail
+from ident_service.registry.database import audit_log
 from ident_service.registry.runs import REPORTS
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
@@ -66,5 +66,5 @@ def compare(service: Serving, who: Viewer, reference: Id, other: Id) -> Response
 def audit(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
     """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
-    lines = trail(service.db, before=before, most=100)
+    lines = audit_log(service.db, before=before, most=100)
     return page("audit", who, lines=lines, more=len(lines) == 100)

@@ -28,7 +28,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, symmetric
-from ident_service.estimation.feasible.formulation import EPSILON, Lift
+from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.likely_bodies import LikelyBodies
@@ -43,7 +43,7 @@ _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data
 
 
 @dataclass(frozen=True)
-class Near:
+class ChangeEllipsoid:
     """Ellipsoid that base parameters may move in.
 
     Attributes:
@@ -76,12 +76,12 @@ class _Matrices:
     bounded: Array
 
 
-def central(
+def centre(
     delta: Array,
     base: BaseParameters,
     conditions: FeasibleSet,
     likely: LikelyBodies | None = None,
-    near: Near | None = None,
+    near: ChangeEllipsoid | None = None,
 ) -> Array:
     """Move link parameters to the centre of those with the same base parameters.
 
@@ -96,7 +96,7 @@ def central(
         Link parameters with the same base parameters to rounding, or as near to them as `near` says, inside the set,
         shape (parameters,); `delta` itself where rounding forbids a step.
     """
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     N = np.zeros((0, base.size)) if near is None else near.metric
     begin = np.zeros(0) if near is None else near.moved(base.K @ delta)
     moving = np.zeros(0, dtype=int) if near is None else np.flatnonzero(near.moves)

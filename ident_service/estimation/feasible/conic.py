@@ -50,7 +50,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Pose:
+class ScaledProblem:
     """Scaled problem for the solver, with the maps back to the original variables.
 
     Attributes:
@@ -80,7 +80,9 @@ class Pose:
         return [self.scale * _transposed(M, z) for M, z in zip(self.maps, found, strict=True)]
 
 
-def restated(rows: Sequence[Rows], objective: Array, hessian: Array, around: Array, columns: Columns | None) -> Pose:
+def precondition(
+    rows: Sequence[Rows], objective: Array, hessian: Array, around: Array, columns: Columns | None
+) -> ScaledProblem:
     """Return the problem preconditioned around a point, or unchanged.
 
     Args:
@@ -93,7 +95,7 @@ def restated(rows: Sequence[Rows], objective: Array, hessian: Array, around: Arr
     if columns is None:
         n = len(objective)
         ones = tuple(np.ones(len(block.f)) for block in rows)
-        return Pose(list(rows), objective, hessian, np.zeros(n), np.ones(n), ones, 1.0)
+        return ScaledProblem(list(rows), objective, hessian, np.zeros(n), np.ones(n), ones, 1.0)
     slacks = [block.F @ around + block.f for block in rows]
     maps = tuple(_map(block, slack) for block, slack in zip(rows, slacks, strict=True))
     F = [_apply(M, block.F) for M, block in zip(maps, rows, strict=True)]
@@ -107,7 +109,7 @@ def restated(rows: Sequence[Rows], objective: Array, hessian: Array, around: Arr
     linear = _transposed(C, objective + hessian * around)
     quadratic = C**2 * hessian if C.ndim == 1 else C.T @ (hessian[:, None] * C)
     scale = max(float(np.linalg.norm(linear)), np.finfo(float).tiny)
-    return Pose(
+    return ScaledProblem(
         [
             Rows(block.cone, part * C if C.ndim == 1 else part @ C, _apply(M, slack), block.size)
             for block, part, M, slack in zip(rows, F, maps, slacks, strict=True)
@@ -195,7 +197,7 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class _Pose:
+class _SolverAttempt:
     """Options of one solver attempt: share of the way to the boundary per step, scaling passes, coordinates."""
 
     step: float
@@ -206,7 +208,12 @@ class _Pose:
 # Distances of a thousandth and margins of a millionth are results here: 1e-9 first, in every pose. The looser ones are
 # for problems whose last digits the solver cannot separate from rounding, in the poses that came close.
 _TOLERANCES = (1e-9, 1e-8, 1e-7)
-_POSES = (_Pose(0.99, 10), _Pose(0.95, 30, "unit"), _Pose(0.9, 50), _Pose(0.9, 10, "orthonormal"))
+_POSES = (
+    _SolverAttempt(0.99, 10),
+    _SolverAttempt(0.95, 30, "unit"),
+    _SolverAttempt(0.9, 50),
+    _SolverAttempt(0.9, 10, "orthonormal"),
+)
 _FINAL = (clarabel.SolverStatus.PrimalInfeasible, clarabel.SolverStatus.DualInfeasible)
 
 
@@ -272,7 +279,7 @@ class ConicProblem:
         close = [way for way in _POSES if not (self.rough and way.around == "orthonormal")]
         for tolerance in _TOLERANCES[-1:] if self.rough else _TOLERANCES:
             for way in tuple(close):
-                pose = restated(self._rows, objective, hessian, around, way.around)
+                pose = precondition(self._rows, objective, hessian, around, way.around)
                 result = _solve(pose, way, tolerance)
                 attempts, iterations = attempts + 1, iterations + result.iterations
                 seconds += result.solve_time
@@ -290,12 +297,12 @@ class ConicProblem:
                     around = x
         raise SolverError(name, status)
 
-    def _duals(self, pose: Pose, z: Array) -> tuple[Array, ...]:
+    def _duals(self, pose: ScaledProblem, z: Array) -> tuple[Array, ...]:
         ends = np.cumsum([len(rows.f) for rows in self._rows])[:-1]
         return tuple(dual / scale for dual, scale in zip(pose.duals(np.split(z, ends)), self._scales, strict=True))
 
 
-def _solve(pose: Pose, way: _Pose, tolerance: float) -> clarabel.DefaultSolution:
+def _solve(pose: ScaledProblem, way: _SolverAttempt, tolerance: float) -> clarabel.DefaultSolution:
     A = scipy.sparse.csc_matrix(-np.vstack([block.F for block in pose.rows]))
     b = np.concatenate([block.f for block in pose.rows])
     hessian = np.diag(pose.hessian) if pose.hessian.ndim == 1 else np.triu(pose.hessian)

@@ -26,7 +26,7 @@ from ident_service.estimation.feasible.formulation import (
     OF_ESTIMATES,
     ConditionsError,
     check,
-    contradiction,
+    conflicting_constraints,
     insets,
     largest,
     project,
@@ -153,7 +153,7 @@ def convex_least_squares(
         if early is not None:
             return ConvexEstimate(early, solver.lower(), "optimal_inaccurate")
     if statuses[0].startswith("infeasible"):
-        if blocks := contradiction(conditions):
+        if blocks := conflicting_constraints(conditions):
             raise ConditionsError(_NAME, statuses[0], blocks)
         if custom is not None:
             raise CustomError(

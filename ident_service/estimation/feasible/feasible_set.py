@@ -169,7 +169,7 @@ Index = dict[str, int]
 _ODD = {"xy": ("lz", "Lxz", "Lyz"), "yz": ("lx", "Lxy", "Lxz"), "xz": ("ly", "Lxy", "Lyz")}
 
 
-def configured(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
+def configured_blocks(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
     """Return every block of the configuration that must be positive.
 
     Args:
@@ -391,7 +391,7 @@ def feasible_set(
     if config is None:
         blocks += signs(positive, links, index)
     else:
-        blocks += configured(config, links, index)
+        blocks += configured_blocks(config, links, index)
         equalities += symmetries(config, links, index)
     return FeasibleSet(kind, tuple(names), tuple(blocks), tuple(equalities))
 

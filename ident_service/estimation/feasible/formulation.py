@@ -32,7 +32,7 @@ OF_ESTIMATES = (1e2, 1e3, 1e4)
 Solved = TypeVar("Solved")
 
 
-class Lift:
+class LinkParameterMap:
     """The bijection (beta, delta_d) -> delta of eq. 49, for any grouping whose K has full row rank."""
 
     def __init__(self, base: BaseParameters) -> None:
@@ -177,7 +177,7 @@ def traces(conditions: FeasibleSet) -> Array:
     return rows
 
 
-def pressing(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
+def active_constraints(conditions: FeasibleSet, duals: Sequence[Array]) -> tuple[str, ...]:
     """Return the names of the active constraints, those with a large multiplier, the most decisive first."""
     weights = [float(np.abs(dual).max()) for dual in duals[: len(conditions.blocks)]]
     order = sorted(range(len(weights)), key=lambda i: -weights[i])
@@ -223,7 +223,7 @@ class ConditionsError(ParameterError, SolverError):
         self.args = (f"{self.args[0]}, because these conditions contradict each other: {'; '.join(blocks)}",)
 
 
-def contradiction(conditions: FeasibleSet) -> tuple[str, ...]:
+def conflicting_constraints(conditions: FeasibleSet) -> tuple[str, ...]:
     """Return the names of the conditions that conflict whatever the data; none where some delta fulfils all of them.
 
     Below the inset that every problem keeps, the multipliers of the largest margin name the blocks of the proof.

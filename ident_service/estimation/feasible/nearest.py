@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident_service.errors import SolverError
-from ident_service.estimation.feasible.central import Near, central
+from ident_service.estimation.feasible.central import ChangeEllipsoid, centre
 from ident_service.estimation.feasible.conic import ConicProblem, Solution
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.formulation import (
     OF_ESTIMATES,
     ConditionsError,
-    Lift,
+    LinkParameterMap,
+    active_constraints,
+    conflicting_constraints,
     constrain,
-    contradiction,
     minimise,
-    pressing,
     project,
     with_insets,
 )
@@ -67,15 +67,15 @@ class FeasibleEstimate:
         base: BaseParameters,
         conditions: FeasibleSet,
         likely: LikelyBodies | None = None,
-        near: Near | None = None,
+        near: ChangeEllipsoid | None = None,
     ) -> FeasibleEstimate:
         """Return the link parameters nearest to likely ones, with these base parameters or near ones: `central.py`."""
-        delta = central(self.delta, base, conditions, likely, near)
+        delta = centre(self.delta, base, conditions, likely, near)
         beta = self.beta if near is None else base.K @ delta
         return replace(self, beta=beta, delta=delta, margin=conditions.margin(delta)[0])
 
 
-def hold(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
+def add_conditions(problem: ConicProblem, conditions: FeasibleSet, to_delta: Array, inside: Array) -> None:
     """Add every block of the set with its inset (eq. 21, `insets`) and every equality exactly; delta = to_delta x."""
     for block, inset in zip(conditions.blocks, inside, strict=True):
         constrain(problem, block, block.times(to_delta), block.f - inset * block.identity())
@@ -130,7 +130,7 @@ def solve_inside(
             reaches=reaches,
         )
     except SolverError as error:
-        if blocks := contradiction(conditions):
+        if blocks := conflicting_constraints(conditions):
             raise ConditionsError(name, error.status, blocks) from error
         raise
     return project(to_delta @ solution.x, conditions), solution
@@ -175,7 +175,7 @@ def _nearest(
     reaches: Sequence[float],
     inside: Array,
 ) -> FeasibleEstimate:
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     n, variables = base.size, len(base.names) + 1
     problem = ConicProblem(variables)
     # Unit columns for beta: in SI units they differ by orders of magnitude.
@@ -188,7 +188,7 @@ def _nearest(
     distance[1:, :n] = metric * columns / scale
     problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
     to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
-    hold(problem, conditions, to_delta, inside)
+    add_conditions(problem, conditions, to_delta, inside)
     size = float(np.max(np.abs(beta), initial=0.0))
     best: FeasibleEstimate | None = None
     failure: SolverError | None = None
@@ -211,7 +211,7 @@ def _nearest(
                 delta=delta,
                 objective=distance_found,
                 margin=conditions.margin(delta)[0],
-                tight=() if at_target else pressing(conditions, solution.duals[1:]),
+                tight=() if at_target else active_constraints(conditions, solution.duals[1:]),
                 iterations=solution.iterations,
                 solver_seconds=solution.seconds,
                 bound=solution.bound,

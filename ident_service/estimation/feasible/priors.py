@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import ParameterError, SolverError
-from ident_service.estimation.feasible.central import Near
+from ident_service.estimation.feasible.central import ChangeEllipsoid
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set, reference, symmetric
-from ident_service.estimation.feasible.formulation import OF_TESTS, pressing, with_insets
-from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
+from ident_service.estimation.feasible.formulation import OF_TESTS, active_constraints, with_insets
+from ident_service.estimation.feasible.nearest import FeasibleEstimate, add_conditions, solve_inside
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -129,7 +129,9 @@ def residual_deviation(fit: LeastSquares) -> float:
     return sigma
 
 
-def towards_prior(fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior) -> FeasibleEstimate:
+def solve_with_prior(
+    fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior
+) -> FeasibleEstimate:
     """Solve the constrained least squares with a prior.
 
     Raises:
@@ -153,7 +155,7 @@ def _towards_prior(
     problem = ConicProblem(variables)
     to_delta = np.zeros((n, variables))
     to_delta[:, :n] = np.diag(prior.scales)
-    hold(problem, conditions, to_delta, inside)
+    add_conditions(problem, conditions, to_delta, inside)
     residual = np.zeros((rows, variables))
     residual[:, :n] = fit.R1 @ base.K * prior.scales / sigma
     residual[:, n : n + rows] = -np.eye(rows)
@@ -180,7 +182,7 @@ def _towards_prior(
         delta=delta,
         objective=float(np.linalg.norm(fit.R1 @ beta - fit.rho1)),
         margin=conditions.margin(delta)[0],
-        tight=pressing(conditions, solution.duals),
+        tight=active_constraints(conditions, solution.duals),
         iterations=solution.iterations,
         solver_seconds=solution.seconds,
         prior_distance=prior.divergence(delta),
@@ -188,12 +190,12 @@ def _towards_prior(
     )
 
 
-def roomier(
+def move_off_boundary(
     held: FeasibleEstimate,
     base: BaseParameters,
     conditions: FeasibleSet,
     likely: LikelyBodies,
-    near: Near,
+    near: ChangeEllipsoid,
 ) -> FeasibleEstimate:
     """Move an estimate off the boundary of the set, towards likely bodies, within the uncertainty `near`.
 
@@ -225,13 +227,13 @@ def roomier(
     return held
 
 
-def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: Near, inside: Array) -> Array:
+def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: ChangeEllipsoid, inside: Array) -> Array:
     """Return link parameters of least divergence from the prior whose base parameters lie within `near`."""
     n, links = len(prior.names), prior.whitened
     problem = ConicProblem(n + 14 * len(links), rough=True)  # seven digits are enough to start Newton's method
     to_delta = np.zeros((n, n + 14 * len(links)))
     to_delta[:, :n] = np.diag(prior.scales)
-    hold(problem, conditions, to_delta, inside)
+    add_conditions(problem, conditions, to_delta, inside)
     still = np.flatnonzero(~near.moves)
     problem.zero(base.K[still] @ to_delta, -near.origin[still])
     rows = near.metric @ base.K @ to_delta

@@ -19,16 +19,16 @@ from ident_service.estimation.feasible.formulation import (
     OF_TABLES,
     OF_TESTS,
     ConditionsError,
-    Lift,
+    LinkParameterMap,
+    active_constraints,
     check,
     constrain,
     insets,
     minimise,
-    pressing,
     traces,
 )
 from ident_service.estimation.feasible.nearest import HARD, FeasibleEstimate, nearest
-from ident_service.estimation.feasible.priors import Prior, towards_prior
+from ident_service.estimation.feasible.priors import Prior, solve_with_prior
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base_parameters import BaseParameters
@@ -120,7 +120,7 @@ def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet)
         SolverError: the solver stopped without an optimum.
     """
     check(beta, base, conditions)
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     fixed = lift.of_beta @ beta
     E, e = conditions.equality_rows()
     E_d, e = E @ lift.of_dependent, e + E @ fixed
@@ -136,14 +136,14 @@ def feasibility_test(beta: Array, base: BaseParameters, conditions: FeasibleSet)
         feasible=margin > 0.0,
         margin=margin,
         delta=found[-first],
-        tight=pressing(conditions, plain.duals),
+        tight=active_constraints(conditions, plain.duals),
         scaled_margin=max(conditions.scaled_margin(delta)[0] for delta in found),
         shares=_shares(conditions, scaled),
     )
 
 
 def _largest_margin(
-    lift: Lift, fixed: Array, equalities: tuple[Array, Array], conditions: FeasibleSet, scaled: bool
+    lift: LinkParameterMap, fixed: Array, equalities: tuple[Array, Array], conditions: FeasibleSet, scaled: bool
 ) -> Solution:
     dependents = len(lift.dependent)
     problem = ConicProblem(dependents + 1)
@@ -223,7 +223,7 @@ def constrained_least_squares(
     if prior is None or prior.weight == 0.0:
         found = nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares")
         return _unless_feasible(found, fit.beta, base, conditions, OF_ESTIMATES[0])
-    return towards_prior(fit, base, conditions, prior)
+    return solve_with_prior(fit, base, conditions, prior)
 
 
 def _unless_feasible(

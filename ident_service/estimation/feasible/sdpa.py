@@ -15,7 +15,7 @@ import numpy as np
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import triangle_entries
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.formulation import EPSILON, Lift, check
+from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap, check
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -38,7 +38,7 @@ def bpft_sdpa(beta: Array, base: BaseParameters, conditions: FeasibleSet) -> str
         ParameterError: shapes or names do not fit.
     """
     check(beta, base, conditions)
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     names = ["t", *(base.names[column] for column in lift.dependent)]
     file = _File("BPFT, eq. 51, as a largest margin t", names, np.append(-1.0, np.zeros(len(lift.dependent))))
     _conditions(file, conditions, lift.of_beta @ beta, lift.of_dependent, 0.0, margin=True)
@@ -136,7 +136,7 @@ def _nearest(
     title: str, metric: Array, target: Array, offset: float, base: BaseParameters, conditions: FeasibleSet
 ) -> str:
     """Return the text of the problem: minimise u with `u - offset >= |target - metric beta|^2`."""
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     n, dependents = base.size, len(lift.dependent)
     names = ["u", *(f"beta_{i} = {text}" for i, text in enumerate(base.expressions, 1))]
     names += [base.names[column] for column in lift.dependent]

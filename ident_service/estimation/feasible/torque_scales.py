@@ -16,8 +16,8 @@ from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.formulation import Lift, check, insets, pressing
-from ident_service.estimation.feasible.nearest import FeasibleEstimate, hold, solve_inside
+from ident_service.estimation.feasible.formulation import LinkParameterMap, active_constraints, check, insets
+from ident_service.estimation.feasible.nearest import FeasibleEstimate, add_conditions, solve_inside
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle
@@ -83,7 +83,7 @@ def constrained_least_squares_with_scales(
     n, variables = base.size, len(base.names) + len(free) + 1
     scale = max(float(np.linalg.norm(R, axis=0).max()), np.finfo(float).tiny)
     problem = ConicProblem(variables)
-    lift = Lift(base)
+    lift = LinkParameterMap(base)
     factors = slice(variables - 1 - len(free), variables - 1)
     distance = np.zeros((len(R) + 1, variables))
     distance[0, -1] = 1.0
@@ -94,7 +94,7 @@ def constrained_least_squares_with_scales(
     to_delta[:, :n] = lift.of_beta
     to_delta[:, n : factors.start] = lift.of_dependent
     guess = np.linalg.lstsq(R[:, :n], -R[:, n:].sum(axis=1), rcond=None)[0]
-    hold(problem, conditions, to_delta, insets(conditions, base, guess))
+    add_conditions(problem, conditions, to_delta, insets(conditions, base, guess))
     if free:
         pick = np.zeros((len(free), variables))
         pick[:, factors] = np.eye(len(free))
@@ -113,7 +113,7 @@ def constrained_least_squares_with_scales(
         delta=delta,
         objective=float(np.linalg.norm(residual)),
         margin=conditions.margin(delta)[0],
-        tight=pressing(conditions, solution.duals[1:]),
+        tight=active_constraints(conditions, solution.duals[1:]),
         iterations=solution.iterations,
         solver_seconds=solution.seconds,
     )

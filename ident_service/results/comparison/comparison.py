@@ -34,12 +34,12 @@ from ident_service.config.arm import ArmConfig
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.change_detection import (
     Cause,
-    Drift,
+    ComparedEstimate,
     Effect,
-    Identified,
     Motion,
+    ParameterChange,
     causes,
-    drift,
+    detect_change,
     friction_ratio,
     meaning_of_cause,
     meaning_of_effect,
@@ -58,7 +58,7 @@ Key = tuple[tuple[str, float], ...]
 
 
 @dataclass(frozen=True)
-class Side:
+class ComparedSet:
     """Parameter set that takes part in a comparison.
 
     Attributes:
@@ -152,7 +152,7 @@ class Side:
         except ParameterError as error:
             raise ParameterError(f"{self.path}: {error}") from None
 
-    def identified(self, places: NDArray[np.intp], *, free: bool) -> Identified | None:
+    def identified(self, places: NDArray[np.intp], *, free: bool) -> ComparedEstimate | None:
         """Return the testable values of some parameters, with their covariance; None without a covariance.
 
         Args:
@@ -166,7 +166,7 @@ class Side:
         values = self.file.values if values is None else values
         fit = self.content.get("fit", {})
         motion = None if self.information is None else Motion.of(self.information, values, places.tolist())
-        return Identified(
+        return ComparedEstimate(
             tuple(self.leading[place] for place in places),
             values[places],
             covariance[np.ix_(places, places)],
@@ -175,7 +175,7 @@ class Side:
         )
 
 
-def read_side(path: Path) -> Side:
+def read_side(path: Path) -> ComparedSet:
     """Read a folder of results or a parameter file.
 
     Raises:
@@ -186,14 +186,14 @@ def read_side(path: Path) -> Side:
     if path.is_dir():
         results = read_results(path)
         require_consistent(results.parameters, path / PARAMETERS)
-        return Side(path, results.sha256[PARAMETERS], results.parameters, results.config)
+        return ComparedSet(path, results.sha256[PARAMETERS], results.parameters, results.config)
     file = read_parameters(path)
     require_consistent(file, path)
-    return Side(path, hashlib.sha256(path.read_bytes()).hexdigest(), file)
+    return ComparedSet(path, hashlib.sha256(path.read_bytes()).hexdigest(), file)
 
 
 @dataclass(frozen=True)
-class InUse:
+class AppliedValues:
     """Values in use of the parameters that both sides have.
 
     Attributes:
@@ -223,10 +223,10 @@ class InUse:
 
 
 def values_in_use(
-    sides: tuple[Side, Side],
+    sides: tuple[ComparedSet, ComparedSet],
     places: Sequence[NDArray[np.intp]],
-    compared: tuple[Identified, Identified] | None,
-) -> InUse:
+    compared: tuple[ComparedEstimate, ComparedEstimate] | None,
+) -> AppliedValues:
     """Return the values in use of the shared parameters of two sides.
 
     Args:
@@ -236,11 +236,11 @@ def values_in_use(
     """
     reference, side = (one.file.values[at] for one, at in zip(sides, places, strict=True))
     if compared is None:
-        return InUse(reference, side, False, None)
+        return AppliedValues(reference, side, False, None)
     first, second = compared
     seen = np.isfinite(np.diag(first.covariance) + np.diag(second.covariance))
     apart = not (np.array_equal(first.values, reference) and np.array_equal(second.values, side))
-    return InUse(reference, side, apart, torque_shares(first, second, np.where(seen, side - reference, 0.0)))
+    return AppliedValues(reference, side, apart, torque_shares(first, second, np.where(seen, side - reference, 0.0)))
 
 
 UNSAID = "-"
@@ -248,7 +248,7 @@ Verdict = Literal["unchanged", "changed", "impossible"]
 
 
 @dataclass(frozen=True)
-class Crossed:
+class CrossErrors:
     """Torque errors of both sides' parameters on the data that the second side was identified from."""
 
     reference: TorqueError
@@ -277,19 +277,19 @@ class Pair:
         other_shape: joints, from 1, whose friction has another shape on each side, and so is not compared.
     """
 
-    side: Side
+    side: ComparedSet
     places: tuple[NDArray[np.intp], NDArray[np.intp]]
     only_reference: tuple[str, ...]
     only_side: tuple[str, ...]
     difference: Array
-    compared: tuple[Identified, Identified] | None
-    drift: Drift | None
+    compared: tuple[ComparedEstimate, ComparedEstimate] | None
+    drift: ParameterChange | None
     reason: str
     causes: tuple[Cause, ...]
-    crossed: Crossed | None
+    crossed: CrossErrors | None
     provenance: Mapping[str, tuple[str, str]]
     notes: tuple[str, ...]
-    in_use: InUse
+    in_use: AppliedValues
     free: bool
     other_shape: tuple[int, ...] = ()
 
@@ -310,7 +310,7 @@ class Pair:
 class Comparison:
     """Reference and the sides that were compared with it."""
 
-    reference: Side
+    reference: ComparedSet
     pairs: tuple[Pair, ...]
 
     @property
@@ -320,7 +320,7 @@ class Comparison:
         return "changed" if "changed" in words else "impossible" if "impossible" in words else "unchanged"
 
 
-def compare(sides: Sequence[Side]) -> Comparison:
+def compare(sides: Sequence[ComparedSet]) -> Comparison:
     """Compare parameter sets with the first of them.
 
     Args:
@@ -336,7 +336,7 @@ def compare(sides: Sequence[Side]) -> Comparison:
     return Comparison(reference, tuple(_pair(reference, side) for side in others))
 
 
-def _pair(reference: Side, side: Side) -> Pair:
+def _pair(reference: ComparedSet, side: ComparedSet) -> Pair:
     if reference.joints and side.joints and len(reference.joints) != len(side.joints):
         raise ParameterError(
             f"{side.path}: an arm of {len(side.joints)} joints, but {reference.path} has {len(reference.joints)}; "
@@ -359,7 +359,7 @@ def _pair(reference: Side, side: Side) -> Pair:
         reason = f"no covariance in {' and '.join(without)}; differences are listed, nothing can be tested"
         difference = side.file.values[places[1]] - reference.file.values[places[0]]
     else:
-        compared, found = (first, second), drift(first, second)
+        compared, found = (first, second), detect_change(first, second)
         difference = found.difference
         if differing and found.verdict == "unchanged":
             reason = (
@@ -392,7 +392,7 @@ def _pair(reference: Side, side: Side) -> Pair:
     )
 
 
-def _others(side: Side, other: Side) -> tuple[str, ...]:
+def _others(side: ComparedSet, other: ComparedSet) -> tuple[str, ...]:
     expressions = side.content["base_parameters"]["expressions"]
     return tuple(expression for expression, key in zip(expressions, side.keys, strict=True) if key not in other.keys)
 
@@ -402,7 +402,7 @@ def _others(side: Side, other: Side) -> tuple[str, ...]:
 _SAME_SHAPE = {"presliding": 5e-4, "stribeck_velocity": 0.0}
 
 
-def _other_shape(reference: Side, side: Side) -> tuple[int, ...]:
+def _other_shape(reference: ComparedSet, side: ComparedSet) -> tuple[int, ...]:
     found: set[int] = set()
     for key, symbol in (("presliding", "fc"), ("stribeck_velocity", "fs")):
         here, there = (one.content.get("friction", {}).get(key, []) for one in (reference, side))
@@ -419,33 +419,35 @@ def _shaped(name: str, joints: Sequence[int]) -> bool:
     )
 
 
-def _remedy(reference: Side) -> str:
+def _remedy(reference: ComparedSet) -> str:
     arm = reference.path / ARM
     return f"ident identify ... --arm {arm}" if reference.config is not None else "identification.friction as numbers"
 
 
-def _names(side: Side, joints: Sequence[int]) -> list[str]:
+def _names(side: ComparedSet, joints: Sequence[int]) -> list[str]:
     return [side.joints[joint - 1] if side.joints is not None else str(joint) for joint in joints]
 
 
-def _crossed(reference: Side, side: Side, places: tuple[NDArray[np.intp], NDArray[np.intp]]) -> Crossed | None:
+def _crossed(
+    reference: ComparedSet, side: ComparedSet, places: tuple[NDArray[np.intp], NDArray[np.intp]]
+) -> CrossErrors | None:
     """Return torque errors with the values in use, held in a feasible set or not; None where tables differ."""
     size = side.file.base.size
     if side.information is None or len(places[0]) != size or size != reference.file.base.size:
         return None
     beta = np.empty(size)
     beta[places[1]] = reference.file.values[places[0]]
-    return Crossed(torque_error(side.information, beta), torque_error(side.information, side.file.values))
+    return CrossErrors(torque_error(side.information, beta), torque_error(side.information, side.file.values))
 
 
-def _provenance(reference: Side, side: Side) -> dict[str, tuple[str, str]]:
+def _provenance(reference: ComparedSet, side: ComparedSet) -> dict[str, tuple[str, str]]:
     known = [_flat(one) for one in (reference, side)]
     keys = list(dict.fromkeys([*known[0], *known[1]]))
     both = {key: (known[0].get(key, UNSAID), known[1].get(key, UNSAID)) for key in keys}
     return {key: pair for key, pair in both.items() if pair[0] != pair[1]}
 
 
-def _flat(side: Side) -> dict[str, str]:
+def _flat(side: ComparedSet) -> dict[str, str]:
     content = side.content
     source = content.get("provenance", {})
     facts: dict[str, Any] = {
@@ -466,7 +468,9 @@ def _flat(side: Side) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items() if value is not None}
 
 
-def _notes(reference: Side, side: Side, free: bool, differing: Sequence[int], in_use: InUse) -> list[str]:
+def _notes(
+    reference: ComparedSet, side: ComparedSet, free: bool, differing: Sequence[int], in_use: AppliedValues
+) -> list[str]:
     notes = []
     both = (reference.content, side.content)
     names = [content.get("arm", {}).get("name") for content in both]
@@ -556,7 +560,7 @@ def _links(pair: Pair) -> int:
     return max(int(name[1:]) for name in names if name.startswith("m") and name[1:].isdigit())
 
 
-def _whole(pair: Pair, found: Drift, cause: Cause | None, links: int) -> Finding:
+def _whole(pair: Pair, found: ParameterChange, cause: Cause | None, links: int) -> Finding:
     """Return the change of all parameters together, as a finding."""
     joint, torque, residual = "", None, None
     if found.torque_share is not None and found.residual_share is not None:
@@ -578,7 +582,9 @@ def _whole(pair: Pair, found: Drift, cause: Cause | None, links: int) -> Finding
     return Finding(what, found.joint.sigma, joint, torque, residual, size, meaning)
 
 
-def _single(pair: Pair, found: Drift, compared: tuple[Identified, Identified], effect: Effect, links: int) -> Finding:
+def _single(
+    pair: Pair, found: ParameterChange, compared: tuple[ComparedEstimate, ComparedEstimate], effect: Effect, links: int
+) -> Finding:
     owner = f"joint {joint_name(pair, effect.number)}" if effect.kind in _OF_JOINTS else f"link {effect.number}"
     return Finding(
         what=f"{effect.kind} of {owner}",
@@ -591,6 +597,6 @@ def _single(pair: Pair, found: Drift, compared: tuple[Identified, Identified], e
     )
 
 
-def _ratio(compared: tuple[Identified, Identified], joint: int) -> str:
+def _ratio(compared: tuple[ComparedEstimate, ComparedEstimate], joint: int) -> str:
     found = friction_ratio(*compared, joint)
     return "" if found is None else f"{found[0] - 1.0:+.0%} at {found[1]:.2g} rad/s"

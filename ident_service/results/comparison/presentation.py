@@ -17,11 +17,26 @@ from scipy.special import ndtri
 
 from ident_service import __version__
 from ident_service.config.arm import JointTerm
-from ident_service.estimation.change_detection import ALPHA, RELEVANT_RESIDUAL, RELEVANT_TORQUE, Drift, Test, relevant
+from ident_service.estimation.change_detection import (
+    ALPHA,
+    RELEVANT_RESIDUAL,
+    RELEVANT_TORQUE,
+    ParameterChange,
+    Test,
+    relevant,
+)
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.model.chain import Array
 from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
-from ident_service.results.comparison.comparison import UNSAID, Comparison, Finding, Pair, Side, findings, joint_name
+from ident_service.results.comparison.comparison import (
+    UNSAID,
+    ComparedSet,
+    Comparison,
+    Finding,
+    Pair,
+    findings,
+    joint_name,
+)
 from ident_service.results.evidence.gathering import friction_term
 from ident_service.results.manifest import write_atomically
 from ident_service.results.parameter_file import require_schema
@@ -36,7 +51,7 @@ _TERMS: dict[str, JointTerm] = {symbol: term for term, symbol in TERM_SYMBOLS.it
 _LARGEST_Z = 1e3
 
 
-def friction_curves(reference: Side, pair: Pair, place: int) -> list[Figure]:
+def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figure]:
     """Return one figure per joint with friction on both sides.
 
     Args:
@@ -76,7 +91,7 @@ def friction_curves(reference: Side, pair: Pair, place: int) -> list[Figure]:
     return figures
 
 
-def z_figure(found: Drift, place: int) -> Figure:
+def z_figure(found: ParameterChange, place: int) -> Figure:
     """Draw every parameter's difference in standard deviations, on a scale that shows 1 as well as 1000."""
     size = len(found.z)
     shown = _squeezed(np.clip(found.z, -_LARGEST_Z, _LARGEST_Z))
@@ -123,7 +138,7 @@ def _squeezed(z: Array) -> Array:
     return np.asarray(np.arcsinh(z))
 
 
-def _friction(side: Side) -> dict[int, dict[JointTerm, float]]:
+def _friction(side: ComparedSet) -> dict[int, dict[JointTerm, float]]:
     """Return per joint, from 1, the value of each friction term that is a base parameter of its own."""
     found: dict[int, dict[JointTerm, float]] = {}
     for name, value in zip(side.leading, side.file.values.tolist(), strict=True):
@@ -133,14 +148,14 @@ def _friction(side: Side) -> dict[int, dict[JointTerm, float]]:
     return found
 
 
-def _units(side: Side, joint: int) -> tuple[str, str]:
+def _units(side: ComparedSet, joint: int) -> tuple[str, str]:
     """Return the units of torque and velocity of a joint; a revolute joint's where the file does not say."""
     units = dict(zip(side.leading, side.content["base_parameters"].get("units", []), strict=False))
     slides = any(units.get(f"{symbol}{joint}") in ("N", "N s/m") for symbol in _TERMS)
     return ("N", "m/s") if slides else ("N m", "rad/s")
 
 
-def _curve(side: Side, terms: Mapping[JointTerm, float], at: Array, joint: int) -> Array:
+def _curve(side: ComparedSet, terms: Mapping[JointTerm, float], at: Array, joint: int) -> Array:
     velocities = side.content.get("friction", {}).get("stribeck_velocity", [])
     count = max(joint, len(velocities))
     # A file that does not say its Stribeck velocities was made with the default.
@@ -180,7 +195,7 @@ def comparison_text(comparison: Comparison) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _called(side: Side) -> str:
+def _called(side: ComparedSet) -> str:
     arm = side.content.get("arm", {}).get("name", "no arm named")
     return f"{side.path} ({arm}, {side.content.get('method', 'method not said')})"
 
@@ -292,17 +307,17 @@ def _shares(pair: Pair) -> list[tuple[str, float]]:
     return list(zip(names, pair.drift.torque_share.tolist(), strict=True))
 
 
-def _fits(side: Side) -> str:
+def _fits(side: ComparedSet) -> str:
     fit = side.content.get("fit")
     return "not said" if fit is None else f"{fit['relative_error_percent']:.3f} %"
 
 
-def _validations(side: Side) -> str:
+def _validations(side: ComparedSet) -> str:
     scores = side.content.get("validation", [])
     return ", ".join(f"{one['relative_error_percent']:.3f} % ({one['recording']})" for one in scores) or "none"
 
 
-def _table(reference: Side, pair: Pair) -> list[str]:
+def _table(reference: ComparedSet, pair: Pair) -> list[str]:
     apart, use = pair.in_use.apart, pair.in_use
     heads = f"{'reference':>11s} {'compared':>11s} {'difference':>11s} {'z':>8s} {'p (Holm)':>9s}"
     heads += f" {'ref. in use':>11s} {'cmp. in use':>11s}" if apart else ""
@@ -353,7 +368,7 @@ def write_comparison(path: Path, comparison: Comparison) -> None:
     write_atomically(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
-def _side(side: Side) -> dict[str, Any]:
+def _side(side: ComparedSet) -> dict[str, Any]:
     content = side.content
     return {
         "path": str(side.path),
@@ -368,7 +383,7 @@ def _error_percent(entry: Any) -> float | None:
     return None if entry is None else entry.get("relative_error_percent")
 
 
-def _pair_document(reference: Side, pair: Pair) -> dict[str, Any]:
+def _pair_document(reference: ComparedSet, pair: Pair) -> dict[str, Any]:
     found, expressions = pair.drift, reference.content["base_parameters"]["expressions"]
     first, second = (side.file.values[at] for side, at in zip((reference, pair.side), pair.places, strict=True))
     if pair.compared is not None:
@@ -466,7 +481,7 @@ def comparison_html(comparison: Comparison) -> str:
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{joined}</body></html>\n'
 
 
-def _sections(reference: Side, pair: Pair, place: int) -> Iterable[str]:
+def _sections(reference: ComparedSet, pair: Pair, place: int) -> Iterable[str]:
     found = findings(pair)
     first, *_ = verdict_lines(pair)
     said = contradiction(pair)
@@ -494,7 +509,7 @@ def _sections(reference: Side, pair: Pair, place: int) -> Iterable[str]:
         yield section(f"provenance-{place}", "How they came about", made)
 
 
-def _parameters(reference: Side, pair: Pair) -> str:
+def _parameters(reference: ComparedSet, pair: Pair) -> str:
     table_of = reference.content["base_parameters"]
     units = table_of.get("units", [""] * reference.file.base.size)
     first, second = (side.file.values[at] for side, at in zip((reference, pair.side), pair.places, strict=True))
@@ -564,7 +579,7 @@ def _torque(pair: Pair) -> str:
     return table(f"Relative torque error of the values in use, on the recordings of {_name(pair.side)}", heads, rows)
 
 
-def _name(side: Side) -> str:
+def _name(side: ComparedSet) -> str:
     arm = side.content.get("arm", {}).get("name")
     return f"{side.name} ({arm})" if arm else side.name
 
@@ -576,7 +591,7 @@ def _files(comparison: Comparison) -> str:
     return table("Parameter sets, the reference first", heads, rows)
 
 
-def _errors(side: Side) -> tuple[Cell, Cell]:
+def _errors(side: ComparedSet) -> tuple[Cell, Cell]:
     fit, scores = side.content.get("fit"), side.content.get("validation", [])
     said = ", ".join(number(one["relative_error_percent"], 4) for one in scores)
     return (

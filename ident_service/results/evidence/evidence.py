@@ -85,7 +85,7 @@ class Spectrum:
 
 
 @dataclass(frozen=True)
-class Traced:
+class PredictionTrace:
     """Traces and spectra of one recording against the chosen estimate.
 
     Attributes:
@@ -159,7 +159,7 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Posed:
+class PosedArm:
     """Arm in one posture of its recordings, with the bodies of its links.
 
     Attributes:
@@ -238,9 +238,9 @@ class Evidence:
     constrained: int
     chosen: int
     bounds: tuple[tuple[str, ...], ...]
-    recordings: tuple[Traced, ...]
+    recordings: tuple[PredictionTrace, ...]
     friction: tuple[Friction, ...]
     conditions: tuple[Condition, ...]
-    posed: Posed | None
+    posed: PosedArm | None
     timing: tuple[Timing, ...]
     warnings: tuple[str, ...]

@@ -26,10 +26,10 @@ from ident_service.results.evidence.evidence import (
     Friction,
     JointTrace,
     Mask,
-    Posed,
+    PosedArm,
+    PredictionTrace,
     Spectrum,
     Timing,
-    Traced,
 )
 from ident_service.results.manifest import write_atomically
 from ident_service.results.parameter_file import require_schema, strict_json
@@ -191,7 +191,7 @@ def evidence_document(evidence: Evidence) -> dict[str, Any]:
     }
 
 
-def _recording_document(one: Traced) -> dict[str, Any]:
+def _recording_document(one: PredictionTrace) -> dict[str, Any]:
     return {
         "name": one.name,
         "sha256": one.sha256,
@@ -229,7 +229,7 @@ def runs_of(numbers: np.ndarray[Any, np.dtype[np.int64]]) -> list[list[int]]:
     return [[int(numbers[b]), int(n)] for b, n in zip(begins, np.diff(begins, append=len(numbers)), strict=True)]
 
 
-def _posed_document(posed: Posed) -> dict[str, Any]:
+def _posed_document(posed: PosedArm) -> dict[str, Any]:
     bodies = [
         {
             "mass": body.mass,
@@ -328,7 +328,7 @@ def _densities(content: Mapping[str, Any], lines: int) -> Array:
     return np.asarray(10.0**logs)
 
 
-def _traced(content: Mapping[str, Any], joints: int) -> Traced:
+def _traced(content: Mapping[str, Any], joints: int) -> PredictionTrace:
     _require(len(content["joints"]) == joints, f"{content['name']!r} has {len(content['joints'])} joints, not {joints}")
     _require(len(content["spectra"]) in (0, joints), f"{content['name']!r} has {len(content['spectra'])} spectra")
     count = sum(length for _, length in content["runs"])
@@ -356,7 +356,7 @@ def _traced(content: Mapping[str, Any], joints: int) -> Traced:
         for one in content["spectra"]
     )
     time = (numbers + 0.5) * content["width"]
-    return Traced(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra)
+    return PredictionTrace(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra)
 
 
 def _friction(content: Mapping[str, Any]) -> Friction:
@@ -367,7 +367,7 @@ def _friction(content: Mapping[str, Any]) -> Friction:
     return Friction(velocity, torque, curve[0], curve[1], tuple(content["terms"]))
 
 
-def _posed(content: Mapping[str, Any], joints: int) -> Posed:
+def _posed(content: Mapping[str, Any], joints: int) -> PosedArm:
     points = _numbers(content["points"])
     _require(len(points) == 1 + 2 * joints and len(content["bodies"]) == joints, "the arm's frames and bodies")
     _require(all(max(branch) < len(points) for branch in content["branches"]), "the arm's branches")
@@ -379,7 +379,7 @@ def _posed(content: Mapping[str, Any], joints: int) -> Posed:
         )
         for one in content["bodies"]
     )
-    return Posed(points, tuple(tuple(branch) for branch in content["branches"]), bodies)
+    return PosedArm(points, tuple(tuple(branch) for branch in content["branches"]), bodies)
 
 
 def _timing(content: Mapping[str, Any], joints: int) -> Timing:

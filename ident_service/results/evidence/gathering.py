@@ -40,11 +40,11 @@ from ident_service.results.evidence.evidence import (
     Friction,
     JointTrace,
     Mask,
-    Posed,
+    PosedArm,
+    PredictionTrace,
     Role,
     Spectrum,
     Timing,
-    Traced,
 )
 
 
@@ -70,7 +70,7 @@ def bounds_of(tight: tuple[str, ...], conditions: FeasibleSet, base: BaseParamet
     return tuple(tuple(name for name in tight if int(column) in touched.get(name, set())) for column in base.base)
 
 
-def posed(model: ArmModel, delta: Array | None, positions: Array) -> Posed | None:
+def posed(model: ArmModel, delta: Array | None, positions: Array) -> PosedArm | None:
     """Return the arm, with its bodies, in the most telling posture of a motion.
 
     Args:
@@ -87,7 +87,7 @@ def posed(model: ArmModel, delta: Array | None, positions: Array) -> Posed | Non
         mass, center, axes = ellipsoid(delta[model.layout.inertial(link)])
         R, p = turns[0, link], places[0, link]
         bodies.append(Body(mass, R @ center + p, None if axes is None else axes @ R.T))
-    return Posed(frame_origins(model.chain, posture)[0], branches(model.chain), tuple(bodies))
+    return PosedArm(frame_origins(model.chain, posture)[0], branches(model.chain), tuple(bodies))
 
 
 def _most_telling(points: Array) -> int:
@@ -489,7 +489,7 @@ def gather_evidence(
     everyone += [(one, "validation") for one in validation]
     most = max(_STRETCHES // len(everyone), _FEWEST_STRETCHES)
     friction = FrictionSeen(estimate)
-    traced: list[Traced] = []
+    traced: list[PredictionTrace] = []
     times: list[Timing] = []
     postures = Scatter(_POSTURES)
     for recording, role in everyone:
@@ -580,7 +580,7 @@ class _Seen:
             self._welch.add(residual[:, begin:end], opens=begin in breaks)
         self._last = float(rows.time[-1])
 
-    def traced(self, recording: Recording, role: Role) -> Traced:
+    def traced(self, recording: Recording, role: Role) -> PredictionTrace:
         """Return the recording's traces and spectra."""
         if self._envelope is None or self._welch is None:
             raise AssertionError("a recording that was identified from has equations")
@@ -599,7 +599,7 @@ class _Seen:
             )
             for k in range(joints)
         )
-        return Traced(
+        return PredictionTrace(
             name=recording.path.name,
             sha256=recording.sha256,
             role=role,

@@ -20,10 +20,10 @@ from ident_service import __version__
 from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array
-from ident_service.model.friction_state import presliding_ways, turned
+from ident_service.model.friction_state import advance_dahl_state, presliding_ways
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
 from ident_service.model.regressor import joint_regressor
-from ident_service.model.symbolic import Symbol, Tape, Value, needed_steps
+from ident_service.model.symbolic import ExpressionGraph, Symbol, Value, needed_steps
 from ident_service.results.export.identified_arm import IdentifiedArm
 from ident_service.results.export.round_trip import (
     AGREEMENT,
@@ -48,7 +48,7 @@ _SIGN = re.compile(rf"^    const double (x\d+) = \(double\)\(\(({_OPERAND}) > 0\
 _RESULT = re.compile(rf"^    ([a-zA-Z]+)\[(\d+)\] = ({_OPERAND});$")
 
 
-def c_lines(tape: Tape, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
+def c_lines(tape: ExpressionGraph, inputs: Mapping[int, str], outputs: Sequence[tuple[str, Value]]) -> list[str]:
     """Return the body of a C function, indented.
 
     Args:
@@ -134,7 +134,7 @@ def run_c_lines(lines: Sequence[str], arrays: Mapping[str, Array]) -> dict[str, 
 
 _PARAMETER = re.compile(r"^    (-?[\d.e+-]+),? /\* \d+ ")
 _DRIVES: tuple[JointTerm, ...] = ("drive_inertia",)
-_Formulas = Callable[[Tape, dict[int, Value], dict[str, list[Symbol]]], list[Value]]
+_Formulas = Callable[[ExpressionGraph, dict[int, Value], dict[str, list[Symbol]]], list[Value]]
 
 
 def c_prefix(arm: IdentifiedArm) -> str:
@@ -246,30 +246,30 @@ def _parameters(arm: IdentifiedArm, name: str) -> str:
 def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _Formulas]]:
     chain, layout, n = arm.model.chain, arm.model.layout, arm.model.chain.joints
 
-    def rigid(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+    def rigid(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         links = rigid_torque(tape, chain, layout, p, s["q"], s["dq"], s["ddq"])
         drives = drive_torque(chain, layout, p, s["ddq"])
         return [a + b for a, b in zip(links, drives, strict=True)]
 
-    def friction(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+    def friction(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         return friction_torque(tape, chain, layout, p, s["dq"])
 
-    def gravity(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+    def gravity(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         return rigid_torque(tape, chain, layout, p, s["q"])
 
-    def mass(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+    def mass(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         M = mass_matrix(tape, chain, layout, p, s["q"])
         return [M[i][j] for i in range(n) for j in range(n)]
 
     ways = presliding_ways(arm.model)
 
-    def turn(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+    def turn(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         return [
             _turned(tape, share, s["step"], before, x0)
             for share, before, x0 in zip(chain.coupling, s["before"], ways, strict=True)
         ]
 
-    def turning(tape: Tape, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
+    def turning(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         return friction_torque(tape, chain, layout, p, s["dq"], s["direction"])
 
     found: list[tuple[str, tuple[str, ...], str, _Formulas]] = [
@@ -284,7 +284,7 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
     return found
 
 
-def _turned(tape: Tape, share: Array, step: list[Symbol], before: Symbol, way: float) -> Value:
+def _turned(tape: ExpressionGraph, share: Array, step: list[Symbol], before: Symbol, way: float) -> Value:
     """Return the friction state of one drive after one step of Dahl's law (`model/friction_state.py`)."""
     travelled: Value = sum((float(c) * x for c, x in zip(share, step, strict=True) if c), 0.0)
     if not isinstance(travelled, Symbol):
@@ -299,7 +299,7 @@ def _turned(tape: Tape, share: Array, step: list[Symbol], before: Symbol, way: f
 def _function(
     arm: IdentifiedArm, name: str, what: str, arguments: tuple[str, ...], result: str, formulas: _Formulas
 ) -> str:
-    tape, n = Tape(), arm.model.chain.joints
+    tape, n = ExpressionGraph(), arm.model.chain.joints
     states = {argument: [tape.input() for _ in range(n)] for argument in arguments}
     inputs = {symbol.index: f"{key}[{k}]" for key, symbols in states.items() for k, symbol in enumerate(symbols)}
     parameters: dict[int, Value] = {}
@@ -400,7 +400,7 @@ def _turning_pairs(
     still, dq, before = random_states(model.chain.joints)
     step = np.where(np.arange(len(dq))[:, None] % 3 == 0, 0.0, 1e-3 * dq)
     before = np.tanh(before)
-    direction = turned(before, step @ model.chain.coupling.T, ways)
+    direction = advance_dahl_state(before, step @ model.chain.coupling.T, ways)
     H = joint_regressor(model.chain, model.layout, 0.0 * still, dq, 0.0 * dq, direction=direction)
     without = with_terms(model, delta, [term for term in model.layout.terms if term != "drive_inertia"])
     without -= with_terms(model, delta, ())

@@ -32,7 +32,7 @@ from ident_service.results.export.mjcf import mjcf_export
 from ident_service.results.export.round_trip import AGREEMENT, disagreement, random_states, torque
 from ident_service.results.export.sdf import sdf_export
 from ident_service.results.export.urdf import urdf_export
-from ident_service.results.manifest import appearing_folder, write_atomically
+from ident_service.results.manifest import atomic_folder, write_atomically
 
 # Standard deviations are those of the unconstrained values; both are the same where nothing was constrained.
 _HEADER = ("kind", "name", "unit", "value", "sigma", "verdict", "unconstrained_value")
@@ -314,7 +314,7 @@ def export_run(run: Path, formats: Sequence[str], folder: Path) -> tuple[Export,
         ConfigError, ModelError: the arm in it cannot be used, or a format cannot carry it.
     """
     made = export_texts(read_identified(run), formats)
-    with appearing_folder(folder) as staging:
+    with atomic_folder(folder) as staging:
         for export in made:
             write_atomically(staging / export.name, export.text)
     return tuple(replace(export, text="") for export in made)

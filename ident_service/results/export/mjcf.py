@@ -18,7 +18,13 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array
 from ident_service.model.parameter_layout import JOINT_TERMS, joint_drives
 from ident_service.results.export.bodies import about_center, joint_bodies, require_real
-from ident_service.results.export.round_trip import Carried, carried, gravity_of, left_out, require_same_torques
+from ident_service.results.export.round_trip import (
+    Carried,
+    gravity_of,
+    require_same_torques,
+    supported_terms,
+    unsupported_terms,
+)
 from ident_service.results.export.urdf import xml_places
 from ident_service.results.export.words import comments, unique
 
@@ -42,10 +48,10 @@ def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] 
     """
     from ident_service.model.dynamic_model import read_back
 
-    has = carried(model, delta, JOINT_TERMS)
+    has = supported_terms(model, delta, JOINT_TERMS)
     shared = _shared(model, delta)
     everything = {term: has[term] | shared[term] for term in has}
-    lost = left_out(model, delta, everything)
+    lost = unsupported_terms(model, delta, everything)
     if any(joint.velocity is not None for joint in model.config.joints.values()):
         lost = (*lost, "velocity limits")
     text = _text(model, delta, has, shared, lost, said)

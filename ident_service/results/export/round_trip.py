@@ -60,7 +60,7 @@ def with_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> A
     return kept
 
 
-def carried(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
+def supported_terms(model: ArmModel, delta: Array, terms: Collection[JointTerm]) -> Carried:
     """Return which values a format with some joint terms supports: none negative, of joints with an own drive only."""
     drives = joint_drives(model.chain, model.layout, delta)
     known = [term for term in JOINT_TERMS if term in terms and term in model.layout.terms]
@@ -114,7 +114,7 @@ _WORDS: dict[JointTerm, str] = {
 }
 
 
-def left_out(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
+def unsupported_terms(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
     """Return the joint terms with a value that a file does not carry, in words."""
     found = []
     for term in model.layout.terms:

@@ -30,7 +30,13 @@ from ident_service.results.export.bodies import (
     require_real,
     rotation_rpy,
 )
-from ident_service.results.export.round_trip import Carried, carried, gravity_of, left_out, require_same_torques
+from ident_service.results.export.round_trip import (
+    Carried,
+    gravity_of,
+    require_same_torques,
+    supported_terms,
+    unsupported_terms,
+)
 from ident_service.results.export.urdf import Element, xml_places
 from ident_service.results.export.words import comments, unique
 
@@ -178,9 +184,9 @@ def sdf_export(
     Raises:
         ModelError: a link that no real body is, or the file does not say what it should.
     """
-    has = carried(model, delta, _TERMS)
+    has = supported_terms(model, delta, _TERMS)
     gravity = ("gravity",) if model.chain.gravity.any() else ()
-    lost = (*gravity, *left_out(model, delta, has))
+    lost = (*gravity, *unsupported_terms(model, delta, has))
     joints = _names(model)
     text = _text(model, delta, has, joints, lost, said)
     written = read_sdf(text, name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))

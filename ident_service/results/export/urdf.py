@@ -31,11 +31,11 @@ from ident_service.model.urdf import urdf_text
 from ident_service.results.export.bodies import about_center, about_origin, is_real, moved, rotation_rpy
 from ident_service.results.export.round_trip import (
     Carried,
-    carried,
     gravity_of,
-    left_out,
     presliding_left_out,
     require_same_torques,
+    supported_terms,
+    unsupported_terms,
 )
 from ident_service.results.export.words import plain
 from ident_service.results.manifest import write_atomically
@@ -396,7 +396,7 @@ def urdf_export(
     """
     from ident_service.model.dynamic_model import read_back
 
-    has = carried(model, delta, _TERMS)
+    has = supported_terms(model, delta, _TERMS)
     notes: tuple[str, ...] = ()
     own = model.config.kinematics if model.config.kinematics.urdf is not None else None
     if own is not None:
@@ -404,7 +404,7 @@ def urdf_export(
     else:
         text = urdf_text(model, delta)
     gravity = "gravity" if model.chain.gravity.any() else ""
-    unwritten = left_out(model, delta, has)
+    unwritten = unsupported_terms(model, delta, has)
     text = _commented(text, (*presliding_left_out(model, delta), *said))
     written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model), own)
     require_same_torques(model, delta, written, has, name)

@@ -10,7 +10,16 @@ import numpy as np
 
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.recordings.quality import MUCH_JITTER
-from ident_service.results.evidence.evidence import Body, Evidence, JointTrace, Mask, Posed, Spectrum, Timing, Traced
+from ident_service.results.evidence.evidence import (
+    Body,
+    Evidence,
+    JointTrace,
+    Mask,
+    PosedArm,
+    PredictionTrace,
+    Spectrum,
+    Timing,
+)
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.plots import (
     FONT,
@@ -131,7 +140,7 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
 class _Columns:
     """Trace reduced to as many columns as can be seen, without a lost extreme."""
 
-    def __init__(self, traced: Traced, trace: JointTrace) -> None:
+    def __init__(self, traced: PredictionTrace, trace: JointTrace) -> None:
         step = max(1, -(-len(traced.time) // _COLUMNS))
         number_of = np.round(traced.time / traced.width - 0.5).astype(int)
         place = number_of // step
@@ -227,7 +236,7 @@ def residual_figures(evidence: Evidence) -> list[Figure]:
     return [_residual_figure(evidence, joint, shown) for joint in range(len(evidence.joints))] if shown else []
 
 
-def _residual_figure(evidence: Evidence, joint: int, shown: list[Traced]) -> Figure:
+def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace]) -> Figure:
     name = evidence.joints[joint]
     unit = "(N m)\u00b2/Hz" if evidence.revolute[joint] else "N\u00b2/Hz"
     spectra = [one.spectra[joint] for one in shown]
@@ -537,7 +546,7 @@ def ellipse(axes: Array, view: tuple[int, int]) -> Array:
     return np.asarray((circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
-def _bodies_figure(joints: tuple[str, ...], posed: Posed, name: str, view: tuple[int, int]) -> Figure:
+def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tuple[int, int]) -> Figure:
     low, high = posed.points.min(axis=0), posed.points.max(axis=0)
     around = _AROUND * max(float((high - low).max()), 0.1)
     side = WIDTH - LEFT - RIGHT
@@ -611,7 +620,7 @@ def _length(axes: Array) -> float:
     return 2.0 * float(np.linalg.norm(axes, axis=1).max())
 
 
-def _words(joints: tuple[str, ...], posed: Posed, outside: list[bool], longest: float) -> str:
+def _words(joints: tuple[str, ...], posed: PosedArm, outside: list[bool], longest: float) -> str:
     masses = ", ".join(f"{name} {number(body.mass)} kg" for name, body in zip(joints, posed.bodies, strict=True))
     words = f"One posture of the recordings. Masses, one feasible choice of many: {masses}."
     if gone := [name for name, body in zip(joints, posed.bodies, strict=True) if body.axes is None]:

@@ -16,14 +16,14 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW, Verdict
 from ident_service.recordings.quality import MUCH_JITTER
-from ident_service.results.evidence.evidence import Array, Condition, Evidence, Traced
+from ident_service.results.evidence.evidence import Array, Condition, Evidence, PredictionTrace
 from ident_service.results.evidence.file import packed, packed_mask, runs_of
 from ident_service.results.evidence.gathering import CAD
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.plots import number, plain, sheet
 from ident_service.results.report.figures import Figure, Figures, Zoom, figures
 from ident_service.results.report.markup import Cell, contents, items, paragraph, prose, section, table
-from ident_service.results.report.verdict import POOR, SIMULATED, reservations, verdict
+from ident_service.results.report.verdict import POOR, SIMULATED, limitations, verdict
 from ident_service.results.summary import WHAT_THEN
 
 _NOTHING = Cell("\u2014")
@@ -297,7 +297,7 @@ def _warnings(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
     yield "<h3>Of the recordings</h3>"
     yield items(evidence.warnings) if evidence.warnings else paragraph(_NO_WARNING)
     yield "<h3>Of the estimate</h3>"
-    against = reservations(evidence, parameters)
+    against = limitations(evidence, parameters)
     yield items(against) if against else paragraph(_NOTHING_AGAINST)
 
 
@@ -376,7 +376,7 @@ def _zoom(zoom: Zoom) -> str:
     return f' data-zoom="{plain(json.dumps(content))}"'
 
 
-def _data(place: int, traced: Traced) -> str:
+def _data(place: int, traced: PredictionTrace) -> str:
     """Return a recording for the script: its entries of `evidence.json` without the names."""
     joints: list[dict[str, Any]] = [
         {

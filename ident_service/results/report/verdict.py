@@ -76,7 +76,7 @@ def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
     return f"{len(tight)}{of} conditions are active" if len(tight) > 1 else f"1{of} condition is active"
 
 
-def reservations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
+def limitations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """Return the limitations of the estimate, in sentences; empty where there are none."""
     found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
     if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
@@ -196,7 +196,7 @@ def _prediction(evidence: Evidence) -> str:
     )
     words = f"On what it never saw its torque error is {errors}, against {fitted} on what it was fitted to: "
     words += "it predicts other motions " if own.moving is None else "away from standstill it predicts other motions "
-    words += "markedly worse than its own" if _worse(evidence) else "about as well as its own"
+    words += "markedly worse than its own" if _generalises_poorly(evidence) else "about as well as its own"
     if own.moving is None or own.identification is None:
         return f"{words}."
     times = max(own.validation) / max(own.identification, 1e-12)
@@ -228,7 +228,7 @@ def _error(whole: float, moving: float | None) -> str:
     return f"{number(whole)} %" + ("" if moving is None else f" ({number(moving)} % away from standstill)")
 
 
-def _worse(evidence: Evidence) -> bool:
+def _generalises_poorly(evidence: Evidence) -> bool:
     """Return whether unseen motions are predicted markedly worse than the fitted ones; without standstill, if known."""
     own = evidence.estimates[evidence.chosen]
     if own.moving is not None and own.moving_validation:
@@ -267,7 +267,7 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     own = evidence.estimates[evidence.chosen]
     if not own.validation:
         steps.append("record a second motion and give it with --validate")
-    elif _worse(evidence):
+    elif _generalises_poorly(evidence):
         steps.append("look below at which joint's residual follows the motion, and identify from a richer one")
     poor = poor_joints(evidence, parameters)
     if moving := [one.name for one in poor if one.in_motion]:
