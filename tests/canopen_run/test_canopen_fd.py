@@ -147,6 +147,7 @@ def asked(link: Link, node: int) -> Frame:
 
 @pytest.mark.slow
 @pytest.mark.realtime
+@pytest.mark.campaign  # in virtual time, the test above does the same for every change
 @pytest.mark.timeout(600)
 def test_a_run_over_a_paced_wire_between_two_processes(tmp_path: Path) -> None:
     bus = {"interface": "ident_wire", "channel": channel(), "options": {"pace": True}}

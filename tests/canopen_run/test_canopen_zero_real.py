@@ -32,7 +32,8 @@ from ident_service.model.base_parameters import base_parameters
 NAME, RATE, KP, KD = "relative", 50.0, 100.0, 16.0
 HOME = {"shoulder": 0.3, "elbow": -0.2}  # so that a zero that were ignored would show in every parameter
 
-pytestmark = [pytest.mark.slow, pytest.mark.realtime, pytest.mark.timeout(600)]
+# In lock step, tests/runs/test_zero.py does the same for every change.
+pytestmark = [pytest.mark.slow, pytest.mark.realtime, pytest.mark.campaign, pytest.mark.timeout(600)]
 
 
 def test_a_zeroed_arm_is_identified_and_one_that_was_switched_off_is_refused(
