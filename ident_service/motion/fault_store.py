@@ -145,7 +145,11 @@ class FaultStore:
             pid, run, began = int(mark["pid"]), str(mark["run"]), float(mark["began"])
         except (KeyError, TypeError, ValueError) as error:
             raise self._damaged(self._mark, error) from None
-        return *rows, StoredFault(UNFINISHED, f"process {pid} died while it had the arm, in the run {run}", began)
+        return *rows, StoredFault(
+            UNFINISHED,
+            f"process {pid} died, or could not store why it stopped, while it had the arm, in the run {run}",
+            began,
+        )
 
     def _rows(self) -> tuple[StoredFault, ...]:
         content = self._read(self._faults)

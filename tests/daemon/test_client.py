@@ -204,7 +204,7 @@ def test_a_daemon_that_ends_says_what_becomes_of_the_motion(tmp_path: Path) -> N
 
 
 def test_every_kind_that_the_api_tells_is_an_error_of_the_tree() -> None:
-    source = "".join(path.read_text() for path in (ROOT / "ident_service" / "service" / "api").glob("*.py"))
+    source = "".join(path.read_text() for path in (ROOT / "ident_service" / "daemon").rglob("*.py"))
     told = set(re.findall(r"""(?:\d{3}, |: \()"([A-Z][a-z]+[A-Za-z]*)",""", source))
     told |= {
         HTTPStatus(int(code)).phrase.title().replace(" ", "") for code in re.findall(r"HTTPException\((\d+)", source)

@@ -30,7 +30,7 @@ from sim_backend.plant_status import PlantStatus, read_status
 PATIENCE = 90.0  # s of the machine's time; nothing is judged by it but what never happens
 STARTING = 4.0  # s that a run takes before it moves, about
 TAG = "IDENT_KILL_TAG"
-VICTIMS = {"parent": "ident_service", "recorder": "record.recorder_loop", "motion": "motion.process"}
+VICTIMS = {"parent": "ident_service", "recorder": "recordings.recorder_main", "motion": "motion.process"}
 # What the next run is told of a victim that was killed while the arm moved.
 FAULT = {"parent": "lease_lost", "recorder": "recorder_behind", "motion": "motion_process"}
 MOTION = "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}"

@@ -16,10 +16,10 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from ident_service.motion.command_channel import ControlFile
-from ident_service.motion.fault_store import CONTROLS, FaultFile
+from ident_service.motion.fault_store import CONTROLS, FaultStore
 folder = Path(sys.argv[1])
 ControlFile.take(folder / CONTROLS, None)
-FaultFile(folder).began(Path("runs/7"))
+FaultStore(folder).began(Path("runs/7"))
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
@@ -48,7 +48,7 @@ def test_who_is_killed_while_the_arm_moves_leaves_a_fault(folder: Path) -> None:
     subprocess.run([sys.executable, "-c", KILLED, str(folder)], check=False)
     faults = FaultStore(folder)
     (cause,) = faults.latched().values()
-    assert cause.endswith("died while it had the arm, in the run runs/7")
+    assert cause.endswith("while it had the arm, in the run runs/7")
     with ControlFile.take(folder / CONTROLS, None), pytest.raises(MotionRefused, match="motion_process"):
         faults.began(Path("runs/8"))
     assert faults.acknowledge("motion_process") == cause
