@@ -199,6 +199,21 @@ def test_few_modules_serve_a_single_other() -> None:
     assert len(single) <= MOST_WITH_ONE_IMPORTER, "\n".join(sorted(single))
 
 
+# First words of a sentence that only its author can finish: a docstring opens with a verb and its object, or a noun.
+RIDDLES = {"What", "Who", "Whoever", "Whether", "As", "Of", "That", "How", "Where", "When", "Which"}
+
+
+def test_no_docstring_opens_like_a_riddle() -> None:
+    found = []
+    for file in python_files():
+        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                words = (ast.get_docstring(node) or "-").split()
+                if words[0].rstrip(",:") in RIDDLES:
+                    found.append(f"{file}: {' '.join(words[:8])} ...")
+    assert found == []
+
+
 def test_the_verifier_needs_the_standard_library_alone() -> None:
     modules = {found.module for found in imports_in((ROOT / ONE_FILE).read_text(encoding="utf-8"), ONE_FILE)}
     assert {module.split(".")[0] for module in modules} <= sys.stdlib_module_names
