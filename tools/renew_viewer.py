@@ -22,7 +22,7 @@ FILES = {
     "package/dist/rapidoc-min.js.LICENSE.txt": "rapidoc-min.js.LICENSE.txt",
     "package/LICENSE.txt": "LICENSE.txt",
 }
-PLACE = Path(__file__).resolve().parents[1] / "ident_service" / "service" / "pages" / "vendored"
+PLACE = Path(__file__).resolve().parents[1] / "ident_service" / "daemon" / "web" / "vendored"
 
 
 def main(words: list[str]) -> None:

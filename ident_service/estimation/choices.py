@@ -124,7 +124,7 @@ def held_out_error(blocks: Sequence[Information], weights: Array) -> float:
     """
     if len(blocks) < _PARTS:
         return np.inf
-    parts = np.array_split(np.arange(len(blocks)), _PARTS)
+    parts = [part.tolist() for part in np.array_split(np.arange(len(blocks)), _PARTS)]
     errors = torques = 0.0
     for number, part in enumerate(parts):
         rest = [blocks[index] for other, indices in enumerate(parts) if other != number for index in indices]

@@ -340,8 +340,7 @@ class RingWriter:
         self._words[WRITER_PID] = os.getpid()
         # A record is put together here, so that it stands in shared memory half done for one copy only.
         self._stage = bytearray(self.memory.slot_bytes - 8)
-        vectors = np.frombuffer(self._stage, np.float64, VECTORS * joints, AT_VECTORS)
-        vectors = vectors.reshape(VECTORS, joints)
+        vectors = np.frombuffer(self._stage, np.float64, VECTORS * joints, AT_VECTORS).reshape(VECTORS, joints)
         self._position, self._velocity, self._torque, self._q_reference, self._dq_reference, self._measured = vectors
         behind = AT_VECTORS + 8 * VECTORS * joints
         self._age = np.frombuffer(self._stage, np.int64, joints, behind)
