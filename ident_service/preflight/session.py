@@ -204,6 +204,9 @@ class Session:
         self._words: tuple[int, ...] = ()
         self._friction = still
         self._coupling = model.chain.coupling
+        # With a load, or drives that share joints, the model's gravity is less well known: see `follow`.
+        coupled = not np.array_equal(self._coupling, np.eye(len(self._coupling)))
+        self._averages = coupled or model.config.payload is not None
         to_drives = np.linalg.inv(self._coupling).T
         self._stiffness = to_drives**2 @ (limits.kp * np.diag(self.mass))
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
@@ -257,7 +260,7 @@ class Session:
             if learning and setpoint.velocity.any():
                 learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
             if elapsed >= seconds:
-                if learned:
+                if learned and self._averages:
                     # What the model lacks of gravity is taken for friction on one way, and against it on the other.
                     # The first half of a way is where it is still being learned.
                     halves = [np.mean(way[len(way) // 2 :], axis=0) for way in learned.values()]
