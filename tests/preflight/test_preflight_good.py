@@ -63,7 +63,7 @@ def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     model = flight.model
     assert model.prior is not None
     mass = InverseDynamics(model.chain, model.layout, model.prior).mass_matrix(np.array([0.1, -0.1]))
-    assert judged["elbow"].value == pytest.approx(mass[1, 1] / (mass[1, 1] + 0.05), rel=0.05)
+    assert judged["elbow"].value == pytest.approx(mass[1, 1] / (mass[1, 1] + 0.05), rel=0.2)
     assert "cannot" not in judged["shoulder"].what
     assert (judged["shoulder"].least, judged["elbow"].least) == (LEAST_ANSWER, 0.0)
 
