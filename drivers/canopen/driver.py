@@ -87,7 +87,7 @@ class StopCommand:
         word, drives, self._untold = QUICK_STOP if self.braking else DISABLE_VOLTAGE, self._untold, []
         for number in drives:
             try:
-                buses.control(number, word)
+                buses.control_stop(number, word)
             except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
                 self._untold.append(number)
 
@@ -420,7 +420,7 @@ class CanopenArm(Arm):
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
             raise
         buses.forget_events()  # of the states that drives went through
-        self._enabled = True
+        self._enabled = buses.enabled = True
 
     def reset(self) -> None:
         """Clear the faults that drives have latched; nothing is energised.

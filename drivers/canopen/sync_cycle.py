@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from drivers.can.bus_state import EventCode
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
+from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import worst
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
@@ -34,10 +35,10 @@ from drivers.canopen.cia402 import (
     NmtState,
     emergency_words,
 )
-from drivers.canopen.object_dictionary import CST
+from drivers.canopen.object_dictionary import CST, Entry
 from drivers.canopen.pdo_codec import BusCodec, Drive
 from drivers.canopen.pdo_mapping import GUARD_EARLY, HEARTBEAT, SDO_REPLY, SDO_REQUEST, BusProfile
-from drivers.canopen.sdo import TIMEOUT, Objects
+from drivers.canopen.sdo import TIMEOUT, Objects, upload_request
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 
@@ -47,6 +48,7 @@ LISTEN = 0.12  # s before we send anything; another host's heartbeat comes withi
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+_SILENT = 2  # cycles without a position, after which a drive may have left `operational`
 _MISSED = 0.25  # of a period late, and the slot is left to the next
 _DOUBT = 0.25  # of a period: sending a SYNC takes less, unless this computer stalls
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
@@ -73,6 +75,8 @@ class Buses:
         stamp_doubt_ns: of the last cycle, see `Sample`.
         modes: of operation, that control words of each drive come with.
         withheld: kinds of watchdogs that are not fed, so that they can be seen to act.
+        enabled: whether the drives have been energised in this session; from then on those that miss cycles are asked
+            for their status word, and stopped by SDO too.
     """
 
     def __init__(self, profiles: Sequence[BusProfile], links: Sequence[Link], period_ns: int) -> None:
@@ -102,6 +106,8 @@ class Buses:
         self._heartbeat_period_ns = min(round(0.5e9 * profile.heartbeat_host) for profile in profiles)
         self._heartbeat_ns = 0
         self.withheld: set[str] = set()
+        self.enabled = False
+        self._asked = 0
         # When each guarded drive is asked next, one after the other: remote frames in a row would delay a cycle.
         self._guards: dict[int, GuardedNode] = {}
         for number, (codec, _) in self._at.items():
@@ -130,6 +136,18 @@ class Buses:
         """Send a control word to one drive."""
         codec, link = self._at[number]
         link.send(codec.control_word(self.drives[number].node, word, self.modes[number]))
+
+    def control_stop(self, number: int, word: int) -> None:
+        """Send a control word that stops; by SDO too where a drive may have left `operational`, deaf to RPDOs."""
+        self.control(number, word)
+        codec, link = self._at[number]
+        drive = self.drives[number]
+        if self.enabled and (drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL)):
+            link.send(codec.control_download(drive.node, word))
+
+    def ask(self, number: int, entry: Entry) -> None:
+        """Send the upload of an entry of up to four bytes; the answer comes with a later cycle (`Drive.uploads`)."""
+        self._at[number][1].send(Frame(SDO_REQUEST + self.drives[number].node, upload_request(entry)))
 
     def objects(self, number: int) -> Objects:
         """Return the object dictionary of one drive, usable as long as nothing streams."""
@@ -270,8 +288,20 @@ class Buses:
         self.complete = all(codec.complete for codec in self.codecs)
         if not self.complete:
             self.lost += sum(not drive.answered for drive in self.drives)
+            self._ask_silent()
         self.keep_alive()
         return stamp_ns
+
+    def _ask_silent(self) -> None:
+        """Ask the drive that tells nothing any more for its status word: out of `operational` it still answers SDOs.
+
+        A drive whose watchdog was tried may end there, and whether it has let go must be heard of. One drive a cycle;
+        none that has booted, as it has no power and must be configured first.
+        """
+        silent = [number for number, drive in enumerate(self.drives) if drive.age >= _SILENT and not drive.boots]
+        if self.enabled and silent:
+            self._asked += 1
+            self.ask(silent[self._asked % len(silent)], od.STATUS_WORD)
 
     def keep_alive(self) -> None:
         """Send the host's heartbeat at half of its period, so that a late one is not missed; poll guarded drives."""

@@ -90,6 +90,7 @@ FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motio
 FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by far
 BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
 _CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
+MISSING = 2  # cycles in a row without its position, after which a joint's drive may have left on purpose
 RELEASE = 0.5  # s over which torque is led to zero
 SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and torque is taken off at once
 
@@ -276,7 +277,9 @@ class Session:
         """Check a cycle in which a signal is withheld from drives on purpose, and compute the next torque.
 
         What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
-        have given up torque, but for their position limits. Every other joint is held and guarded as before.
+        have given up torque, but for their position limits. Every other joint is held and guarded as before. A drive
+        that misses its host may leave `operational` and tell no position any more: its joints stand where they were
+        seen last, and the caller says how long that may go on.
 
         Args:
             sample: of this cycle.
@@ -288,7 +291,16 @@ class Session:
             ArmFault: the guard found something that is more than a warning.
         """
         self._rows.append((sample, setpoint))
-        undisturbed = replace(sample, status=self._words, events=(), torque=self._torque, torque_difference=None)
+        given_up = given_up | (sample.age >= MISSING)
+        undisturbed = replace(
+            sample,
+            status=self._words,
+            events=(),
+            torque=self._torque,
+            torque_difference=None,
+            valid=sample.valid | given_up,
+            age=np.where(given_up, 0, sample.age),
+        )
         there = np.where(given_up, sample.position, setpoint.position)
         going = np.where(given_up, 0.0, setpoint.velocity)
         asked = Setpoint(there, going, np.where(given_up, 0.0, setpoint.acceleration))
