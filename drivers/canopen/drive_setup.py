@@ -21,7 +21,7 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, entry_of, where
 from drivers.canopen.cia402 import POWER_OFF, state_of
 from drivers.canopen.motor_units import Coordinates, torque_limit_counts
-from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused, WriteNotVerified, optional
 from drivers.canopen.stored_zero import Zeros
@@ -143,7 +143,7 @@ LIMIT_SLACK = 0.05  # rad or m by which the drives' position limits exceed the j
 _FIRMWARE = 0x100A
 _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
-_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two reads
+_MODE_PATIENCE, _MODE_AGAIN_NS = 0.5, 10_000_000  # s for drives that show it while off, ns between two reads
 _ROUNDING = 1e-6
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
@@ -311,11 +311,11 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
     return f"node {objects.node}: {words}, firmware {firmware}"
 
 
-def configure(objects: Objects, setup: DriveConfiguration) -> int:
+def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
 
     Returns:
-        The mode of operation (6060h), which is sent with every control word.
+        The mode of operation, which is sent with every control word.
 
     Raises:
         DriverError: it lacks, refuses or forgets something; the message names the entry and says why.
@@ -340,8 +340,7 @@ def configure(objects: Objects, setup: DriveConfiguration) -> int:
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):
             objects.ensure_if_there(write)
-    _mode(objects, setup)
-    return setup.torque.mode if setup.torque.by is None else objects.read(od.MODE)
+    return _mode(objects, setup)
 
 
 def _timing(objects: Objects, setup: DriveConfiguration) -> None:
@@ -374,18 +373,16 @@ def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
         objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
 
 
-def _mode(objects: Objects, setup: DriveConfiguration) -> None:
-    """Set the mode of operation, and wait until the drive reports it, which may take some time."""
-    by, clock = setup.torque.by, objects.clock
+def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
+    """Set the mode of operation, and give the drive a moment to report it; before it is enabled it must have."""
+    by, clock, mode = setup.torque.by, objects.clock, setup.torque.mode
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
-    if not objects.holds(wanted := Write(entry, setup.torque.mode)):
+    if not objects.holds(wanted := Write(entry, mode)):
         objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
-    last = clock.now_ns() + round(_MODE_PATIENCE * 1e9)
-    while (mode := objects.read(display)) != setup.torque.mode:
-        if clock.now_ns() > last:
-            words = f"is in mode {mode} ({display.index:04X}h) although {setup.torque.mode} was set"
-            raise DriverError(f"node {objects.node}: {words}")
+    last = clock.now_ns() + (round(_MODE_PATIENCE * 1e9) if setup.can.family.mode_shown == "off" else 0)
+    while objects.read(display) != mode and clock.now_ns() < last:
         clock.sleep_until_ns(clock.now_ns() + _MODE_AGAIN_NS)
+    return OperationMode(mode if by is None else objects.read(od.MODE), display, mode)
 
 
 def _mode_entry(text: str) -> Entry:

@@ -414,7 +414,9 @@ class CanopenArm(Arm):
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
-            steps = EnableSequence(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
+            buses.forget_modes()
+            tell = self._names, self._driver.bring_up, now_ns, reports, option, buses.other_modes
+            steps = EnableSequence(buses.drives, *tell)
             self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)

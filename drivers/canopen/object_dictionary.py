@@ -154,6 +154,22 @@ PERIOD_NUMBER = Entry(0x60C2, 1, Kind.U8, "interpolation period", "10^PERIOD_POW
 PERIOD_POWER = Entry(0x60C2, 2, Kind.I8, "power of ten of the interpolation period")
 SUPPORTED_MODES = Entry(0x6502, 0, Kind.U32, "supported modes")
 
+
+@dataclass(frozen=True)
+class OperationMode:
+    """Represent a mode of operation: the value sent with control words (6060h), and the entry that shows it in effect.
+
+    Attributes:
+        sent: in 6060h.
+        display: entry that tells the mode in effect.
+        wanted: value of `display` in that mode.
+    """
+
+    sent: int
+    display: Entry
+    wanted: int
+
+
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h
 CST_SUPPORTED = 1 << 9  # in 6502h
 

@@ -86,7 +86,8 @@ class MakersWatchdog(Section):
 class Family(Section):
     """Known properties of a family of drives.
 
-    `refuse` is the sentence with which drives without a torque mode are refused. `sources` says for every other key
+    `refuse` is the sentence with which drives without a torque mode are refused. `mode_shown` says in which state a
+    mode of operation takes effect (6061h): already while the drive is off, or only when it is switched on. `sources` says for every other key
     where it is from; `proved` whether somebody has run it on hardware.
     """
 
@@ -100,6 +101,7 @@ class Family(Section):
     speed_limit: tuple[EntryText, ...] = ()
     dummies: tuple[Literal["0003", "0006", "0005", "0002"], ...] | None = None
     watchdog: MakersWatchdog | None = None
+    mode_shown: Literal["off", "switched_on"] = "off"
     notes: str = ""
     sources: dict[str, Annotated[str, Field(min_length=1)]]
 

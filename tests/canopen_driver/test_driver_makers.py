@@ -229,3 +229,36 @@ sources: {match: a test, unit: a test, torque_limit: a test}
         held = [face.objects.number(0x6076) for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]
     assert held == [250_000, 250_000]
     np.testing.assert_allclose(sample.torque, 0.1, atol=3e-4)
+
+
+LATE = """
+name: late
+proved: no
+match: {vendor: 0xFB, product: [0x65510000]}
+unit: {rated: 6076:0/u32, unit: uNm}
+torque_limit: [{entry: 3001:2/u32, per: 3001:1/u32}]
+mode_shown: switched_on
+sources: {match: a test, unit: a test, torque_limit: a test, mode_shown: a test}
+"""
+
+
+def test_a_mode_that_shows_only_when_switched_on_is_waited_for_before_enabling() -> None:
+    bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds", profiles=[{"name": "late.yaml", "text": LATE}]))
+    with bench.arm as arm:
+        assert 10 not in [face.objects.number(0x6061) for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]
+        arm.enable()
+        assert [face.objects.number(0x6061) for face in bench.behind.emulator.faces] == [10, 10]  # type: ignore[attr-defined]
+
+
+def test_a_drive_that_falls_into_another_mode_is_not_enabled() -> None:
+    """As an iPOS may under power; the mode was the wanted one while it was configured."""
+    bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds"))
+    with bench.arm as arm:
+        face = bench.behind.emulator.faces[1]
+        face._firmware.due = lambda name: face._control(face.objects.number(0x6040)) if name == "control word" else None  # type: ignore[attr-defined]
+        face.objects.put(0x6061, 1)  # type: ignore[attr-defined]
+        with pytest.raises(
+            DriverError, match=r"not enabled: slide: drive 2 is in mode 1 \(6061h\) although 10 was set"
+        ):
+            arm.enable()
+        assert "operation enabled" not in bench.states
