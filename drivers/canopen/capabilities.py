@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -107,12 +107,14 @@ class DriveEntries:
         values: of the entries, by key, where known.
         unread: why one that it seems to have could not be read, by key.
         asked: whether the drive was asked; else its data sheet foretells.
+        firmware: its software version (100Ah), empty where it does not tell it.
     """
 
     there: frozenset[int]
     values: Mapping[int, int]
     unread: Mapping[int, str] = field(default_factory=dict)
     asked: bool = True
+    firmware: str = ""
 
     def has(self, entry: Entry) -> bool:
         """Tell whether the drive has an entry."""
@@ -174,6 +176,20 @@ class Capabilities:
     changes: tuple[Problem, ...]
     notes: tuple[str, ...]
 
+    @property
+    def summary(self) -> str:
+        """Describe what a preflight ticket is for: mode, size of a count, limits, watchdogs, status reports."""
+        unknown = "unknown"
+        torque = unknown if self.torque is None else f"mode {self.torque.mode} by {named(self.torque.target)}"
+        count = unknown if self.count is None else f"{self.count:.6g} N m"
+        limit = unknown if self.limit is None else named(self.limit.entry)
+        speed = "none" if self.speed is None else where(self.speed)
+        status = "by timer" if self.event else "by SYNC"
+        return (
+            f"{self.family.name}, {torque}, a count {count}, torque limit {limit}, speed limit {speed}, "
+            f"watchdogs {' '.join(self.watchdogs) or 'none'}, status {status}"
+        )
+
     def require(self, node: int) -> None:
         """Raise DriverError where the drive is to be refused, with everything that is wrong."""
         if wrong := (*self.problems, *self.changes):
@@ -218,7 +234,16 @@ def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()
     objects.read_bytes(od.DEVICE_TYPE.index, 0, od.DEVICE_TYPE.name)  # one that is silent is not asked for all the rest
     first = _asked(objects, (od.DEVICE_TYPE, od.VENDOR, od.PRODUCT))
     family = family_of(first.identity, own)
-    return family, _asked(objects, _entries(family, drive))
+    return family, replace(_asked(objects, _entries(family, drive)), firmware=_firmware(objects))
+
+
+def _firmware(objects: Objects) -> str:
+    try:
+        return objects.read_bytes(od.FIRMWARE_INDEX, 0, "software version").decode("ascii", "replace").strip("\0 ")
+    except BusError:
+        raise
+    except DriverError:
+        return ""
 
 
 def entries_from_sheet(
@@ -303,6 +328,9 @@ def assess(
         elif drive.watchdog not in watchdogs:
             words = f"{drive.watchdog}: this drive lacks it; it has {', '.join(watchdogs)}"
             changes.append(Problem("drives.watchdog", words))
+        if driver.zero == "at_home" and not found.has(od.ZERO_COUNTS):
+            words = "at_home: it has no 1020h to keep a zero in; its encoder must know its position (absolute)"
+            changes.append(Problem("driver.zero", words))
         if driver.torque_reports != "none" and not found.has(od.TORQUE_ACTUAL):
             changes.append(Problem("driver.measured_torque", "it does not tell its torque (6077h): set it to none"))
     event = found.has(pdo_entry(od.TPDO_PERIOD, 2))

@@ -379,7 +379,8 @@ def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
     if not objects.holds(wanted := Write(entry, mode)):
         objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
-    last = clock.now_ns() + (round(_MODE_PATIENCE * 1e9) if setup.can.family.mode_shown == "off" else 0)
+    shows = setup.can.family.mode_shown == "off" and not objects.dry
+    last = clock.now_ns() + (round(_MODE_PATIENCE * 1e9) if shows else 0)
     while objects.read(display) != mode and clock.now_ns() < last:
         clock.sleep_until_ns(clock.now_ns() + _MODE_AGAIN_NS)
     return OperationMode(mode if by is None else objects.read(od.MODE), display, mode)

@@ -544,7 +544,9 @@ class CanopenArm(Arm):
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
             identity = identify(objects, drive.identity)
-            own = self._driver.reactions, self._quick_stop, motors[number], required(objects, self._driver, number)
+            can = required(objects, self._driver, number)
+            identity += f"; {can.summary}"  # a preflight ticket is for what was found of the drive
+            own = self._driver.reactions, self._quick_stop, motors[number], can
             self._begun = number + 1
             buses.modes[number] = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
             if self._zeros is not None:

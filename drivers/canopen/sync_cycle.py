@@ -386,7 +386,7 @@ class EnableSequence:
             now_ns: of the link's clock.
             reports: least and longest time between two status reports of a drive [s].
             quick_stop: 605Ah; drives that stay in quick stop hold the arm, and are enabled out of it with the others.
-            other_modes: has drives asked for their mode of operation; returns what those in another one tell, by number.
+            other_modes: has drives asked for their mode; returns what those in another one tell, by number.
         """
         self._other_modes = other_modes
         self._stays = quick_stop in STAY_IN_QUICK_STOP

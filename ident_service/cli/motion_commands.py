@@ -214,6 +214,23 @@ def _files(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+def add_dry_run(sub: Parser) -> None:
+    """Add the option `--dry-run` to a verb that configures drives."""
+    text = "move and write nothing: list what opening the arm would write into its drives (exit code 3: one is refused)"
+    sub.add_argument("--dry-run", action="store_true", help=text)
+
+
+def dry_run(arguments: argparse.Namespace) -> Answer:
+    """Return what opening the arm of a verb would write into its drives; nothing is written and nothing moves."""
+    from ident_service.config.load import load_arm
+    from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
+
+    config = load_arm(arguments.arm)
+    planned = planned_configuration(config)
+    code = VERDICT_NO if any(one.refused for one in planned) else DONE
+    return code, planned_text(config, planned), planned_document(config, planned)
+
+
 def add_can_log(sub: Parser) -> None:
     """Add the option `--can-log` to a verb that moves an arm."""
     sub.add_argument(
@@ -299,6 +316,7 @@ def add(verbs: VerbList) -> None:
         "--scale", action="store_true", help="move nothing: a person turns each joint by hand by an angle that is typed"
     )
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    add_dry_run(sub)
     add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
@@ -345,6 +363,7 @@ def _motion(sub: Parser) -> None:
         "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
     )
     add_can_log(sub)
+    add_dry_run(sub)
     add_lease(sub)
 
 
@@ -374,6 +393,8 @@ def _watch(arguments: argparse.Namespace) -> Answer:
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.arm_factory import make_arm
@@ -440,6 +461,8 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
 def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
     """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
@@ -472,7 +495,7 @@ def _target(arguments: argparse.Namespace) -> Target | None:
 
 
 def _rehearse(arguments: argparse.Namespace) -> Answer:
-    if arguments.no_key:
+    if arguments.no_key or arguments.dry_run:
         return _run(arguments)
     if arguments.lease_from_stdin:
         from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS

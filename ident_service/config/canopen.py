@@ -356,6 +356,22 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
     return [float(speed) for speed in motors * 60.0 / (2.0 * math.pi)]
 
 
+def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[float]:
+    """Return the most that each joint can be given when the others are given nothing [N m or N].
+
+    Args:
+        driver: the section `driver`, with as many drives as ratios.
+        transmission: the arm's.
+    """
+    size = len(transmission.ratios)
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    motors = np.array([drive.max_torque for drive in driver.drives])
+    # tau_motor = J^-T tau: a joint alone asks each of its motors for a share.
+    shares = np.abs(np.linalg.inv(np.array(transmission.ratios)[:, None] * coupling))  # (joints, motors)
+    with np.errstate(divide="ignore"):
+        return [float(most) for most in (motors / np.where(shares > 1e-12, shares, 0.0)).min(axis=1)]
+
+
 def quick_stop_decelerations(
     driver: CanopenDriver, transmission: Transmission, accelerations: Sequence[float | None]
 ) -> list[int | None]:

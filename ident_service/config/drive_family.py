@@ -87,8 +87,8 @@ class Family(Section):
     """Known properties of a family of drives.
 
     `refuse` is the sentence with which drives without a torque mode are refused. `mode_shown` says in which state a
-    mode of operation takes effect (6061h): already while the drive is off, or only when it is switched on. `sources` says for every other key
-    where it is from; `proved` whether somebody has run it on hardware.
+    mode of operation takes effect (6061h): already while the drive is off, or only when it is switched on. `sources`
+    says for every other key where it is from; `proved` whether somebody has run it on hardware.
     """
 
     name: Annotated[str, Field(min_length=1)]

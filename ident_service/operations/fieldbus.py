@@ -6,8 +6,10 @@ are derived from the data sheet.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from ident_service.config.eds import data_sheet
 from ident_service.config.load import config_error
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
+from ident_service.recordings.files import write_atomically
 
 _HEAD = f"  {'frames':<28}{'COB-IDs':<12}{'bytes':>6}{'Hz':>7}{'one of them, us':>24}{'load of all, %':>24}"
 _UNDER = f"  {'':<53}{'least':>8}{'typical':>8}{'worst':>8}{'least':>8}{'typical':>8}{'worst':>8}"
@@ -536,6 +539,7 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
             "family": can.family.name,
             "proved": can.family.proved,
             "asked": can.found.asked,
+            "firmware": can.found.firmware,
             "identity": {name: can.found.get(entry) for name, entry in IDENTITY.items()},
             "mode": None if can.torque is None else can.torque.mode,
             "target": None if can.torque is None else can.torque.target,
@@ -552,3 +556,46 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
         },
         "facts": _facts(one, found),
     }
+
+
+FILE = "drives.json"  # in an arm's folder
+_KEPT_FORMAT = "ident-drives"
+
+
+def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
+    """Keep what a probe found of an arm's drives, and return what differs from the probe before, in words.
+
+    Args:
+        path: of the file, one for each arm.
+        document: `probe_document` of drives that were asked; those that did not answer keep what was known of them.
+
+    Raises:
+        UsageError: the file was damaged by somebody.
+    """
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        known = dict(before["drives"]) if before["format"] == _KEPT_FORMAT else {}
+    except FileNotFoundError:
+        known = {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: cannot be read ({error}); remove the file, and probe again") from None
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    words = list[str]()
+    for one in document["drives"]:
+        if one["silent"] or one["can"] is None:
+            continue
+        old, place = known.get(one["title"]), f"{one['title']}, node {one['node']}"
+        if old is not None:
+            words += [f"{place}: {what} (probe of {old['when']})" for what in _different(old["can"], one["can"])]
+        known[one["title"]] = {"when": now, "node": one["node"], "can": one["can"]}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps({"format": _KEPT_FORMAT, "version": 1, "drives": known}, indent=1) + "\n")
+    return words
+
+
+def _different(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    if old["identity"] != new["identity"]:
+        return ["another drive than at the last probe"]
+    return [
+        f"{key} was {old.get(key)!r}, is {new[key]!r}" for key in new if key != "asked" and old.get(key) != new[key]
+    ]

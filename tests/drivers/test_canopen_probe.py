@@ -23,7 +23,7 @@ from ident_service.config.drive_family import family_from
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, DriverError, UsageError
-from ident_service.operations.fieldbus import Probe, bus_probe, probe_document, probe_text
+from ident_service.operations.fieldbus import Probe, bus_probe, keep_outcome, probe_document, probe_text
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.process import emulate
 
@@ -250,17 +250,22 @@ def arm_file(folder: Path, *, rated: float) -> Path:
 @needs_sheets
 @pytest.mark.slow
 def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    there, other = arm_file(tmp_path, rated=0.5), arm_file(tmp_path, rated=0.0005)
+    there, other, state = (
+        arm_file(tmp_path, rated=0.5),
+        arm_file(tmp_path, rated=0.05),
+        ["--state", str(tmp_path / "s")],
+    )
     end = threading.Event()
     thread = threading.Thread(target=lambda: emulate(load_arm(there), stop_requested=end.is_set))
     thread.start()
     try:
         until = time.monotonic() + 60.0
-        while main(["bus", "probe", str(there)]) != DONE:  # the drives are not there yet
+        while main(["bus", "probe", str(there), *state]) != DONE:  # the drives are not there yet
             assert "No SDO response received" in capsys.readouterr().out
             assert time.monotonic() < until
         assert capsys.readouterr().out.startswith("mixed: every drive can be driven; nothing was written\n")
-        assert main(["bus", "probe", str(other), "--json"]) == VERDICT_NO
+        first = json.loads((tmp_path / "s" / "arms" / "mixed" / "drives.json").read_text())
+        assert main(["bus", "probe", str(other), "--json", *state]) == VERDICT_NO
     finally:
         end.set()
         thread.join()
@@ -268,7 +273,31 @@ def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.C
     for drive in document["drives"]:
         (change,) = drive["can"]["changes"]
         assert change["where"] == "drives.rated_torque"
-        assert "wrong by 1000, which is another unit" in change["why"]
+        assert "wrong by 10, which is another unit" in change["why"]
+    assert [drive["can"]["identity"]["vendor"] for drive in first["drives"].values()] == [0xFB, 0xFF]
+    assert not [line for line in document["changed"] if "changes was" not in line]  # the drives are the same
+
+
+@needs_sheets
+def test_a_drive_that_cannot_keep_a_zero_is_told_so() -> None:
+    config = arm_of("maxon_epos4_50-8_0110h.eds")
+    at_home = config.model_copy(update={"driver": config.driver.model_copy(update={"zero": "at_home"})})  # type: ignore[union-attr]
+    text = probed(Bench(config), at_home)
+    assert "to change       driver.zero: at_home: it has no 1020h" in text
+
+
+def test_what_a_probe_found_is_kept_and_what_differs_is_told(tmp_path: Path) -> None:
+    path, can = tmp_path / "arms" / "a" / "drives.json", {"identity": {"vendor": 1}, "mode": 10, "asked": True}
+    drive = {"title": "drive 1", "node": 3, "silent": "", "can": can}
+    assert keep_outcome(path, {"drives": [drive]}) == []
+    assert keep_outcome(path, {"drives": [drive | {"silent": "no answer"}]}) == []
+    (line,) = keep_outcome(path, {"drives": [drive | {"can": can | {"mode": 4}}]})
+    assert line.startswith("drive 1, node 3: mode was 10, is 4 (probe of ")
+    (line,) = keep_outcome(path, {"drives": [drive | {"can": can | {"identity": {"vendor": 2}}}]})
+    assert "another drive than at the last probe" in line
+    path.write_text("{")
+    with pytest.raises(UsageError, match=r"cannot be read .*remove the file"):
+        keep_outcome(path, {"drives": [drive]})
 
 
 def test_emulated_drives_need_files_that_are_there(capsys: pytest.CaptureFixture[str]) -> None:
