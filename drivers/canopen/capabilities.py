@@ -18,7 +18,7 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.object_dictionary import Entry, Kind, pdo_entry
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
 from ident_service.config.canopen import CanopenDrive, CanopenDriver, WatchdogKind
-from ident_service.config.drive_family import Family, TorqueLimit, TorquePath, family_from
+from ident_service.config.drive_family import Family, PositionPath, TorqueLimit, TorquePath, family_from
 from ident_service.config.eds import DataSheet
 from ident_service.errors import DriverError
 
@@ -94,7 +94,7 @@ _OPTIONAL: Sequence[tuple[Entry, str]] = (
 _OTHERS: Sequence[Entry] = (
     *(od.DEVICE_TYPE, od.PRODUCT, od.REVISION, od.SERIAL, od.SYNC_WINDOW, od.SYNC_OVERFLOW, od.GUARD_TIME),
     *(od.LIFE_FACTOR, od.HEARTBEAT_CONSUMER, od.HEARTBEAT_PRODUCER, od.RPDO_DEADLINE, pdo_entry(od.TPDO_PERIOD, 2)),
-    *(od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
+    *(od.TARGET_POSITION, od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
 )
 
 
@@ -149,7 +149,7 @@ class Capabilities:
     Attributes:
         family: that it belongs to.
         found: what it has.
-        torque: how torques are streamed; None for no way.
+        torque: how torques are streamed, or positions (`driver.streams`); None for no way.
         count: a count of the target [N m]; None where nothing tells it.
         limit: of the torque, in the drive; None for none.
         speed: entry of the largest speed; None where the drive has none.
@@ -164,7 +164,7 @@ class Capabilities:
 
     family: Family
     found: DriveEntries
-    torque: TorquePath | None
+    torque: TorquePath | PositionPath | None
     count: float | None
     limit: TorqueLimit | None
     speed: Entry | None
@@ -301,12 +301,14 @@ def assess(
     problems = [Problem(where(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not found.has(entry)]
     notes = [f"{where(entry)} is missing: {words}" for entry, words in _OPTIONAL if not found.has(entry)]
     notes += [f"cannot be read: {why}" for why in found.unread.values()]
-    torque = next((path for path in family.torque if _streams(path, found)), None)
+    positions = driver.streams == "position"
+    paths = ([family.position] if family.position else []) if positions else family.torque
+    torque = next((path for path in paths if _streams(path, found)), None)
     kind = found.get(od.DEVICE_TYPE)
     if kind is not None and kind & 0xFFFF != DRIVE_PROFILE:
         problems = [Problem("1000h", f"is {kind:08X}h, which is no drive of CiA 402")]
     elif torque is None:
-        problems = [Problem("6502h", family.refuse or _no_torque(family, found))]
+        problems = [Problem("6502h", _no_position(found) if positions else family.refuse or _no_torque(family, found))]
     elif kind is None and found.asked:
         problems.insert(0, Problem("1000h", "does not tell that it is a drive of CiA 402"))
     count = _count(family, found, drive)
@@ -318,6 +320,8 @@ def assess(
     watchdogs = tuple(_watchdogs(family, found, drive))
     changes: list[Problem] = []
     if torque is not None:
+        if positions and (family.unit is None or family.unit.rated is None):
+            problems.append(Problem("6077h", "nobody knows what a count of the torque that it measures is"))
         problems += _unit_problems(family, found, count)
         changes += _unit_changes(family, found, drive, count)
         if limit is None:
@@ -365,8 +369,8 @@ def named(text: str) -> str:
     return where(entry_of(text, ""))
 
 
-def _streams(path: TorquePath, found: DriveEntries) -> bool:
-    """Return whether a drive supports a way of streaming torques; where 6502h is unknown, it may."""
+def _streams(path: TorquePath | PositionPath, found: DriveEntries) -> bool:
+    """Return whether a drive supports a way of streaming; where 6502h is unknown, it may."""
     needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
     modes = found.get(od.SUPPORTED_MODES)
     supported = path.supported is None or modes is None or bool(modes >> path.supported & 1)
@@ -378,6 +382,14 @@ def _no_torque(family: Family, found: DriveEntries) -> str:
     said = "has no value" if modes is None else f"is {modes:X}h"
     lacking = sorted({named(p.target) for p in family.torque if not found.has(entry_of(p.target, ""))})
     return f"no torque mode: 6502h {said}" + (f", {', '.join(lacking)} missing" if lacking else "")
+
+
+def _no_position(found: DriveEntries) -> str:
+    modes = found.get(od.SUPPORTED_MODES)
+    said = "has no value" if modes is None else f"is {modes:X}h"
+    return f"no cyclic synchronous position mode: 6502h {said}" + (
+        "" if found.has(od.TARGET_POSITION) else ", 607Ah missing"
+    )
 
 
 def _limits(limit: TorqueLimit, found: DriveEntries) -> bool:

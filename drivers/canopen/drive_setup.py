@@ -32,9 +32,10 @@ from ident_service.config.canopen import (
     DriveIdentity,
     Reactions,
     motor_speeds,
+    motor_torques,
     quick_stop_decelerations,
 )
-from ident_service.config.drive_family import TorquePath
+from ident_service.config.drive_family import PositionPath, TorquePath
 from ident_service.errors import AnotherDrive, DriverError
 
 _SMALL = {0x0002: Kind.I8, 0x0005: Kind.U8}
@@ -157,11 +158,13 @@ class MotorLimits:
         positions: lowest and highest [counts], for a drive that heeds them; None where joints have none.
         speed: at which it turns when all joints move at their velocity limits [turns per minute].
         deceleration: 6085h, in the drive's unit; None where neither the drive's section nor the joints say one.
+        torque: that keeps its joints within their torque limits, whatever the others give [N m].
     """
 
     positions: tuple[int, int] | None
     speed: float = 0.0
     deceleration: int | None = None
+    torque: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -186,15 +189,24 @@ class DriveConfiguration:
     can: Capabilities
 
     @property
-    def torque(self) -> TorquePath:
-        """Return how torques are streamed to the drive."""
+    def torque(self) -> TorquePath | PositionPath:
+        """Return how torques, or positions, are streamed to the drive."""
         assert self.can.torque is not None  # noqa: S101 - else it has been refused
         return self.can.torque
 
     @property
     def limit_counts(self) -> int:
-        """Return the largest torque [counts of the target]."""
-        return torque_limit_counts(self.drive.max_torque, self.drive.rated_torque)
+        """Return the largest torque [per mille of rated torque].
+
+        Where positions are streamed the drive alone can keep the joints' limits; else the host does, cycle by cycle.
+        """
+        most = min(self.drive.max_torque, self.motor.torque) if self.positions else self.drive.max_torque
+        return torque_limit_counts(most, self.drive.rated_torque)
+
+    @property
+    def positions(self) -> bool:
+        """Return whether positions are streamed."""
+        return isinstance(self.can.torque, PositionPath)
 
     def watchdog(self) -> list[Write]:
         """Return the downloads that set a watchdog of the maker's."""
@@ -211,17 +223,25 @@ class DriveConfiguration:
         ]
 
     def hints(self) -> list[Write]:
-        """Return the downloads of the cycle and the position limits, for drives that want to know them.
+        """Return the downloads of the cycle and, in torque mode, the position limits, for drives that want to know them.
 
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
         todo = [Write(od.SYNC_PERIOD, self.period_us)]
-        if self.motor.positions is not None:
-            lowest, highest = self.motor.positions
-            todo += [Write(od.LOWER_LIMIT, lowest), Write(od.UPPER_LIMIT, highest)]
+        return todo if self.positions else [*todo, *self.walls(), *self.interpolation()]
+
+    def walls(self) -> list[Write]:
+        """Return the downloads of the position limits."""
+        if self.motor.positions is None:
+            return []
+        lowest, highest = self.motor.positions
+        return [Write(od.LOWER_LIMIT, lowest), Write(od.UPPER_LIMIT, highest)]
+
+    def interpolation(self) -> list[Write]:
+        """Return the downloads of the interpolation period; none where 8 bits do not hold it."""
         power = next(power for power in (-3, -4, -5, -6) if self.period_us % 10 ** (6 + power) == 0)
         number = self.period_us // 10 ** (6 + power)
-        return [*todo, Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)] if number <= 0xFF else todo
+        return [Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)] if number <= 0xFF else []
 
     @property
     def period_us(self) -> int:
@@ -230,10 +250,10 @@ class DriveConfiguration:
 
     def pdos(self) -> list[Pdo]:
         """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
-        target = entry_of(self.torque.target, "target torque", "counts")
+        target = entry_of(self.torque.target, "target position" if self.positions else "target torque", "counts")
         found = []
         for pdo in self.profile.pdos(self.drive.node):
-            own = tuple(target if slot == od.TARGET_TORQUE else slot for slot in pdo.slots)
+            own = tuple(target if slot in (od.TARGET_TORQUE, od.TARGET_POSITION) else slot for slot in pdo.slots)
             found.append(replace(pdo, slots=own))
             if od.STATUS_WORD in pdo.slots and not self.can.event:
                 found[-1] = replace(pdo, type=self.profile.status_syncs, inhibit=0, timer=0)
@@ -254,7 +274,8 @@ def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
     limits = found.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
     speeds = motor_speeds(gears, [joint.velocity for joint in joints])
     brakes = quick_stop_decelerations(driver, gears, [joint.acceleration for joint in joints])
-    return [MotorLimits(*one) for one in zip(limits, speeds, brakes, strict=True)]
+    torques = motor_torques(driver, gears, [joint.torque for joint in joints])
+    return [MotorLimits(*one) for one in zip(limits, speeds, brakes, torques, strict=True)]
 
 
 def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
@@ -337,6 +358,8 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
         (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
     for write in setup.watchdog():
         objects.ensure(write)
+    for write in setup.walls() + setup.interpolation() if setup.positions else ():
+        objects.ensure_if_there(write)  # here they count: a drive moves by them
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):
             objects.ensure_if_there(write)

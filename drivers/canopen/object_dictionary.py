@@ -134,6 +134,7 @@ VELOCITY = Entry(0x606C, 0, Kind.I32, "velocity", "drive's unit")
 TARGET_TORQUE = Entry(0x6071, 0, Kind.I16, "target torque", "per mille of rated torque")
 MAX_TORQUE = Entry(0x6072, 0, Kind.U16, "largest torque", "per mille of rated torque")
 MAX_CURRENT = Entry(0x6073, 0, Kind.U16, "largest current", "per mille of rated current")
+TARGET_POSITION = Entry(0x607A, 0, Kind.I32, "target position", "counts")
 TORQUE_DEMAND = Entry(0x6074, 0, Kind.I16, "torque demand", "per mille of rated torque")
 RATED_CURRENT = Entry(0x6075, 0, Kind.U32, "rated current", "mA")
 RATED_TORQUE = Entry(0x6076, 0, Kind.U32, "rated torque", "mN m")
@@ -172,6 +173,7 @@ class OperationMode:
 
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h
 CST_SUPPORTED = 1 << 9  # in 6502h
+CSP = 8  # cyclic synchronous position
 
 
 def pdo_entry(entry: Entry, number: int, sub: int | None = None) -> Entry:

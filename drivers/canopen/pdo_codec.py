@@ -189,7 +189,9 @@ class BusCodec:
         self._strangers: set[int] = set()
         self._foreign: set[int] = set()
         self._frames = [
-            _Packed(frame.cob_id, frame.drives, struct.Struct(f"<{len(frame.drives)}h").pack)
+            _Packed(
+                frame.cob_id, frame.drives, struct.Struct("<" + frame.target.kind.value[1:] * len(frame.drives)).pack
+            )
             for frame in profile.torque_frames
         ]
         self._sync = Frame(SYNC)
@@ -209,18 +211,18 @@ class BusCodec:
         self._ours |= {frame.cob_id for frame in profile.torque_frames}
 
     def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
-        """Return the frames that carry a torque to every drive of this bus.
+        """Return the frames that carry a torque, or a position, to every drive of this bus.
 
         Args:
-            counts: of all drives of the arm [per mille of rated torque], in the arm's order.
+            counts: of all drives of the arm [per mille of rated torque, or counts], in the arm's order.
 
         Raises:
-            DriverError: a torque that 16 bits do not hold, or too few of them; nothing is to be sent then.
+            DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.
         """
         try:
             return [Frame(one.cob_id, one.pack(*[counts[k] for k in one.drives])) for one in self._frames]
         except (struct.error, IndexError, TypeError) as error:
-            raise DriverError(f"bus {self.profile.number}: torques {list(counts)} cannot be sent: {error}") from None
+            raise DriverError(f"bus {self.profile.number}: targets {list(counts)} cannot be sent: {error}") from None
 
     def sync(self) -> Frame:
         """Return the SYNC frame, which starts a cycle: drives latch torques and sample positions."""

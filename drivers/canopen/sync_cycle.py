@@ -350,7 +350,7 @@ def _on_the_wire(profile: BusProfile) -> float:
     """Return how long the frames of a cycle take at most [s]."""
     lengths = [
         0,
-        *(2 * len(frame.drives) for frame in profile.torque_frames),
+        *(frame.length for frame in profile.torque_frames),
         *(sum(slot.kind.size for slot in profile.position_slots) for _ in profile.nodes),
     ]
     bus = profile.bus

@@ -50,6 +50,16 @@ class TorquePath(Section):
         return self
 
 
+class PositionPath(Section):
+    """Way to stream positions: a mode, its bit in 6502h, and the entry that takes the position [counts]."""
+
+    mode: Annotated[int, Field(strict=True, ge=-128, le=_MOST_MODE)]
+    supported: Annotated[int, Field(strict=True, ge=0, le=31)] | None = None
+    target: Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i32$")]
+    by: None = None
+    slope: None = None
+
+
 class TorqueUnit(Section):
     """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant."""
 
@@ -96,6 +106,7 @@ class Family(Section):
     match: Match = Match()
     refuse: str = ""
     torque: tuple[TorquePath, ...] = ()
+    position: PositionPath | None = None
     unit: TorqueUnit | None = None
     torque_limit: tuple[TorqueLimit, ...] = ()
     speed_limit: tuple[EntryText, ...] = ()

@@ -22,7 +22,7 @@ _ON = (0x23, 0x27)  # of the statusword: switched on, operation enabled
 _LOOP_NS, _MODE_NS = 1_000_000, 20_000_000
 _SOME_CONSTANT = 0.05  # N m/A, of a motor whose description has none
 # Objects without which a mode makes no sense, by the mode's number (CiA 402-2).
-_MODES = {1: (0x607A,), 3: (0x60FF,), 4: (0x6071, 0x6087), 6: (0x6098,), 10: (0x6071,)}
+_MODES = {1: (0x607A,), 3: (0x60FF,), 4: (0x6071, 0x6087), 6: (0x6098,), 8: (0x607A, 0x60C2), 10: (0x6071,)}
 _SERVO = 0x0002_0192
 
 
