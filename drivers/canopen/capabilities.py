@@ -313,6 +313,7 @@ def assess(
         problems.insert(0, Problem("1000h", "does not tell that it is a drive of CiA 402"))
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
+    notes += _other_limits(family, found, drive, limit)
     speeds = [entry_of(text, "largest speed", "turns per minute") for text in family.speed_limit]
     speed = next((entry for entry in speeds if found.has(entry)), None)
     if speed is None:
@@ -394,6 +395,18 @@ def _no_position(found: DriveEntries) -> str:
 
 def _limits(limit: TorqueLimit, found: DriveEntries) -> bool:
     return all(found.has(entry_of(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
+
+
+def _other_limits(
+    family: Family, found: DriveEntries, drive: CanopenDrive, chosen: TorqueLimit | None
+) -> Iterator[str]:
+    """Tell of further limits that are below the described torque: a drive keeps the lowest (Nanotec, 6071h)."""
+    most = 1000.0 * drive.max_torque / drive.rated_torque
+    for limit in family.torque_limit:
+        held = None if limit is chosen or limit.per else found.get(entry_of(limit.entry, ""))
+        if held is not None and held < most:
+            share = held * drive.rated_torque / 1000.0
+            yield f"{named(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
 
 
 def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | None:

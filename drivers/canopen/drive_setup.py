@@ -223,7 +223,7 @@ class DriveConfiguration:
         ]
 
     def hints(self) -> list[Write]:
-        """Return the downloads of the cycle and, in torque mode, the position limits, for drives that want to know them.
+        """Return the downloads of what drives want to know: the cycle and, in torque mode, the position limits.
 
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """

@@ -255,9 +255,9 @@ class CanopenDriver(ExtendedSection):
     says whether drives report the torque that they measure (6077h): with their positions, in every cycle
     (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
     object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the
-    host is gone. `profiles` are files of families of drives, which count before the shipped ones. `streams` says what the host
-    sends in every cycle: the torque of each drive, or its position (cyclic synchronous position), where the drives
-    close the position loop by themselves and tell the torque that they measure.
+    host is gone. `profiles` are files of families of drives, which count before the shipped ones. `streams` says
+    what the host sends in every cycle: the torque of each drive, or its position (cyclic synchronous position), where
+    the drives close the position loop by themselves and tell the torque that they measure.
     """
 
     kind: Literal["canopen"]

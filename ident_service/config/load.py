@@ -26,6 +26,7 @@ _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _ANOTHER_UNIT = (
     30.0  # times between a joint's torque limit and what its motors give: no choice of a limit is so far off
 )
+_POSITION_RATES = 100.0, 500.0  # Hz; slower the guard sees too little, faster a torque path is what a drive has
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 # Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.
 _LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
@@ -106,7 +107,8 @@ def disagreements(
                     f"driver.drives: joint {joints[k]} can be given {reach:.4g} by its gears and max_torque, but"
                     f" joints.{joints[k]}.torque is {limit:g}: {ratio:.3g} times apart, which is another unit or gear",
                 )
-    shares = driver.torque_frames == "shared" and any(
+    yield from _positions(driver, rate)
+    shares = driver.drives_a_frame > 1 and any(
         sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
     )
     if why := data_sheet(driver.eds.text).mistake:
@@ -129,6 +131,27 @@ def disagreements(
         yield ("driver", "profiles"), f"driver.profiles: {error}"
     if joints and len(joints) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"
+
+
+def _positions(driver: CanopenDriver, rate: float) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Yield what is inconsistent with drives that are given positions."""
+    if driver.streams != "position":
+        return
+    if driver.torque_reports != "cyclic":
+        yield (
+            ("driver", "measured_torque"),
+            "driver.measured_torque: drives that are given positions (driver.streams) must tell their torque in every"
+            " cycle, as nobody else knows it; leave it out, or set it to cyclic",
+        )
+    least, most = _POSITION_RATES
+    if not least <= rate <= most:
+        yield (
+            ("driver", "streams"),
+            f"driver.streams: positions are streamed at {least:g} to {most:g} Hz, between which drives interpolate"
+            f" (60C2h); control.rate is {rate:g}",
+        )
+    elif abs(1e6 / rate - round(1e6 / rate)) > 1e-6:
+        yield ("driver", "streams"), f"driver.streams: a period of 1/{rate:g} s is not whole microseconds (60C2h)"
 
 
 _MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
@@ -328,6 +351,18 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
         torques = [joint.torque if (joint := config.joints.get(name)) else None for name in names]
         limits = velocities, torques
         yield from disagreements(config.driver, config.transmission, names, config.control.rate, homeless, *limits)
+        if config.driver.streams == "position" and config.control.after_stop in ("hold", "lower"):
+            yield (
+                ("control", "after_stop"),
+                "control.after_stop: drives that are given positions (driver.streams) cannot lower an arm by torque;"
+                " give its joints brakes, and leave this out",
+            )
+        if config.driver.streams == "position" and config.identification.torque == "commanded":
+            yield (
+                ("identification", "torque"),
+                "identification.torque: of drives that are given positions (driver.streams) no torque is commanded;"
+                " leave it out, or set it to measured",
+            )
     if config.payload is not None and config.payload.link is not None and names and config.payload.link not in names:
         yield ("payload", "link"), f"payload.link: {config.payload.link!r} is none of {', '.join(names)}"
     yield from recording.disagreements(config.recording, config.transmission, names)

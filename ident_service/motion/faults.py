@@ -97,6 +97,9 @@ FAULTS: dict[str, Rule] = {
     "encoder_jump": Rule(_WARN, "a reading was disturbed, and is not used"),
     "torque_saturated": Rule(_WARN, "the motion asks for more than the arm may give; the torque was limited"),
     "torque_rate": Rule(_WARN, "the torque jumped, from noise or a gain that is too high; its change was limited"),
+    # Of drives that are given positions, which alone limit their torque.
+    "torque_exceeded": Rule(_WARN, "it pushes against something, or is heavier than described", often=5),
+    "position_rate": Rule(_WARN, "cycles were late or lost; where the joint shall be was brought up with limits kept"),
     "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores what it is told"),
     "drive_notice": Rule(_WARN, "the drive informs of it, and goes on; its manual says more about the code", each=True),
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
@@ -137,6 +140,10 @@ FAULTS: dict[str, Rule] = {
     "bus_silent": Rule(_QUICK, "nobody guarded the arm in between"),
     "clock_jump": Rule(_QUICK, "nothing timed can be trusted"),
     "torque_not_finite": Rule(_QUICK, "a mistake in the program or the model"),
+    # A stop under control would go on pushing.
+    "torque_unexplained": Rule(_QUICK, "it pushes against something or somebody, or its encoder or model is wrong"),
+    "position_not_finite": Rule(_QUICK, "a mistake in the program or the model"),
+    "position_outside": Rule(_QUICK, "a mistake in the program or the motion"),
     "torque_absurd": Rule(_QUICK, "the arm is overloaded, or program or model are wrong"),
     "driver": Rule(_QUICK, "the bus or its adapter failed"),
     "program": Rule(_QUICK, "the program failed or was interrupted"),

@@ -5,6 +5,7 @@ the drive takes its host for gone; 0 is never.
 
 In mode 8 (cyclic synchronous position) a loop of 1 ms follows 607Ah, between two targets on a straight line that takes
 the interpolation period (60C2h), by stiffness, damping and an integral part as a maker's tool would have tuned them.
+The torque that it tells is then the mean since the SYNC before.
 
 Demand is target plus offset, in counts of the target, cut off at the drive's limits (of CiA 402: thousandths of the
 rated torque, 6072h and 6073h). Above the speed limit (6080h) no torque acts that leads faster; the target is ignored
@@ -152,11 +153,12 @@ class TorqueLoop:
         """Start with a loop that is not closed."""
         self._objects, self._motor, self._personality = objects, motor, personality
         self._position = PositionLoop(objects, motor, tuning)
+        self._acting, self._sum, self._told_ns = (0.0, 0), 0.0, 0  # torque [counts] and since when [ns]
         self.limited = self.follows = False
 
     def release(self) -> None:
         """End the torque loop; the power stage decides what the motor does now."""
-        self.limited = self.follows = False
+        self.limited = self.follows = self._motor.holds = False
         self._position.release()
         for index in (0x6074, 0x6077, 0x6078):
             self._objects.values[index << 8] = 0
@@ -170,7 +172,7 @@ class TorqueLoop:
         asked = number(target >> 8, target & 0xFF) + number(0x60B2) if cyclic else 0
         if follows := number(0x6061) == _CSP and 0x607A00 in self._objects.entries:
             count = self._personality.torque(1.0, self._objects)
-            most = self._personality.reach(self._objects) * count
+            most, self._motor.holds = self._personality.reach(self._objects) * count, True
             asked = round(self._position.torque(now_ns, most) / count) if count else 0
         reach = int(self._personality.reach(self._objects) * self._motor.defects.torque_share)
         demand = min(max(asked, -reach), reach)
@@ -180,8 +182,27 @@ class TorqueLoop:
             demand, self.limited, self.follows = 0, True, False
         values[0x607400] = demand
         fraction = self._motor.defects.torque_fraction
-        values[0x607700] = values[0x607800] = round(fraction * demand)
+        if follows:
+            self._add(fraction * demand, now_ns)
+        else:
+            values[0x607700] = values[0x607800] = round(fraction * demand)
         self._motor.drive(self._personality.torque(fraction * demand, self._objects), now_ns)
+
+    def _add(self, acts: float, now_ns: int) -> None:
+        """Note the torque [counts] that acts from now on, for the mean that is told."""
+        acted, since_ns = self._acting
+        self._sum += acted * (now_ns - since_ns)
+        self._acting = acts, now_ns
+
+    def tell_mean(self, now_ns: int) -> None:
+        """Tell the mean torque since it was told last: a position loop changes it several times in a cycle."""
+        if not self._motor.holds:
+            return
+        self._add(self._acting[0], now_ns)
+        if now_ns > self._told_ns:
+            values = self._objects.values
+            values[0x607700] = values[0x607800] = round(self._sum / (now_ns - self._told_ns))
+        self._sum, self._told_ns = 0.0, now_ns
 
     def _leads_faster(self, demand: int, now_ns: int) -> bool:
         speed = self._motor.speed(now_ns)
@@ -617,6 +638,7 @@ class CanopenDrive:
         if self.nmt.state is State.OPERATIONAL:
             self._makers.synced()
         self._sample(self._node.now_ns)
+        self._torque.tell_mean(self._node.now_ns)
         self._evaluated = False
         self._pdos.sync()  # limits depend on where the motor is, whether a torque has come or not
         if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
