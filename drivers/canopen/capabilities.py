@@ -262,6 +262,8 @@ def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
     texts += [text for one in family.torque_limit for text in (one.entry, one.per, one.negative) if text]
     texts += [*family.speed_limit, *([family.unit.rated] if family.unit and family.unit.rated else [])]
     texts += [family.watchdog.entry] if family.watchdog else []
+    texts += [family.brake] if family.brake else []
+    texts += [family.position.target] if family.position else []
     entries = [*(entry for entry, _ in (*_INDISPENSABLE, *_OPTIONAL)), *_OTHERS]
     entries += [entry_of(text, "entry of its family") for text in texts]
     if (mine := drive.watchdog_entry) is not None:

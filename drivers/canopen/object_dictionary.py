@@ -99,6 +99,7 @@ SERIAL = Entry(0x1018, 4, Kind.U32, "serial number")
 SYNC_OVERFLOW = Entry(0x1019, 0, Kind.U8, "counter in SYNC, 0 for none")
 # A host may store two numbers of its own here (CiA 301, "verify configuration"); see `stored_zero.py`.
 STORED = Entry(0x1010, 1, Kind.U32, "what is stored when")
+RESTORE = Entry(0x1011, 1, Kind.U32, "what is restored when")
 ZERO_COUNTS = Entry(0x1020, 1, Kind.U32, "counts at home", "counts, as 32 bits")
 ZERO_MARK = Entry(0x1020, 2, Kind.U32, "mark of the counts at home")
 ERROR_BEHAVIOUR = Entry(0x1029, 1, Kind.U8, "state after a communication error")

@@ -64,9 +64,11 @@ class Objects:
 
     Attributes:
         dry: whether nothing is really written.
+        patience: how long a reply is waited for [s]; storing in flash memory takes longer than reading.
     """
 
     dry = False
+    patience = TIMEOUT
 
     def __init__(self, link: Link, node: int, others: Callable[[Frame], None] = lambda frame: None) -> None:
         """Use the given link, which stays the caller's.
@@ -92,7 +94,7 @@ class Objects:
         self._link.send(Frame(can_id, bytes(data), remote=remote))
         if data[0] == _ABORT:  # is not replied to
             return
-        deadline = self._link.clock.now_ns() + round(TIMEOUT * 1e9)
+        deadline = self._link.clock.now_ns() + round(self.patience * 1e9)
         while (frame := self._link.receive(deadline)) is not None:
             if frame.identifier == SDO_REPLY + self.node and len(frame.data) == 8 and not frame.error:
                 self._client.on_response(frame.identifier, frame.data, 0.0)

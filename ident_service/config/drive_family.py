@@ -97,8 +97,9 @@ class Family(Section):
     """Known properties of a family of drives.
 
     `refuse` is the sentence with which drives without a torque mode are refused. `mode_shown` says in which state a
-    mode of operation takes effect (6061h): already while the drive is off, or only when it is switched on. `sources`
-    says for every other key where it is from; `proved` whether somebody has run it on hardware.
+    mode of operation takes effect (6061h): already while the drive is off, or only when it is switched on.
+    `brake` is the maker's entry in which its tool has set up a holding brake, which is shown and never written.
+    `sources` says for every other key where it is from; `proved` whether somebody has run it on hardware.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -113,6 +114,7 @@ class Family(Section):
     dummies: tuple[Literal["0003", "0006", "0005", "0002"], ...] | None = None
     watchdog: MakersWatchdog | None = None
     mode_shown: Literal["off", "switched_on"] = "off"
+    brake: EntryText | None = None
     notes: str = ""
     sources: dict[str, Annotated[str, Field(min_length=1)]]
 

@@ -18,7 +18,7 @@ from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
 from drivers.canopen.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line, budget
 from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
-from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, named, where
+from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, entry_of, named, where
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
 from drivers.canopen.drive_setup import IDENTITY, differences
 from drivers.canopen.pdo_mapping import bus_profiles
@@ -512,6 +512,9 @@ def _facts(one: Probed, found: Probe) -> dict[str, str]:
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"
     facts["torque_frames"] = f"{shares}, as far as its file and family know"
     facts["status_reports"] = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    if (brake := can.family.brake) is not None:
+        held = can.found.get(entry_of(brake, ""))
+        facts["brake"] = f"{named(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
     facts["proved"] = "on hardware" if can.family.proved else "not on hardware"
     return facts
 
@@ -593,9 +596,28 @@ def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
     return words
 
 
+# The rest of a probe is what the description makes of it.
+_OF_THE_DRIVE = (
+    "family",
+    "firmware",
+    "mode",
+    "target",
+    "count",
+    "torque_limit",
+    "speed_limit",
+    "watchdogs",
+    "status_timer",
+)
+
+
+# The rest of a probe is what the description makes of it.
+_OF_THE_DRIVE = (
+    *("family", "firmware", "mode", "target", "count"),
+    *("torque_limit", "speed_limit", "watchdogs", "status_timer"),
+)
+
+
 def _different(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     if old["identity"] != new["identity"]:
         return ["another drive than at the last probe"]
-    return [
-        f"{key} was {old.get(key)!r}, is {new[key]!r}" for key in new if key != "asked" and old.get(key) != new[key]
-    ]
+    return [f"{key} was {old.get(key)!r}, is {new.get(key)!r}" for key in _OF_THE_DRIVE if old.get(key) != new.get(key)]

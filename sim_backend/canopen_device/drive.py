@@ -411,6 +411,9 @@ BOOT_NS = 20_000_000  # from a reset to the boot-up message
 NO_HEARTBEAT, SYNC_LENGTH, NO_VOLTAGE, POWER_STAGE = 0x8130, 0x8240, 0x3220, 0x5400
 _PDO_PARAMETERS = {index for group in (*COMMUNICATION, *MAPPING) for index in group}
 _DRIVE_OBJECTS = 0x6000
+# CiA 301, 7.5.2.13 and 14: "save" and "load", little-endian.
+_STORE, _RESTORE, NOT_STORED = 0x1010, 0x1011, 0x08000020
+_SIGNATURES = {_STORE: 0x65766173, _RESTORE: 0x64616F6C}
 _FAULT = 1  # of 6007h
 _WARNING, _REMOTE, _LIMITED, _FOLLOWS, _VOLTAGE = 0x0080, 0x0200, 0x0800, 0x1000, 0x0010
 # Key of the position entry; a TPDO without it is no feedback.
@@ -738,6 +741,8 @@ class CanopenDrive:
             raise SdoAbort(WRONG_STATE)
         if key == 0x100300 and value:
             raise SdoAbort(WRONG_VALUE)
+        if index in _SIGNATURES and value != _SIGNATURES[index]:
+            raise SdoAbort(NOT_STORED)
         if index in (0x1005, 0x1014) and value & 0x7FFF_F800:
             raise SdoAbort(WRONG_VALUE)  # extended identifiers, and producing SYNC
 
@@ -747,7 +752,10 @@ class CanopenDrive:
         if index not in (0x1003, 0x1020) and not self.objects.entries[key].mappable:
             self.objects.put(0x1020, 0, 1)
             self.objects.put(0x1020, 0, 2)
-        if index in _PDO_PARAMETERS or index == 0x1005:
+        if index in _SIGNATURES:
+            self.objects.values[key] = self.objects.entries[key].default  # what it tells is what it can
+            (self.objects.store if index == _STORE else self.objects.restore)()
+        elif index in _PDO_PARAMETERS or index == 0x1005:
             self._configure()
         elif index == 0x1016:
             self.nmt.configure_consumers()

@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from helpers.emulated_arms import weightless_config
@@ -175,7 +176,7 @@ def test_an_arm_without_a_bus_is_refused() -> None:
 def test_every_shipped_family_says_where_its_facts_are_from() -> None:
     families = shipped_families()
     assert families[-1].name == "generic402"
-    assert len({family.name for family in families}) == len(families) > 6
+    assert len({family.name for family in families}) == len(families) > 12
     for family in families:
         assert not family.proved  # nobody has run one on hardware yet
         assert family.match.vendor is not None or family is families[-1]
@@ -191,6 +192,63 @@ def test_families_are_found_by_vendor_and_product_and_the_users_come_first() -> 
     mine = family_from("mine.yaml", "{name: mine, proved: yes, match: {vendor: 0xFB}, sources: {match: my bench}}")
     assert family_of({"vendor": 0xFB, "product": 1}, [mine]).name == "mine"
     assert family_of({"vendor": 0xFB, "product": 1}, [mine]).torque_limit == shipped_families()[-1].torque_limit
+
+
+# Families of which no file is at hand: the vendor, and entries that only the family knows.
+UNSEEN = {
+    "ZeroErr eDriver": (0x5A65726F, {0x607200: 1000}),
+    "Copley": (0xAB, {0x607200: 1000}),
+    "Nanotec": (0x26C, {0x203B01: 2000, 0x607200: 0}),
+    "Synapticon SOMANET": (0x22D2, {0x607200: 1000, 0x200401: 7}),
+    "Kollmorgen AKD": (0x6A, {0x607300: 1000}),
+}
+
+
+@needs_sheets
+@pytest.mark.parametrize("name", UNSEEN)
+def test_makers_without_a_file_at_hand_are_emulated_by_what_their_family_says(name: str) -> None:
+    """An anonymous drive's file with the maker's number and entries: opened, enabled, given a torque that acts."""
+    vendor, own = UNSEEN[name]
+    text = sheet("e35.eds")["text"].replace("VendorNumber=101", f"VendorNumber={vendor:#x}")
+    head, tail = text.split("[1018sub1]")
+    text = head + "[1018sub1]" + tail.replace("DefaultValue=0xFF", f"DefaultValue={vendor:#x}", 1)
+    if 0x607200 not in own:
+        text = text.replace("[6072]", "[5FFE]")
+    for key, value in own.items():
+        if key >> 8 not in (0x6072, 0x6073):
+            index, sub = f"{key >> 8:04X}", key & 0xFF
+            text += f"\n[{index}]\nSubNumber=2\nObjectType=0x9\n[{index}sub0]\nDataType=5\nDefaultValue=1\n"
+            kind = 7 if key == 0x203B01 else 6
+            text += f"[{index}sub{sub:X}]\nDataType={kind}\nAccessType=rw\nDefaultValue={value}\n"
+    constant = {"torque_constant": 0.5} if name == "Nanotec" else {}
+    config = arm_of("e35.eds")
+    tree = config.model_dump(mode="json", by_alias=True)
+    file = {"name": "maker.eds", "text": text}
+    tree["driver"]["eds"], tree["driver"]["emulation"]["eds"] = file, [file]
+    for drive in tree["driver"]["drives"]:
+        drive.update({"eds": file} | constant)
+    config = ArmConfig.model_validate(tree)
+    bench = Bench(config)
+    found = bus_probe(config, (), bench.links)  # type: ignore[arg-type]
+    (first, _) = found.probed
+    assert first.can is not None
+    assert first.can.family.name == name
+    assert found.good, probe_text(config, found)
+    assert ("brake" in probe_document(config, found)["drives"][0]["facts"]) is (0x200401 in own)
+    with bench.arm as arm:
+        arm.enable()
+        for _ in range(20):
+            sample = arm.exchange(np.array([0.1, 0.05]))
+        np.testing.assert_allclose(sample.torque, [0.1, 0.05], atol=1.1e-3)
+        torques = bench.behind.emulator.body.truth(bench.behind.clock.now_ns()).torque
+        np.testing.assert_allclose(torques, sample.torque, rtol=1e-6, atol=1e-9)
+
+
+def test_an_ipos_is_refused_in_one_sentence_that_says_what_to_do() -> None:
+    family = family_of({"vendor": 0x1A3, "product": 1})
+    assert family.name == "Technosoft iPOS"
+    assert ". " not in family.refuse
+    assert "driver.streams to position" in family.refuse
 
 
 @pytest.mark.parametrize(
