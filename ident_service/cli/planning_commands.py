@@ -249,6 +249,32 @@ def _add_bus(verbs: VerbList) -> None:
         sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
         sub.set_defaults(stores=name == "store")
 
+    text = "a ZIP file to send when drives do not work: probe, frames, EDS hashes, ticket, versions; no secrets"
+    sub = bus.add("report", _bus_report, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--out", type=Path, metavar="FILE", help="must not exist (default: below the state folder)")
+    sub.add_argument(
+        "--run", type=Path, metavar="DIR", help="run folder whose can.log goes along (`ident run --can-log`)"
+    )
+
+
+def _bus_report(arguments: argparse.Namespace) -> Answer:
+    from datetime import UTC, datetime
+
+    from ident_service.config.load import load_arm
+    from ident_service.operations.fieldbus import bus_report
+    from ident_service.registry.state_folder import arm_folder, ticket_path
+
+    config, state = load_arm(arguments.arm), own_state_folder(arguments)
+    if arguments.run is not None and not (arguments.run / "can.log").is_file():
+        raise UsageError(f"{arguments.run}: has no can.log; `ident run --can-log` makes one")
+    named = f"report-{datetime.now(UTC):%Y%m%d-%H%M%S}.zip"
+    path = arguments.out or arm_folder(state, config.name) / named
+    frames = None if arguments.run is None else arguments.run / "can.log"
+    names = bus_report(config, path, ticket_path(state, config.name), frames)
+    text = f"{path}: look into it before you send it\n" + "".join(f"  {name}\n" for name in names)
+    return DONE, text, {"path": str(path), "files": names}
+
 
 def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
     """Require that a person has typed the arm's name; raises UsageError."""

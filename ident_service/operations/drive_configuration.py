@@ -263,7 +263,8 @@ def store_or_restore(
             _require_off(objects)
             if optional(objects.read, entry) is None:
                 raise DriverError(f"node {objects.node}: has no {where(entry)}; use its maker's tool")
-            if store and optional(objects.read, od.ZERO_MARK):
+            mark: int | None = optional(objects.read, od.ZERO_MARK)
+            if store and mark:
                 raise DriverError(
                     f"node {objects.node}: holds a zero (1020h), which must be lost with its power: switch the drives"
                     " off and on, store, and then zero the arm again"
