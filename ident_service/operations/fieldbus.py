@@ -680,7 +680,7 @@ def bus_report(
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
     found: dict[str, str] = {
         "versions.json": _as_json(_versions()),
-        "description.json": _as_json(_described(config, driver)),
+        "description.json": _as_json(_description(config, driver)),
     }
     with TemporaryDirectory(prefix="ident-") as folder:
         for name, text, document in _read(config, driver, Path(folder) / "probe.log", open_bus):
@@ -736,7 +736,7 @@ def _versions() -> dict[str, str]:
     return known | {"python": platform.python_version(), "kernel": platform.release(), "machine": platform.machine()}
 
 
-def _described(config: ArmConfig, driver: CanopenDriver) -> dict[str, Any]:
+def _description(config: ArmConfig, driver: CanopenDriver) -> dict[str, Any]:
     """Return what matters of a description: no options of interfaces, which may hold a password, and no path."""
     drives = [drive.model_dump(mode="json", include=set(_OF_A_DRIVE)) for drive in driver.drives]
     sheets = [driver.sheet_file(number) for number in range(len(drives))]
