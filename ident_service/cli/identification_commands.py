@@ -252,8 +252,8 @@ def _payload(arguments: argparse.Namespace) -> Answer:
 
 
 def _add_parameters(verbs: VerbList) -> None:
-    """Register `base`, `feasible`, `correct` and `verify`."""
-    sub = verbs.add("base", _base, "base parameters and their expressions")
+    """Register `base-parameters`, `feasible`, `project` and `verify`."""
+    sub = verbs.add("base-parameters", _base, "list the base parameters and their expressions", former="base")
     sub.add_argument("arm", metavar="ARM")
 
     sub = verbs.add("feasible", _feasible, "could a real body have these parameters? (exit code 3: no)")
@@ -262,7 +262,8 @@ def _add_parameters(verbs: VerbList) -> None:
     sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
     sub.add_argument("--notation", choices=NOTATIONS, help="of the file's names, where it is not ours")
 
-    sub = verbs.add("correct", _correct, "the nearest feasible parameters")
+    text = "write the feasible parameters nearest to those of a file"
+    sub = verbs.add("project", _correct, text, former="correct")
     sub.add_argument("file", type=Path, metavar="FILE")
     sub.add_argument("--metric", choices=["euclidean", "covariance"], default="euclidean", help="what nearest means")
     sub.add_argument("--out", type=Path, required=True, metavar="FILE")

@@ -52,7 +52,11 @@ def add(verbs: VerbList) -> None:
     group = verbs.group("alarm", "drift alarms")
     sub = group.add("list", _alarms, "alarms that stand (exit code 3: there are some)")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _remark(group.add("ack", _ack, "a person knows of it; the accepted set stays as it is"))
+    _remark(
+        group.add(
+            "acknowledge", _ack, "confirm that a person knows of it; the accepted set stays as it is", former="ack"
+        )
+    )
 
 
 def registry(arguments: argparse.Namespace) -> Database:

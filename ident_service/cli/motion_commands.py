@@ -1,4 +1,4 @@
-"""Commands at an arm: `watch`, `check`, `rehearse`, `run`, and what all that move one share.
+"""Commands at an arm: `watch`, `preflight`, `run`, `stop`, `pause` and others, and functions that all motions share.
 
 `stop` needs no lease, no ticket and no confirmation, and waits for no other process. Running motions is
 `operations/motion_run.py`.
@@ -161,7 +161,7 @@ def run_and_report(
     state = own_state_folder(arguments)
     path = ticket_path(state, config.name)
     if not path.exists():
-        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
+        raise MotionRefused(f"{config.name}: not checked yet; `ident preflight` comes before every motion")
     folder = arguments.out or new_run_folder(state, config.name)
     begun = False
 
@@ -229,8 +229,8 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     """
     if arguments.json or not sys.stdin.isatty():
         raise UsageError(
-            "a rehearsal moves only while a key is held, and there is no terminal to hold one at; give --no-key to "
-            "rehearse without, and have `ident stop` ready in another terminal"
+            "there is no terminal at which to hold the space bar; `ident run --speed 0.2` (or `rehearse --no-key`) "
+            "moves the arm without; have `ident stop` ready in another terminal"
         )
     return sys.stdin.fileno()
 
@@ -278,17 +278,20 @@ def _report_text(report: dict[str, Any]) -> str:
     )
 
 
-_REHEARSAL = 0.2
+SLOW = 0.2  # of the motion's own speed, while a key is held
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
 _HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: VerbList) -> None:
-    """Register `watch`, `check`, `run`, `rehearse`, `stop`, `pause`, `resume`, `finish`, `supported` and `ack`."""
+    """Register `watch`, `preflight`, `run`, `stop`, `pause`, `resume`, `finish`, `supported` and `acknowledge`."""
     sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
-    sub = verbs.add("check", _check, "preflight: what must be true before the arm moves (exit code 3: it is not)")
+    text = (
+        "test the arm and its drives before a motion, and write the ticket that `run` asks for (exit code 3: refused)"
+    )
+    sub = verbs.add("preflight", _check, text, former="check")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
@@ -302,24 +305,28 @@ def add(verbs: VerbList) -> None:
     add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
-    sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
+    sub.add_argument(
+        "--speed", type=speed, metavar="SHARE", help="of the motion's own speed (default: 1, with --hold-to-run 0.2)"
+    )
+    sub.add_argument("--hold-to-run", action="store_true", help="the arm moves only while the space bar is held")
     sub.add_argument(
         "--until",
         type=share,
         metavar="SHARE",
-        help="end early, in order, once every deviation is at most this share of its parameter (0.05)",
+        help="finish early, once every standard deviation is at most this share of its parameter, such as 0.05",
     )
     sub.add_argument(
         "--parameter",
         dest="chosen",
         action="append",
         metavar="EXPRESSION",
-        help="with --until: only this base parameter counts, as `ident base` prints it; may be repeated",
+        help="with --until: only this base parameter counts, as `ident base-parameters` prints it; may be repeated",
     )
-    sub = verbs.add("rehearse", _rehearse, "the run at a fifth of its speed, while the space bar is held")
+    # The former name of `run --hold-to-run`.
+    sub = verbs.add("rehearse", _rehearse, "the same as `run --hold-to-run`", hidden=True)
     _motion(sub)
     sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
-    sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
+    sub.add_argument("--speed", type=speed, default=SLOW, metavar="SHARE", help="of the motion's own speed")
     for name, text in (
         ("stop", "bring the arm, or every arm, to a controlled stop; needs no lease and always works"),
         ("pause", "let the arm stand"),
@@ -332,7 +339,7 @@ def add(verbs: VerbList) -> None:
         if name == "supported":
             sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees it")
         sub.set_defaults(asks=name)
-    sub = verbs.add("ack", _ack, "acknowledge a latched fault by its name")
+    sub = verbs.add("acknowledge", _ack, "acknowledge an active fault by its name", former="ack")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("fault", metavar="FAULT")
     add_by(sub)
@@ -438,14 +445,25 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     return (DONE if good else VERDICT_NO), "\n".join([*lines, ""]), {"joints": [asdict(one) for one in found]}
 
 
-def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
+def _run(arguments: argparse.Namespace) -> Answer:
+    if not arguments.hold_to_run:
+        return _move(arguments, 1.0 if arguments.speed is None else arguments.speed)
+    require_no_target(arguments)
+    return _hold_to_run(arguments, SLOW if arguments.speed is None else arguments.speed)
+
+
+def _rehearse(arguments: argparse.Namespace) -> Answer:
+    return _move(arguments, arguments.speed) if arguments.no_key else _hold_to_run(arguments, arguments.speed)
+
+
+def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float | None = None) -> Answer:
     """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
     lease = requested_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
-    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
+    sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s"
     stopping = StopOnSignal()
     with stopping:
         return run_and_report(
@@ -453,11 +471,21 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
             config,
             motion,
             sentence,
-            speed=arguments.speed,
+            speed=share_of_speed,
             lease=seconds,
             stop_requested=stop_or_lapsed(stopping.requested, lease),
             until=_target(arguments),
         )
+
+
+def require_no_target(arguments: argparse.Namespace) -> None:
+    """Refuse an accuracy target of a run that ends when a key is released.
+
+    Raises:
+        UsageError: `--until` or `--parameter` was given.
+    """
+    if arguments.until is not None or arguments.chosen:
+        raise UsageError("--until and --parameter are for a run without --hold-to-run")
 
 
 def _target(arguments: argparse.Namespace) -> Target | None:
@@ -471,32 +499,28 @@ def _target(arguments: argparse.Namespace) -> Target | None:
     return Target(arguments.until, tuple(arguments.chosen or ()))
 
 
-def _rehearse(arguments: argparse.Namespace) -> Answer:
-    if arguments.no_key:
-        return _run(arguments)
-    if arguments.lease_from_stdin:
-        from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
-
-        return _run(arguments, HOLD_TO_RUN_SECONDS)
-    terminal = require_terminal(arguments)
+def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 
+    if arguments.lease_from_stdin:
+        return _move(arguments, share_of_speed, HOLD_TO_RUN_SECONDS)
+    terminal = require_terminal(arguments)
     config = load_arm(arguments.arm)
     motion = _chosen(config, arguments.motion)
-    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s while the space bar is held"
+    sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
     with stopping, HeldKey(terminal) as key:
         tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
-        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
         if not key.wait(stopping.requested):
-            raise MotionRefused("nobody held the key; nothing has moved")
+            raise MotionRefused("the space bar was not held; nothing has moved")
         return run_and_report(
             arguments,
             config,
             motion,
             sentence,
-            speed=arguments.speed,
+            speed=share_of_speed,
             lease=HOLD_TO_RUN_SECONDS,
             stop_requested=lambda: stopping.requested() or key.released(),
         )

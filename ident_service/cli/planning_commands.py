@@ -38,7 +38,7 @@ def _add_motions(verbs: VerbList) -> None:
         action="append",
         dest="chosen",
         metavar="EXPRESSION",
-        help="a base parameter as `ident base` prints it, to be taught best (a_optimal); may be repeated",
+        help="a base parameter as `ident base-parameters` prints it, to be known best (a_optimal); may be repeated",
     )
     sub.add_argument("--motion", choices=["fourier", "postures"], help="default: the arm's")
     length = "of the motion, ramps included: whole periods of about the base frequency (default: the arm's)"

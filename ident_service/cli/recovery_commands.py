@@ -1,4 +1,4 @@
-"""Commands that make an arm usable again: `recover`, `home`, `ack`, `supported`; and `reidentify`.
+"""Commands that make an arm usable again: `recover`, `home`, `set-home`; and `reidentify`.
 
 Each step runs in this process the verb that the daemon runs as a job; `service/maintenance` stores the result.
 """
@@ -43,16 +43,22 @@ _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 
 def _add_recovery(verbs: VerbList) -> None:
-    """Register `home` and `recover`."""
-    sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
+    """Register `home`, `set-home` and `recover`."""
+    sub = verbs.add("home", _home, "move the arm home, at a tenth of its velocity limits at most")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument(
-        "--zero", action="store_true", help="move nothing: a person has led the arm home, and its encoders begin there"
-    )
-    sub.add_argument("--confirm", metavar="NAME", help="with --zero or --server: the arm's name, typed by a person")
+    sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
+    sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
     add_lease(sub, confirm=False)
+    text = (
+        "define the posture in which the arm stands as its home: sets the zero of incremental encoders, moves nothing"
+    )
+    sub = verbs.add("set-home", _home, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
+    add_lease(sub, confirm=False)
+    sub.set_defaults(zero=True, out=None, can_log=False)
     sub = verbs.add(
         "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
     )
@@ -70,10 +76,10 @@ def _home(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     if arguments.zero:
         if arguments.out is not None or arguments.can_log:
-            raise UsageError("--out and --can-log are for a motion; with --zero nothing moves")
+            raise UsageError("--out and --can-log are for a motion; here nothing moves")
         return _zero(arguments, config)
     if arguments.confirm is not None:
-        raise UsageError("--confirm is for --zero; a motion needs the ticket of `ident check`")
+        raise UsageError("--confirm is for `ident set-home`; a motion needs the ticket of `ident preflight`")
     if held := _lead_held(arguments, config):
         return held
     return _slowly(arguments, config, Destination.HOME)
@@ -139,7 +145,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
         lines.append(
             "  but these drives are emulated within this command, and forget it now; over ident_wire they do not"
         )
-    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident check {arguments.arm}`")
+    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident preflight {arguments.arm}`")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -253,7 +259,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
         accepted = accepted_set(state, config.name, number)[1]
         motion = [] if arguments.motion is None else [str(arguments.motion)]
         confirm = [] if arguments.confirm is None else ["--confirm", arguments.confirm]
-        code, text, _ = _step(arguments, "check", arguments.arm, *motion, *confirm)
+        code, text, _ = _step(arguments, "preflight", arguments.arm, *motion, *confirm)
         if code != DONE:
             raise PersonNeeded(f"{config.name}: preflight found reasons not to move\n{text}")
         recorded = new_id(config.name)
@@ -280,7 +286,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     }
     lines = f"{text}{verdict.words}\n"
     if verdict.state == "changed":
-        lines += "a drift alarm stands until `ident alarm ack`, or `ident accept` of another set\n"
+        lines += "a drift alarm stands until `ident alarm acknowledge`, or `ident accept` of another set\n"
     return EXIT_CODES[verdict.state], lines, answer
 
 

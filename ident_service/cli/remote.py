@@ -39,7 +39,13 @@ Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
-_MOVE = ("check", "run", "home", "leave_limit", "zero")  # a rehearsal has its own way, `remote_watching.py`
+_MOVE = (
+    "check",
+    "run",
+    "home",
+    "leave_limit",
+    "zero",
+)  # `run --hold-to-run` has its own function in `remote_watching.py`
 
 
 def add(verbs: VerbList) -> None:
@@ -164,10 +170,11 @@ def _design(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any
 
 def _check(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     motion = motion_id(client, arguments.arm, arguments.motion)
-    return {"arm": arguments.arm, "motion": motion, "home": arguments.home}
+    return {"kind": "check", "arm": arguments.arm, "motion": motion, "home": arguments.home}
 
 
-def _run(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+def run_job(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the request of a run without a key; upload its motion first if it is a file."""
     return {
         "arm": arguments.arm,
         "motion": motion_id(client, arguments.arm, arguments.motion),
@@ -267,13 +274,12 @@ REMOTE: dict[str, Verb] = {
     "simulate": job_verb(_simulate),
     "identify": job_verb(_identify),
     "design": job_verb(_design),
-    "check": job_verb(_check),
-    "run": job_verb(_run),
-    "home": job_verb(_home),
+    "preflight": job_verb(_check),
+    **dict.fromkeys(("home", "set-home"), job_verb(_home)),
     "stop": _stop,
     **dict.fromkeys(("pause", "resume", "finish"), _ask),
     "supported": _supported,
-    "ack": _ack,
+    "acknowledge": _ack,
     "jobs list": _list,
     "jobs show": _show,
     "jobs watch": _watch,
@@ -300,12 +306,11 @@ _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
     "identify": frozenset({"arm", "recordings", "validate", "columns", "method", "feasible_set", "prior"}),
     "design": frozenset({"arm", "search_time", "starts", "seed", "criterion", "chosen", "motion", "after"}),
-    "check": _MOTION | {"home"},
-    "run": _MOTION | {"speed", "until", "chosen"},
-    "home": frozenset({"arm", "confirm", "zero"}),
+    "preflight": _MOTION | {"home"},
+    **dict.fromkeys(("home", "set-home"), frozenset({"arm", "confirm", "zero"})),
     **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
     "supported": frozenset({"arm", "confirm"}),
-    "ack": frozenset({"arm", "fault"}),
+    "acknowledge": frozenset({"arm", "fault"}),
     "jobs list": frozenset({"most"}),
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
 }

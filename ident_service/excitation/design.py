@@ -109,7 +109,8 @@ def complete_task(
     places = {expression.replace(" ", ""): place for place, expression in enumerate(base.expressions)}
     if unknown := [name for name in design.parameters if name.replace(" ", "") not in places]:
         raise UsageError(
-            f"{', '.join(unknown)}: not among the base parameters of {model.config.name}; `ident base` prints them"
+            f"{', '.join(unknown)}: not among the base parameters of {model.config.name}; "
+            "`ident base-parameters` prints them"
         )
     chosen = np.array([places[name.replace(" ", "")] for name in design.parameters], dtype=np.intp)
     plain = design.criterion == "condition_number"

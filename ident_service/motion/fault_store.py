@@ -83,7 +83,7 @@ class FaultStore:
         """Raise MotionRefused, which names the faults, if there are any."""
         if faults:
             words = "; ".join(f"{code} ({cause})" for code, cause in faults.items())
-            acks = ", ".join(f"`ident ack {self._arm} {code}`" for code in faults)
+            acks = ", ".join(f"`ident acknowledge {self._arm} {code}`" for code in faults)
             raise MotionRefused(f"{self._arm}: faults that nobody has acknowledged: {words}; {acks}")
 
     def latch(self, code: str, cause: str) -> None:

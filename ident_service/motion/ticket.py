@@ -280,7 +280,7 @@ class Ticket:
         """Raise MotionRefused, which says why, unless this ticket is `valid_for` the motion."""
         if why := self.valid_for(subject, now):
             raise MotionRefused(
-                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
+                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident preflight` makes a new one"
             )
 
     def with_arm(self, subject: Subject) -> Subject:
@@ -368,9 +368,9 @@ def read_ticket(path: Path) -> Ticket:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise UsageError(f"{path}: not UTF-8 text, so not a ticket; `ident check` makes a new one") from None
+        raise UsageError(f"{path}: not UTF-8 text, so not a ticket; `ident preflight` makes a new one") from None
     except UsageError as error:
-        raise UsageError(f"{path}: {error}; `ident check` makes a new one") from None
+        raise UsageError(f"{path}: {error}; `ident preflight` makes a new one") from None
 
 
 def ticket_from_json(text: str) -> Ticket:

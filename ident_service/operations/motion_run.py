@@ -115,7 +115,8 @@ class ProcessResult:
         if UNFINISHED not in latched:
             return ArmError(f"{died} before it took the arm; nothing has moved")
         return ArmFault(
-            UNFINISHED, f"{died}; drives that hear nothing stop by themselves: look at the arm before `ident ack`"
+            UNFINISHED,
+            f"{died}; drives that hear nothing stop by themselves: look at the arm before `ident acknowledge`",
         )
 
     def _how(self) -> str:

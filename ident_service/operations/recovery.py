@@ -55,7 +55,7 @@ class Recovery:
         tripped: what drives still have latched, by axis.
         outside: joints outside their position limits, in words.
         steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
-        usable: whether `ident check` can be run.
+        usable: whether `ident preflight` can be run.
     """
 
     arm: str
@@ -179,7 +179,7 @@ def _before(
     support: str,
 ) -> list[str]:
     """Return what must be done before the arm is usable, in order."""
-    steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
+    steps = [f"`ident acknowledge {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
     if unreachable:
         steps.append(f"Check power, cables, emergency stop, and that no other program has the arm: {unreachable}.")
     if zero_lost:
@@ -199,8 +199,8 @@ def _before(
         try:
             require_near(seen.position, limits, seen.joint_names)
             steps.append(
-                f"`ident check {name} --home`, then `ident recover {name} --leave-limit` leads it back inside, slowly; "
-                f"or push it by hand: {'; '.join(out)}."
+                f"`ident preflight {name} --home`, then `ident recover {name} --leave-limit` moves it back inside, "
+                f"slowly; or push it by hand: {'; '.join(out)}."
             )
         except MotionRefused as error:
             steps.append(f"Bring it back by hand: {error}.")
@@ -209,8 +209,8 @@ def _before(
 
 def _at_last(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:
     away = seen is None or out or bool((np.abs(seen.position - limits.home) > AT_HOME).any())
-    home = f"`ident check {name} --home`, then `ident home {name}` leads it home; then " if away else ""
-    return f"{home}`ident check {name}` for the next motion."
+    home = f"`ident preflight {name} --home`, then `ident home {name}` leads it home; then " if away else ""
+    return f"{home}`ident preflight {name}` for the next motion."
 
 
 @dataclass(frozen=True)

@@ -290,7 +290,7 @@ def direction_check(
         "A hidden delay is in the drive's filters or its interpolation, or belongs into identification.delay.",
     )
     if told and check.verdict is Verdict.PASSED:
-        return replace(check, reason="; ".join([*told, "`ident check ARM --scale` tells which"]))
+        return replace(check, reason="; ".join([*told, "`ident preflight ARM --scale` tells which"]))
     return check
 
 

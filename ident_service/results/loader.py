@@ -20,7 +20,7 @@ def dynamic_model(path: Path, arm: str | Path | None) -> DynamicModel:
     found = _identified(path, arm)
     if found.delta is None:
         raise ModelError(
-            f"{path}: no body has these parameters, so there is no model; `ident correct` gives the nearest ones that "
+            f"{path}: no body has these parameters, so there is no model; `ident project` gives the nearest ones that "
             "a body has"
         )
     return DynamicModel(found.model, found.delta)

@@ -152,7 +152,7 @@ def test_check_run_identify(daemon: Asked, arm: str) -> None:
     early = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
     ended = daemon.follow(early["id"], lease=True)
     assert (ended["state"], ended["exit_code"]) == ("refused", 3)
-    assert "`ident check`" in ended["detail"]
+    assert "`ident preflight`" in ended["detail"]
     for kind in ("check", "run"):
         job = daemon.begin({"kind": kind, "arm": ARM}, confirmed=True)
         ended = daemon.follow(job["id"], lease=True)

@@ -267,7 +267,7 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
         server = ["--server", client.url, "--state", str(state)]
         for text in texts.values():
             client.post("/api/v1/arms", {"description": text})
-        rehearse = ["rehearse", "patient", "--confirm", "patient", *server]
+        rehearse = ["run", "--hold-to-run", "patient", "--confirm", "patient", *server]
         assert main([*rehearse, "--json"]) == 2  # a program holds no key
         assert "no terminal" in capsys.readouterr().err
         before = termios.tcgetattr(slave)
@@ -324,7 +324,7 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
             assert parser().parse_args(words).arm == "quick"
         assert main([*next(one for one in commands if one[0] == "ack"), "--state", str(state)]) == 0
         assert main(["recover", "quick", *server]) == 0
-        assert client.answer(next(client.jobs()).id)["steps"] == ["`ident check quick` for the next motion."]
+        assert client.answer(next(client.jobs()).id)["steps"] == ["`ident preflight quick` for the next motion."]
 
 
 @pytest.mark.slow

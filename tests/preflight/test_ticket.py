@@ -180,7 +180,7 @@ def test_what_is_no_ticket_is_refused_with_one_reason(text: str, complaint: str,
     with pytest.raises(UsageError) as again:
         read_ticket(path)
     assert str(again.value).startswith(f"{path}: ")
-    assert str(again.value).endswith("`ident check` makes a new one")
+    assert str(again.value).endswith("`ident preflight` makes a new one")
     assert complaint in str(again.value)
 
 

@@ -1,4 +1,4 @@
-"""`ident home --zero`: a person says that the arm stands at its home; and what later steps make of it."""
+"""`ident set-home`: a person says that the arm stands at its home; and what later steps make of it."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_person_who_says_so_makes_the_arm_usable(config: ArmConfig, behind: Lo
     assert not found.usable
     assert found.unreachable == ""
     assert "drives 1, 2 do not know where the arm stands" in found.zero_lost
-    assert any("`ident home pucks2 --zero`" in step for step in found.steps), found.steps
+    assert any("`ident set-home pucks2`" in step for step in found.steps), found.steps
     assert not any("Check power" in step for step in found.steps), found.steps
     done = set_home(config, state, sure)
     assert [(one.joint, one.position, one.unit) for one in done.posture] == [
@@ -171,7 +171,7 @@ def test_latched_faults_are_said(config: ArmConfig, behind: LockStepArm, state: 
     behind.settle(behind.clock.now_ns() + 100_000_000)
     found = recover(config, state)
     assert "drives 2 do not know" in found.zero_lost
-    acknowledged = next(k for k, step in enumerate(found.steps) if "`ident ack pucks2 drive_restarted`" in step)
+    acknowledged = next(k for k, step in enumerate(found.steps) if "`ident acknowledge pucks2 drive_restarted`" in step)
     zeroed = next(k for k, step in enumerate(found.steps) if "--zero" in step)
     assert acknowledged < zeroed < len(found.steps) - 1
     done = set_home(config, state, sure)

@@ -76,7 +76,7 @@ class IdentifiedArm:
         if self.delta is None:
             raise ModelError(
                 f"{self.model.config.name}: no body has these parameters, so there are no link inertias to export; "
-                "csv, json and c take base parameters, and `ident correct` gives the nearest ones that a body has"
+                "csv, json and c take base parameters, and `ident project` gives the nearest ones that a body has"
             )
         return self.delta
 
