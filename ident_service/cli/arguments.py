@@ -62,8 +62,10 @@ class VerbList:
     def of(cls, parser: Parser) -> VerbList:
         """Create the list of verbs of a command."""
         common = Parser(add_help=False)
-        common.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else")
-        common.add_argument("--server", metavar="URL", help="have a daemon there do it; things are named by its ids")
+        common.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+        common.add_argument(
+            "--server", metavar="URL", help="run it on the daemon there; runs, motions and jobs are named by id"
+        )
         common.add_argument("--state", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)")
         return cls(parser.add_subparsers(required=True, metavar="VERB"), common)
 

@@ -58,7 +58,7 @@ def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
     due = client.get(_of(arguments, "due"))
-    text = f"{arguments.arm}: entered: {row['what']}\n" + "".join(map(due_line, due))
+    text = f"{arguments.arm}: recorded: {row['what']}\n" + "".join(map(due_line, due))
     return DONE, text, {**row, "due": due}
 
 

@@ -48,7 +48,7 @@ def _correct(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
 
 def _compare(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if len(arguments.others) != 1:
-        raise UsageError("compare --server: one run is compared with one other; ask again for the rest")
+        raise UsageError("compare --server: compares one run with one other")
     run, other = arguments.reference, arguments.others[0]
     return {"run": word_of_address(str(run)), "other": word_of_address(str(other))}
 

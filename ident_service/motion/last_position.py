@@ -106,7 +106,7 @@ class PositionFile:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UsageError(f"{self._path}: cannot be read ({error}); look at the arm, then remove the file") from None
+            raise UsageError(f"{self._path}: cannot be read ({error}); check the arm, then remove the file") from None
 
 
 def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:

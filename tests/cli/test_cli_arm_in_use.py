@@ -118,5 +118,5 @@ def test_a_stop_ends_a_preflight(state: Path) -> None:
         arm.exchange(np.zeros(2))
         asked.append(True)
         arm.exchange(None)
-        with pytest.raises(DriverError, match="somebody asked for a stop"):
+        with pytest.raises(DriverError, match="a stop was requested"):
             arm.exchange(np.zeros(2))

@@ -329,5 +329,5 @@ def test_a_stop_of_an_unknown_arm_names_those_that_are_remembered(state: Path, i
         ended = ident(*words)
         assert ended.code == 2
         assert "planar2" in ended.err  # shipped
-        assert f"arms that {state} remembers: mine" in ended.err
+        assert f"arms in {state}: mine" in ended.err
     assert ident("stop", "mine").code == 0

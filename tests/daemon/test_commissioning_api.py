@@ -169,7 +169,7 @@ def test_check_run_identify(daemon: Asked, arm: str) -> None:
     assert result["feasible"] is True
     assert daemon.get(f"/api/v1/runs/{ended['run']}").json()["parameters"]["sha256"]
     log = daemon.get(f"/api/v1/jobs/{early['id']}/log").text
-    assert "not checked yet" in log
+    assert "no preflight ticket" in log
 
 
 @pytest.mark.parametrize(

@@ -195,5 +195,5 @@ def test_what_cannot_be_meant_is_refused(arms: Path, ident: Ident, tmp_path: Pat
         assert not out.exists()
     code, _, err = ident("payload", bare, tooled, "--out", bare)
     assert code == 2
-    assert "would replace the arm's own parameters" in err
+    assert "would replace the arm's parameters" in err
     read_results(bare)

@@ -75,5 +75,5 @@ def test_a_damaged_file_is_not_taken_for_none(folder: Path, name: str, content: 
     folder.mkdir(parents=True)
     (folder / name).write_text(content)
     for ask in (FaultStore(folder).latched, lambda: FaultStore(folder).began(Path("run"))):
-        with pytest.raises(UsageError, match=f"{name}: cannot be read .* look at the arm, then remove the file"):
+        with pytest.raises(UsageError, match=f"{name}: cannot be read .* check the arm, then remove the file"):
             ask()

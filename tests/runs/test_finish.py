@@ -107,7 +107,7 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     [
         (["--until", "0.1", "--parameter", "nonsense"], "nonsense: not among the base parameters"),
         (["--until", "0"], "a target of 0 of a parameter"),
-        (["--parameter", "fv1"], "--parameter is what --until SHARE is about"),
+        (["--parameter", "fv1"], "--parameter needs --until SHARE"),
     ],
 )
 def test_a_target_that_is_none_is_refused_before_anything_moves(
@@ -122,7 +122,7 @@ def test_a_target_that_is_none_is_refused_before_anything_moves(
 
 def test_finish_is_refused_where_nobody_moves(virtual_arm: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["finish", str(virtual_arm), "--state", str(tmp_path / "state")]) == 2
-    assert "nobody moves the arm" in capsys.readouterr().err
+    assert "the arm is not moving" in capsys.readouterr().err
 
 
 _AS_ZERO = 0.01

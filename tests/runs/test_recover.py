@@ -222,9 +222,9 @@ def ident(tmp_path: Path, state: Path, capsys: pytest.CaptureFixture[str]) -> It
 def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tmp_path: Path, state: Path) -> None:
     code, said = ident("home")
     assert code == 3
-    assert "not checked yet" in said
+    assert "no preflight ticket" in said
     assert ident("check", "--home", "--confirm", "planar2")[0] == 0
-    # A ticket for a way home is none for a motion.
+    # A ticket for the path home is none for a motion.
     code, said = ident("run", "--out", str(tmp_path / "run"))
     assert code == 3
     assert "the motion has changed since" in said
