@@ -194,8 +194,9 @@ def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Gener
     if bool(np.any(lowest < limits.lower) or np.any(highest > limits.upper)):
         joint = int(np.argmax(np.maximum(limits.lower - lowest, highest - limits.upper)))
         raise MotionRefused(
-            f"the trajectory to or from the motion moves joint {joint + 1} to {lowest[joint]:.3f}..{highest[joint]:.3f},"
-            f" outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; start closer to it or slower"
+            f"the trajectory to or from the motion moves joint {joint + 1} to "
+            f"{lowest[joint]:.3f}..{highest[joint]:.3f}, outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; "
+            "start closer to it or slower"
         )
     return reference
 

@@ -246,7 +246,7 @@ def test_identify_replaces_an_earlier_result_and_nothing_else(place: Path, quick
     words = identify(place, quick, quick.folder / "identification.mcap")
     refused = ident(*words)
     assert refused.code == 2
-    assert "holds what is not of an earlier result: report.txt; give a folder that does not exist" in refused.err
+    assert "holds files that are not of an earlier result: report.txt; give a folder that does not exist" in refused.err
     assert left_over(place) == ["out", "out/report.txt"]
     (folder / "report.txt").unlink()
     assert ident(*words, "--sdpa").code == 0
