@@ -1,11 +1,14 @@
-"""Check the documents: every decision that is cited can be found, every link leads somewhere, every file exists."""
+"""Check the documents: decisions that are cited, links, files, and commands are there."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+
+from ident_service.cli import parser
 
 ROOT = Path(__file__).resolve().parents[1]
 DECISIONS = ROOT / "docs" / "decisions"
@@ -86,3 +89,41 @@ def test_links_and_files_of_a_document_exist(document: Path) -> None:
     if document.name != "CHANGELOG.md":  # which tells of files as they were
         for file in re.findall(r"`((?:ident_service|drivers|sim_backend|estimation|motion|tests)/[\w/.]+\.py)`", text):
             assert (ROOT / file).is_file() or (ROOT / "ident_service" / file).is_file(), file
+
+
+PLACEHOLDER = re.compile(
+    r"invalid \w+ value: '[A-Z]+'|a (?:whole )?number|is needed|are required: |expected (?:at least )?one argument"
+)
+FORMER = {"check", "rehearse", "ack", "base", "correct"}
+
+
+def commands(text: str) -> list[list[str]]:
+    """The words after `ident` of every command in a block or between backticks."""
+    blocks = re.findall(r"(?ms)^```(?:sh|bash)?\n(.*?)^```$", text)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    found = []
+    for line in [*lines, *re.findall(r"`([^`\n]+)`", without_code(text).replace("\n", " "))]:
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError:
+            continue
+        if words[:1] == ["ident"] and len(words) > 1 and words[1] not in ("...", "VERB"):
+            found.append(words[1:])
+    return found
+
+
+@pytest.mark.parametrize("document", [path for path in DOCUMENTS if path.name != "CHANGELOG.md"], ids=lambda p: p.stem)
+def test_commands_of_a_document_are_understood(document: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for words in commands(document.read_text(encoding="utf-8")):
+        assert words[0] not in FORMER, words
+        try:
+            parser().parse_args(words)
+        except SystemExit:  # a word in capitals stands for a value, and a command may be named without its arguments
+            message = capsys.readouterr().err
+            assert "unrecognized" not in message, (words, message)
+            assert "invalid choice" not in message, (words, message)
+            assert PLACEHOLDER.search(message) or "--help" in words or "--version" in words, (words, message)
+
+
+def test_the_readme_names_commands() -> None:
+    assert len(commands((ROOT / "README.md").read_text(encoding="utf-8"))) > 50
