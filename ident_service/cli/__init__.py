@@ -1,6 +1,6 @@
 """Run the command `ident`: parse its arguments, call the functions of the Python API, print, return an exit code.
 
-One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them.
+One file per group of commands: `GROUPS` lists them; each registers its commands with `add(verbs)` and runs them.
 """
 
 from __future__ import annotations

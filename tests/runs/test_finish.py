@@ -176,5 +176,5 @@ def test_one_that_looks_may_die_or_hang(tmp_path: Path, how: signal.Signals) -> 
                 time.sleep(0.01)
         assert not reaching.reached()
     assert reaching._process.returncode is not None
-    died = ["nobody looks any more whether the target is reached; the motion goes on to its end"]
+    died = ["the target is no longer monitored; the motion continues to its end"]
     assert told == (died if how is signal.SIGKILL else [])

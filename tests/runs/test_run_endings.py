@@ -230,7 +230,7 @@ def test_a_refusal_stays_one_and_a_death_without_a_word_is_none(tmp_path: Path) 
     faults = fault_file(tmp_path, "planar2")
     with pytest.raises(MotionRefused, match=r"^not at rest$"):
         ProcessResult({}, {"kind": "MotionRefused", "message": "not at rest"}).raise_for(faults)
-    with pytest.raises(ArmError, match=r"without a word \(SIGKILL\) before it took the arm"):
+    with pytest.raises(ArmError, match=r"without a message \(SIGKILL\) before it opened the arm"):
         ProcessResult({}, {}, -signal.SIGKILL).raise_for(faults)
     ProcessResult({"state": "done"}, {}, os.EX_OK).raise_for(faults)
 
