@@ -94,6 +94,7 @@ def test_links_and_files_of_a_document_exist(document: Path) -> None:
 PLACEHOLDER = re.compile(
     r"invalid \w+ value: '[A-Z]+'|a (?:whole )?number|is needed|are required: |expected (?:at least )?one argument"
 )
+PARSER = parser()
 FORMER = {"check", "rehearse", "ack", "base", "correct"}
 
 
@@ -117,7 +118,7 @@ def test_commands_of_a_document_are_understood(document: Path, capsys: pytest.Ca
     for words in commands(document.read_text(encoding="utf-8")):
         assert words[0] not in FORMER, words
         try:
-            parser().parse_args(words)
+            PARSER.parse_args(words)
         except SystemExit:  # a word in capitals stands for a value, and a command may be named without its arguments
             message = capsys.readouterr().err
             assert "unrecognized" not in message, (words, message)
