@@ -23,7 +23,7 @@
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
         │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
-        ├── Stopped                    a motion did not come to its end, because somebody asked for a stop
+        ├── Stopped                    a motion did not come to its end, because a stop was requested
         └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
@@ -174,7 +174,7 @@ class PositionUnknown(DriverError):
 
 
 class Stopped(ArmError):
-    """A motion did not come to its end: somebody asked for a stop, or nobody renewed its lease."""
+    """A motion did not come to its end: a stop was requested, or nobody renewed its lease."""
 
 
 class ArmFault(ArmError):

@@ -396,7 +396,7 @@ def _lines(profile: BusProfile) -> Iterator[Line]:
         yield _line(profile, "heartbeats of the drives", beats, (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_drives)
     if guarded:
         often = 1.0 / (GUARD_EARLY * profile.guarding[0])
-        yield _line(profile, "questions of node guarding", guarded, (), often)
+        yield _line(profile, "requests of node guarding", guarded, (), often)
         yield _line(profile, "answers to them", guarded, (HEARTBEAT_STATE,), often)
     yield _line(
         profile, "heartbeat of the host", (HEARTBEAT + profile.host,), (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_host

@@ -566,7 +566,7 @@ class CanopenArm(Arm):
                 if self._stops == stops:
                     buses.control(number, word)
             if self._stops != stops:
-                raise DriverError("the arm was stopped on its drives' way to another state")
+                raise DriverError("the arm was stopped while its drives changed state")
 
     def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
         drives = buses.drives

@@ -113,7 +113,7 @@ class Coordinates:
             if not -_TURN // 2 <= low <= high < _TURN // 2:
                 raise DriverError(
                     f"position limits at counts {low} to {high} do not fit the 32 bits of 607Dh; "
-                    "a drive that counts from where it was when power came begins anew when its power is switched"
+                    "a drive that counts from power-up starts again when its power is switched"
                 )
             found.append((low, high))
         return found

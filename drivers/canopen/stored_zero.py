@@ -148,7 +148,7 @@ class Zeros:
         return (
             f"drives {', '.join(map(str, sorted(nodes)))} do not know where the arm stands: their encoders count from "
             "where they were when power came, and nobody has zeroed them since (with this description); lead the arm "
-            f"to its home by hand, then `ident home {self._name} --zero`"
+            f"to its home by hand, then `ident set-home {self._name}`"
         )
 
 

@@ -446,7 +446,7 @@ def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]
         if drive in chosen:
             last = drive.emergency
             why = "" if last is None else f" ({emergency_words(last.code, last.register, last.vendor)})"
-            silent = "has told no status word" + (" since it booted" if drive.boots else "")
+            silent = "has sent no status word" + (" since it booted" if drive.boots else "")
             says = silent if drive.status is None else f"is in the state {drive.state}{why}"
             words.append(f"{name} {says}")
     return "; ".join(words)

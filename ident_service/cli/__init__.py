@@ -1,6 +1,6 @@
 """Run the command `ident`: parse its arguments, call the functions of the Python API, print, return an exit code.
 
-One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them.
+One file per group of commands: `GROUPS` lists them; each registers its commands with `add(verbs)` and runs them.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         print_answer(arguments, code, text, document)
     except OSError as error:
-        print_to_person(f"ident: done, but the answer cannot be written: {error.strerror}\n")
+        print_to_person(f"ident: done, but the output cannot be written: {error.strerror}\n")
         discard(sys.stdout)
         return FAILED
     return code
@@ -164,7 +164,7 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
     if error.errno == errno.ENAMETOOLONG:
         return UsageError(f"{place[:40]}...: this name is too long for a file")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFull(f"{place}: cannot be written: {error.strerror}; make room, then ask again")
+        return DiskFull(f"{place}: cannot be written: {error.strerror}; free disk space, then try again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         from ident_service.registry.state_folder import shut_out
 
@@ -177,7 +177,7 @@ def parser() -> Parser:
     """Build the argument parser with all verbs and their arguments."""
     top = Parser(
         prog="ident",
-        description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
+        description="Commission a robot arm: move it, record it, and identify physically feasible dynamic parameters.",
     )
     top.add_argument("--version", action="version", version=f"ident-service {__version__}")
     verbs = VerbList.of(top)

@@ -250,7 +250,7 @@ class CanopenDriver(ExtendedSection):
     without its position a joint counts as gone: 3 to 5 (FIELDBUS.md), or what takes 10 ms, as long as a stall may last.
     `bring_up` [s] is how long all drives together may take for one step to `operation enabled`. `zero` says whether
     encoders know where they stand (`absolute`), or count from where they were when power came; then a person leads
-    the arm to the joints' `home` and says so, `ident home ARM --zero`, after every loss of power. `measured_torque`
+    the arm to the joints' `home` and says so, `ident set-home ARM`, after every loss of power. `measured_torque`
     says whether drives report the torque that they measure (6077h): with their positions, in every cycle
     (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
     object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the

@@ -256,7 +256,7 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
     if change < settled:
         return ()
     return (
-        f"{what} did not settle: of all rounds the one is used that changed a parameter least, by {change:.2g} of its"
+        f"{what} did not converge: the round is used that changed parameters least, by {change:.2g} of its"
         " standard deviations",
     )
 

@@ -338,8 +338,8 @@ def _check(method: str, recordings: Sequence[Recording], validation: Sequence[Re
     for index, recording in enumerate(recordings):
         if any(overlap(recording, other) for other in recordings[:index]):
             raise UsageError(
-                f"{recording.path}: the same recording twice would make the doubt too small; leave one out, or give"
-                " ranges that do not overlap"
+                f"{recording.path}: the same recording twice would make the uncertainty too small; leave one out, or "
+                "give ranges that do not overlap"
             )
     if seen := [str(one.path) for one in validation if any(overlap(one, other) for other in recordings)]:
         raise UsageError(

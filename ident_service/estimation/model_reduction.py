@@ -98,7 +98,7 @@ def essential_parameters(
     """
     size = len(fit.beta)
     if fit.rank < size:
-        raise ModelError(f"the data see {fit.rank} of {size} directions; record a motion that excites all of them")
+        raise ModelError(f"the data excite {fit.rank} of {size} directions; record a motion that excites all of them")
     if not 0.0 < level < 1.0:
         raise ModelError(f"{level=} is no level of a test")
     covariance = block_covariance(equations, fit) if covariance is None else covariance

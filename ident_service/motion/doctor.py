@@ -230,7 +230,7 @@ def _throttling(root: Path) -> Finding:
     share = runtime / period
     found = f"real-time processes get {share:.0%} of {period / 1e6:g} s"
     if share >= _RUNTIME:
-        return Finding(what, State.GOOD, f"{found}, which is more than a loop takes")
+        return Finding(what, State.GOOD, f"{found}, more than a loop takes")
     return Finding(what, State.POOR, found, "`sysctl kernel.sched_rt_runtime_us=-1`, or 0.95 of the period")
 
 
@@ -273,7 +273,7 @@ def _wake_up(root: Path) -> Finding:
     if not file.exists():
         return Finding(what, State.UNKNOWN, "no /dev/cpu_dma_latency in this container, or kernel")
     if os.access(file, os.W_OK):
-        return Finding(what, State.GOOD, "kept away while a motion runs (/dev/cpu_dma_latency)")
+        return Finding(what, State.GOOD, "prevented while a motion runs (/dev/cpu_dma_latency)")
     rule = 'KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
     remedy = f"`{rule}` in /etc/udev/rules.d/70-cpu-dma-latency.rules, then `udevadm trigger`"
     return Finding(what, State.POOR, "/dev/cpu_dma_latency is not writable for this user", remedy)
@@ -295,10 +295,10 @@ def _cores(settings: Realtime, root: Path) -> Finding:
         )
     wanted = settings.cores or tuple(isolated)
     if wanted and set(wanted) <= set(isolated):
-        return Finding(what, State.GOOD, f"{', '.join(map(str, wanted))} isolated from all else")
-    remedy = "`isolcpus=3 nohz_full=3 rcu_nocbs=3` on the kernel's command line sets core 3 apart"
+        return Finding(what, State.GOOD, f"{', '.join(map(str, wanted))} isolated")
+    remedy = "`isolcpus=3 nohz_full=3 rcu_nocbs=3` on the kernel's command line isolates core 3"
     if len(here) < 3:
-        return Finding(what, State.POOR, f"{len(here)}: none can be set apart beside the kernel's work", "more cores")
+        return Finding(what, State.POOR, f"{len(here)}: no core can be isolated", "more cores")
     return Finding(what, State.POOR, f"of {len(here)}, the motion's is not isolated", remedy)
 
 
@@ -310,7 +310,10 @@ def _machine(root: Path) -> Finding:
     flags = next((line for line in text.splitlines() if line.startswith("flags")), "")
     if " hypervisor" in flags:
         return Finding(
-            what, State.POOR, "a virtual machine, whose host stalls it as it likes", "run motions on a real computer"
+            what,
+            State.POOR,
+            "a virtual machine, which its host may stall at any time",
+            "run motions on a real computer",
         )
     return Finding(what, State.GOOD, "no virtual machine")
 

@@ -83,8 +83,8 @@ class FaultStore:
         """Raise MotionRefused, which names the faults, if there are any."""
         if faults:
             words = "; ".join(f"{code} ({cause})" for code, cause in faults.items())
-            acks = ", ".join(f"`ident ack {self._arm} {code}`" for code in faults)
-            raise MotionRefused(f"{self._arm}: faults that nobody has acknowledged: {words}; {acks}")
+            acks = ", ".join(f"`ident acknowledge {self._arm} {code}`" for code in faults)
+            raise MotionRefused(f"{self._arm}: unacknowledged faults: {words}; {acks}")
 
     def latch(self, code: str, cause: str) -> None:
         """Store a fault; one that is stored already keeps its first cause.
@@ -111,10 +111,10 @@ class FaultStore:
         faults = self.latched()
         if code not in faults:
             known = ", ".join(faults) or "none"
-            raise UsageError(f"{self._arm}: no fault {code!r} is latched (latched: {known})")
+            raise UsageError(f"{self._arm}: no active fault {code!r} (active: {known})")
         if in_use(self._controls):
             raise UsageError(
-                f"{self._arm}: a process still has the arm; see it stopped and supported (`ident stop`, `ident "
+                f"{self._arm}: a process still controls the arm; stop and support it (`ident stop`, `ident "
                 "supported`), then acknowledge"
             )
         self._write(tuple(row for row in self._rows() if row.code != code))
@@ -169,7 +169,7 @@ class FaultStore:
             raise self._damaged(path, error) from None
 
     def _damaged(self, path: Path, error: Exception) -> UsageError:
-        return UsageError(f"{path}: cannot be read ({error}); look at the arm, then remove the file")
+        return UsageError(f"{path}: cannot be read ({error}); check the arm, then remove the file")
 
     def _write(self, faults: tuple[StoredFault, ...]) -> None:
         self._faults.parent.mkdir(parents=True, exist_ok=True)

@@ -141,7 +141,7 @@ def _run_with_fault_store(request: dict[str, Any], controls: ControlFile) -> dic
         try:
             _remember(faults, latch)
         except UsageError as second:  # the mark stays, so that the arm is not taken for a sound one
-            error.add_note(f"it could not be latched: {second}")
+            error.add_note(f"it could not be stored: {second}")
         raise
     _remember(faults, latch)
     return report
@@ -181,7 +181,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) 
             if not sink.event(arm.clock.now_ns(), 20, sentence):
                 raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
             if lifeline.cut:
-                raise MotionRefused("whoever asked for the motion is gone")
+                raise MotionRefused("the program that started the motion has ended")
             positions.require_not_turned(arm)
             positions.forget()
             moves = True

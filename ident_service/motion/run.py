@@ -237,12 +237,14 @@ class _Run:
     def run(self) -> RunReport:
         if self.latch.faults:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
-            raise MotionRefused(f"faults that nobody has acknowledged: {waiting}")
+            raise MotionRefused(f"unacknowledged faults: {waiting}")
         loop, torque = self._prepared()
         if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
-            raise MotionRefused("a stop was asked for before the arm was energised; nothing has moved")
+            raise MotionRefused("a stop was requested before the arm was energised; nothing has moved")
         if not self.controls.lease_ok(self.arm.clock.now_ns()):
-            raise MotionRefused("whoever asked for the motion is gone, or is silent; nothing has moved")
+            raise MotionRefused(
+                "the program that started the motion has ended or does not renew its lease; nothing has moved"
+            )
         try:
             self.states.enter(State.CHECKED)
             self.arm.enable()
@@ -284,7 +286,7 @@ class _Run:
         described = arm.describe()
         if described.joint_names != chain.names:
             raise MotionRefused(
-                f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
+                f"the drives have the joints {', '.join(described.joint_names)}, "
                 f"the description {', '.join(chain.names)}"
             )
         with keep_host_alive(arm):  # what is worked out takes longer than drives wait for their host
@@ -399,6 +401,6 @@ def _tell_before(error: BaseException, loop: Loop) -> None:
     """Add the first fault and the warnings before a fault to its error, as notes."""
     first, warnings = loop.ended_by, loop.guard.findings.warnings
     if first is not None and first.message not in str(error):
-        error.add_note(f"first came {first.code}: {first.message}")
+        error.add_note(f"the first fault was {first.code}: {first.message}")
     if warnings:
-        error.add_note("warned of before: " + ", ".join(f"{code} {count} times" for code, count in warnings.items()))
+        error.add_note("earlier warnings: " + ", ".join(f"{code} {count} times" for code, count in warnings.items()))

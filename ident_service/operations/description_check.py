@@ -122,21 +122,19 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
     model = checked.model
     head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
     if (payload := model.config.payload) is not None:
-        unknown = "; no prior, so that no model has it" if model.prior is None else ""
+        unknown = "; no prior, so no model has it" if model.prior is None else ""
         head += f"payload: {payload.words}{unknown}\n"
     head += "".join(f"WARNING: {line}\n" for line in checked.warnings)
     head += "" if checked.budget is None else bus_lines(checked.budget)
     if checked.gains is None:
-        return (
-            head + "gains: not judged; limits or gains are missing, so that this arm can be identified but not moved\n"
-        )
+        return head + "gains: not checked; limits or gains are missing, so this arm can be identified but not moved\n"
     return head + _after_stop_text(checked.after_stop) + _gains_text(checked.gains)
 
 
 def _after_stop_text(follows: AfterStop | str | None) -> str:
     """Format what follows a stop as one line; empty for an arm without a model."""
     words = {
-        AfterStop.BRAKE: "held for two seconds, then left to brakes or to itself; nothing can fall",
+        AfterStop.BRAKE: "held for two seconds, then released to its brakes; nothing can fall",
         AfterStop.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
         AfterStop.LOWER: "lowered until it rests",
     }
@@ -157,7 +155,7 @@ def _gains_text(report: StabilityReport) -> str:
         *(f"  {one.joint:<{width}} {one.gain_margin:>12.2f} {1e3 * one.delay_margin:>10.2f} ms" for one in joints),
     ]
     if report.coupled_radius is None:
-        lines.append("  without a prior, each joint is judged by itself")
+        lines.append("  without a prior, each joint is checked by itself")
     else:
         lines.append(f"  all joints together: spectral radius {report.coupled_radius:.6f}, below 1 is stable")
     return "\n".join([*lines, *(f"  {words}" for words in report.objections()), ""])

@@ -242,9 +242,9 @@ def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = op
 
 def _judged(node: FoundNode | None, drive: CanopenDrive) -> tuple[Match, str]:
     if node is None:
-        return Match.MISSING, "neither heard nor answering"
+        return Match.MISSING, "silent"
     if not node.answers:
-        return Match.SILENT, "heard, but answers no SDO request"
+        return Match.SILENT, "sends frames, but answers no SDO request"
     if not node.is_drive:
         kind = "not told" if node.device_type is None else f"{node.device_type:08X}h"
         return Match.OTHER, f"no drive of CiA 402 (1000h is {kind})"
@@ -453,7 +453,7 @@ def _foretold(driver: CanopenDriver, number: int, file: TextFile) -> Capabilitie
 def probe_text(config: ArmConfig, found: Probe) -> str:
     """Format a probe as text, with a last line break."""
     bad = [one for one in found.probed if not one.drivable]
-    verdict = f"{len(bad)} of {len(found.probed)} NOT AS IT IS" if bad else "every drive can be driven"
+    verdict = f"{len(bad)} of {len(found.probed)} NOT as described" if bad else "every drive can be driven"
     lines = [f"{config.name}: {verdict}; nothing was written"]
     for one in found.probed:
         lines += ["", *_lines(one, found)]
@@ -472,7 +472,7 @@ def _lines(one: Probed, found: Probe) -> Iterator[str]:
         yield f"{one.title}, node {one.node}: {one.silent}"
         return
     verdict = "CANNOT BE DRIVEN" if can.problems else "not as described" if can.changes else "can be driven"
-    by = "" if can.found.asked else ", foretold by its data sheet"
+    by = "" if can.found.asked else ", predicted from its EDS"
     yield f"{one.title}, node {one.node}: {can.family.name}: {verdict}{by}"
     if one.silent:
         yield f"  {one.silent}"
@@ -503,7 +503,7 @@ def _facts(one: Probed, found: Probe) -> dict[str, str]:
     mode = f"mode {can.torque.mode}" + (f" ({named(can.torque.by.entry)})" if can.torque.by else "")
     facts["torque"] = f"{mode}, {named(can.torque.target)}; a count is {count}{of}"
     facts["torque_limit"] = "none" if can.limit is None else named(can.limit.entry)
-    facts["speed_limit"] = "the host's alone" if can.speed is None else where(can.speed)
+    facts["speed_limit"] = "set by the host" if can.speed is None else where(can.speed)
     facts["watchdogs"] = ", ".join(can.watchdogs) or "none"
     dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"

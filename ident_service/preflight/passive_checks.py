@@ -115,7 +115,7 @@ def identities_check(
     if described.joint_names != names:
         return failed(
             code,
-            f"the arm on the bus has the joints {', '.join(described.joint_names)}, the description {', '.join(names)}",
+            f"the drives have the joints {', '.join(described.joint_names)}, the description {', '.join(names)}",
             "Give the description of this arm, or connect the arm that the description means.",
         )
     if expected is not None and tuple(expected) != described.identities:
@@ -212,7 +212,7 @@ def rate_check(looked: IdleRecording, lock_step: bool) -> Check:
     """
     code = "rate"
     if lock_step:
-        return skipped(code, "time is virtual: it waits for whoever is late, so there is nothing to measure")
+        return skipped(code, "time is virtual, so there is no lateness to measure")
     period = looked.period
     gaps = np.diff(looked.woken_ns) * 1e-9
     late = np.maximum(gaps - period, 0.0)
@@ -306,12 +306,11 @@ def noise_check(
 
 def unreachable(error: ArmError) -> Check:
     """Return the failed check of an arm that could not be opened or recorded, with the reason."""
-    remedy = "Check power, cables and that no other program has the arm."
+    remedy = "Check power, cables, and that no other program uses the arm."
     if isinstance(error, PositionUnknown):
-        remedy = "Do what this says; nobody else knows where the arm stands."
+        remedy = "Do this; only a person can tell where the arm is."
     elif isinstance(error, AnotherDrive):
         remedy = (
-            "Put the drives back in their places; after a repair calibrate zero and torque scale, then enter the new "
-            "identity."
+            "Put the drives back in place; after a repair calibrate zero and torque scale, then enter the new identity."
         )
     return Check("identities", Verdict.FAILED, (), str(error), remedy)

@@ -104,8 +104,8 @@ def preflight(
     Args:
         arm: not open; it stands on its support, without torque.
         model: of the arm.
-        excitation: to be run; None to check the arm for a way home or out of a limit, which may begin a little outside
-            the position limits.
+        excitation: to be run; None for the path home or out of a limit, which may begin a little outside the
+            position limits.
         confirm: shows a question and returns what a person typed; asked once, before anything is energised.
         clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
         identities: of the drives, as an earlier ticket has them; None accepts whatever answers.
@@ -197,10 +197,10 @@ class _Preflight:
     def all_checks(self) -> list[Check]:
         """Return every check; those that were not made name the one that failed."""
         because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
-        why = "nothing before it failed, but it was not reached" if because is None else f"because {because} failed"
+        why = "not reached, although nothing failed before" if because is None else f"because {because} failed"
         made = dict(self.checks)
         if self.excitation is None:
-            made |= {code: skipped(code, "no motion is asked about") for code in ("motion_fits", "motion_proven")}
+            made |= {code: skipped(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
         return [made.get(code) or skipped(code, why) for code in CODES]
 
     def _opened(self, limits: MotionLimits) -> None:
@@ -228,7 +228,7 @@ class _Preflight:
         self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
 
     def _bounds(self, limits: MotionLimits) -> MotionLimits:
-        """Return where the run may begin: inside the limits, or for a way home as far outside as `reachable` allows."""
+        """Return where the run may begin: inside the limits; for the path home as far outside as `reachable` allows."""
         return limits if self.excitation is not None else recoverable_limits(limits)
 
     def _agreed(self, looked: IdleRecording, limits: MotionLimits) -> Consent | None:
@@ -393,14 +393,14 @@ class _Preflight:
             self._passed(sign_failure([astray], self.model, str(error)))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
-            self._passed(failed("direction", f"{name} went astray: {error}", remedy))
+            self._passed(failed("direction", f"{name} left the path: {error}", remedy))
 
     def _broken(self, error: ArmError) -> None:
         """Record a failed check for an arm that could not be opened, recorded or energised, or that fell silent."""
         if self.described is None or "identities" not in self.checks:
             self._passed(unreachable(error))
         else:
-            # None about the motion: a way home may begin although one of them failed. The last where all are made.
+            # None about the motion: the path home may begin although one of them failed. The last where all are made.
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
             code = next(left, CODES[-1])
             remedy = "Check power, cables, bus and the drives' own fault codes."

@@ -107,7 +107,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
             share = peak / getattr(limits, key)
             taken += measures(f"{key}, share of the limit", share, ("",) * len(names), names, most=np.ones(len(names)))
     least = model.config.workspace.clearance
-    for what, clearance in (("clearance", proof.clearance), ("clearance of the way from home", proof.approach)):
+    for what, clearance in (("clearance", proof.clearance), ("clearance on the way from home", proof.approach)):
         if clearance is not None and clearance.pair is not None:
             taken.append(measure(what, clearance.lower_bound, "m", least=least))
     if nearest.pair is not None:
@@ -168,7 +168,7 @@ def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> C
     try:
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
     except (ModelError, MotionRefused) as error:
-        return failed(code, str(error), "Move the arm by hand to where the straight way home is free.")
+        return failed(code, str(error), "Move the arm by hand to where the straight path home is free.")
     return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
 
 

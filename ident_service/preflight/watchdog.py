@@ -64,8 +64,8 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
         confirm: shows a question and returns what the person typed.
     """
     if not sample.status:
-        why = "the driver does not tell what the drives do, so their watchdog cannot be seen to act"
-        return Consent(False, skipped(CODE, why, "Prove it by hand: pull the bus cable while the arm is supported."))
+        why = "the driver does not report drive states, so the watchdogs cannot be tested"
+        return Consent(False, skipped(CODE, why, "Test it by hand: pull the bus cable while the arm is supported."))
     name = model.config.name
     typed = confirm(
         f"The drives' own watchdog is tried at the end, at rest and in a small motion: they hear no more of what "
@@ -139,7 +139,9 @@ def watchdog_check(
                         continue
                     gave_up[number] = silent, word
                     if number not in watched:
-                        strange.append(f"{dogs[number].drive} stopped when {_WORDS[kind]} stayed away, not by its own")
+                        strange.append(
+                            f"{dogs[number].drive} stopped when {_WORDS[kind]} was missing, not because of its own"
+                        )
                 if strange:
                     break
                 if kind == "sync_loss":
@@ -154,7 +156,7 @@ def watchdog_check(
         travel = _travel(arm, at, moving) if moving is not None else None
     except ArmFault as ended:
         why = f"{where}, while drives missed {_WORDS[kind]} and before all had said that they stopped: {ended}"
-        return failed(CODE, f"{why}; the arm was let go", REMEDY)
+        return failed(CODE, f"{why}; the arm was released", REMEDY)
     finally:
         arm.stop(StopKind.TORQUE_OFF)
     found = []
@@ -165,10 +167,10 @@ def watchdog_check(
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
         if fault:
-            strange.append(f"{dog.drive} gave up for another reason ({word!r})")
+            strange.append(f"{dog.drive} stopped for another reason ({word!r})")
     if moving is not None and travel is not None:
         unit = "rad" if model.chain.revolute[moving] else "m"
-        found.append(measure("in motion, way until it rests", travel, unit, joint=model.chain.names[moving]))
+        found.append(measure("in motion, distance until at rest", travel, unit, joint=model.chain.names[moving]))
     return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
 
 

@@ -170,8 +170,8 @@ def test_after_bus_off_sending_is_refused_until_a_restart() -> None:
     ("error", "kind", "says"),
     [
         (can.CanOperationError("Failed to transmit", errno.ENETDOWN), "down", "ip link set can3 up type can bitrate 5"),
-        (can.CanOperationError("Failed to transmit", errno.ENOBUFS), "full", "nobody acknowledges"),
-        (can.CanOperationError("Transmit buffer full"), "full", "nobody acknowledges"),
+        (can.CanOperationError("Failed to transmit", errno.ENOBUFS), "full", "no node acknowledges"),
+        (can.CanOperationError("Transmit buffer full"), "full", "no node acknowledges"),
         (can.CanOperationError("Failed to receive", errno.ENODEV), "gone", "the interface has gone.*Failed to receive"),
         (can.CanOperationError("something new"), "gone", "something new"),
         (can.CanInterfaceNotImplementedError("no library", errno.ENODEV), "gone", "no library"),

@@ -11,7 +11,7 @@ import pytest
 from cli.conftest import COARSE, Commissioned, Ident, left_over, quick_arm
 
 from ident_service import __version__
-from ident_service.cli import main
+from ident_service.cli import main, parser
 
 
 @pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])
@@ -19,6 +19,33 @@ def test_help(ident: Ident, words: tuple[str, ...]) -> None:
     ended = ident(*words, "--help")
     assert ended.code == 0
     assert ended.out.startswith("usage: ident")
+
+
+FORMER = {
+    "check": "preflight",
+    "ack": "acknowledge",
+    "base": "base-parameters",
+    "correct": "project",
+    "alarm ack": "alarm acknowledge",
+}
+
+
+@pytest.mark.parametrize("former", FORMER)
+def test_a_former_name_is_understood_and_not_shown(former: str, ident: Ident) -> None:
+    now = FORMER[former]
+    assert ident(*former.split(), "--help").out == ident(*now.split(), "--help").out
+    shown = ident(*now.split()[:-1], "--help").out
+    words = {line.split()[0] for line in shown.splitlines() if line.startswith("    ") and line[4:5].strip()}
+    assert now.split()[-1] in words
+    assert former.split()[-1] not in words
+    assert not {"rehearse", "--zero"} & words
+
+
+def test_home_zero_is_set_home() -> None:
+    formerly, now = parser().parse_args(["home", "planar2", "--zero"]), parser().parse_args(["set-home", "planar2"])
+    assert formerly.verb is now.verb
+    assert formerly.zero
+    assert now.zero
 
 
 def test_version(ident: Ident) -> None:

@@ -246,7 +246,7 @@ def test_identify_replaces_an_earlier_result_and_nothing_else(place: Path, quick
     words = identify(place, quick, quick.folder / "identification.mcap")
     refused = ident(*words)
     assert refused.code == 2
-    assert "holds what is not of an earlier result: report.txt; give a folder that does not exist" in refused.err
+    assert "holds files that are not of an earlier result: report.txt; give a folder that does not exist" in refused.err
     assert left_over(place) == ["out", "out/report.txt"]
     (folder / "report.txt").unlink()
     assert ident(*words, "--sdpa").code == 0
@@ -329,5 +329,5 @@ def test_a_stop_of_an_unknown_arm_names_those_that_are_remembered(state: Path, i
         ended = ident(*words)
         assert ended.code == 2
         assert "planar2" in ended.err  # shipped
-        assert f"arms that {state} remembers: mine" in ended.err
+        assert f"arms in {state}: mine" in ended.err
     assert ident("stop", "mine").code == 0

@@ -77,7 +77,7 @@ def test_what_is_no_folder_of_an_identification_says_what_it_is(folder: Path, id
         assert ended.code == 2
         assert ended.err == f"ident: {folder}: holds a payload, which has no report; comparison.html shows it\n"
     (folder / "comparison.html").unlink()
-    assert "payload.txt tells of it" in ident("report", folder).err
+    assert "see payload.txt" in ident("report", folder).err
 
 
 def test_a_changed_file_is_refused(folder: Path, ident: Ident) -> None:

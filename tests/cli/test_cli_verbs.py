@@ -43,7 +43,7 @@ def test_simulate_prints_score_and_files(quick: Commissioned) -> None:
     assert sorted(path.name for path in quick.folder.iterdir()) == RUN_FILES
     assert f"files: {quick.folder}" in quick.out
     assert all(f"  {name}\n" in quick.out for name in RUN_FILES)
-    assert "score against the truth" in quick.out
+    assert "comparison with the true parameters" in quick.out
     assert "planar2: 13 base parameters of 28 link parameters" in quick.out
 
 
@@ -183,7 +183,7 @@ def test_feasible(ident: Ident, tmp_path: Path, content: dict[str, list[object]]
     words = ident("feasible", path)
     assert words.code == code
     assert words.out.startswith(f"{path}: {'feasible' if code == 0 else 'INFEASIBLE'} (pseudo_inertia), margin ")
-    assert ("contradicted by:\n  link 1: a mass distribution exists" in words.out) is (code == 3)
+    assert ("violated constraints:\n  link 1: a mass distribution exists" in words.out) is (code == 3)
     document = ident("feasible", path, "--json", "--feasible-set", "inertia").json
     assert document["feasible"] is (code == 0)
     assert document["feasible_set"] == "inertia"

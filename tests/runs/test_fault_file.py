@@ -36,7 +36,9 @@ def test_a_fault_stays_until_it_is_acknowledged_by_name(folder: Path) -> None:
     faults.latch("driver", "a cable")
     faults.latch("runaway", "another cause")
     assert list(FaultStore(folder).latched().items()) == [("runaway", "a sign"), ("driver", "a cable")]
-    with pytest.raises(MotionRefused, match=r"small: faults .* runaway \(a sign\); driver \(a cable\); `ident ack"):
+    with pytest.raises(
+        MotionRefused, match=r"small: faults .* runaway \(a sign\); driver \(a cable\); `ident acknowledge"
+    ):
         faults.began(Path("run"))
     with pytest.raises(UsageError, match=r"small: no fault 'far_outside' is latched \(latched: runaway, driver\)"):
         faults.acknowledge("far_outside")
@@ -73,5 +75,5 @@ def test_a_damaged_file_is_not_taken_for_none(folder: Path, name: str, content: 
     folder.mkdir(parents=True)
     (folder / name).write_text(content)
     for ask in (FaultStore(folder).latched, lambda: FaultStore(folder).began(Path("run"))):
-        with pytest.raises(UsageError, match=f"{name}: cannot be read .* look at the arm, then remove the file"):
+        with pytest.raises(UsageError, match=f"{name}: cannot be read .* check the arm, then remove the file"):
             ask()

@@ -81,7 +81,7 @@ def test_a_full_disk_is_the_fault_that_it_is(
     lines = err.splitlines()
     assert lines[0] == f"ident: {code}: {cause}"
     assert f"{run / 'manifest.json'}: cannot be written: Is a directory" in lines
-    assert f"recorded until then: {run / 'run.mcap.partial'}" in lines
+    assert f"recording until the fault: {run / 'run.mcap.partial'}" in lines
     names = sorted(path.name for path in run.iterdir())
     assert lines[-len(names) - 1 :] == [f"files: {run}", *(f"  {name}" for name in names)]
     if form == "json":
@@ -171,7 +171,7 @@ def another_drive(ticket: dict[str, Any]) -> None:
     [
         (age, "it expired at", False),
         (another_arm, "the arm's description has changed", False),
-        pytest.param(another_drive, "the drives are others", True, marks=pytest.mark.slow),
+        pytest.param(another_drive, "the drives are not those", True, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_that_is_refused_leaves_no_folder(
@@ -230,7 +230,7 @@ def test_a_refusal_stays_one_and_a_death_without_a_word_is_none(tmp_path: Path) 
     faults = fault_file(tmp_path, "planar2")
     with pytest.raises(MotionRefused, match=r"^not at rest$"):
         ProcessResult({}, {"kind": "MotionRefused", "message": "not at rest"}).raise_for(faults)
-    with pytest.raises(ArmError, match=r"without a word \(SIGKILL\) before it took the arm"):
+    with pytest.raises(ArmError, match=r"without a message \(SIGKILL\) before it opened the arm"):
         ProcessResult({}, {}, -signal.SIGKILL).raise_for(faults)
     ProcessResult({"state": "done"}, {}, os.EX_OK).raise_for(faults)
 

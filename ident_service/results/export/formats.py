@@ -165,7 +165,7 @@ def _check(arm: IdentifiedArm, text: str, name: str) -> None:
     if content["base_parameters"]["values"] != arm.beta.tolist():
         raise ModelError(f"{name}: the base parameters read back differ; it was not written")
     if content["friction"]["presliding"] != presliding_ways(arm.model).tolist():
-        raise ModelError(f"{name}: the ways of pre-sliding read back differ; it was not written")
+        raise ModelError(f"{name}: the pre-sliding distances read back differ; it was not written")
     if arm.delta is None:
         return
     joints, drives, n = content["joints"], dict(content["drives"]), len(content["joints"])
@@ -217,7 +217,7 @@ class Export:
     notes: tuple[str, ...] = ()
 
 
-_BASE_ONLY = "no body has these parameters: base parameters only"
+_BASE_ONLY = "not feasible: base parameters only"
 
 
 def _urdf(arm: IdentifiedArm) -> Export:

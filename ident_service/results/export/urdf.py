@@ -223,12 +223,14 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
         rest = whole - sum((inertial for _, inertial in bolted), np.zeros(10))
         names = ", ".join(name for name, _ in bolted)
         if bolted and is_real(rest) and all(is_real(inertial) for _, inertial in bolted):
-            notes.append(f"link {link} has the identified body less what is bolted to it, which is as it was: {names}")
+            notes.append(
+                f"link {link} has the identified body less the links fixed to it, which are unchanged: {names}"
+            )
             whole = rest
         elif bolted:
-            notes.append(f"link {link} has the whole identified body; what is bolted to it has no inertia now: {names}")
+            notes.append(f"link {link} has the whole identified body; links fixed to it have no inertia now: {names}")
             if movable := [name for name, _ in bolted if name in robot.on_held_joints]:
-                notes.append(f"of these, {', '.join(movable)} hang on joints that move, which some programs refuse")
+                notes.append(f"of these, {', '.join(movable)} are on moving joints, which some programs refuse")
             edits += [_removed(robot.links[name], file.name) for name, _ in bolted]
         edits += _inertial(file.text, robot.links[link], whole)
         written = {
