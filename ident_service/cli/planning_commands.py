@@ -200,7 +200,7 @@ def _new(arguments: argparse.Namespace) -> Answer:
     lines = [f"{path}: a first description, and a simulated arm to try it with"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
-    return DONE, "\n".join(lines), {"description": str(path), "guessed": list(guessed)}
+    return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 
 def _check(arguments: argparse.Namespace) -> Answer:

@@ -5,8 +5,8 @@ torque and every fault is in `faults.json`. A process that is killed in between,
 the mark; a mark without a process that holds the arm's control file is the fault `motion_process`.
 
 A disk may fill while the arm moves, so the mark has room for the faults: a JSON object, and after it `_ROOM` blanks,
-which are overwritten by a line of JSON for each. That takes no new block where files are overwritten in place (ext4, xfs,
-tmpfs); a file system that copies on write may refuse it, which leaves `motion_process`. They count as those in
+which are overwritten by a line of JSON for each. That takes no new block where files are overwritten in place (ext4,
+xfs, tmpfs); a file system that copies on write may refuse it, which leaves `motion_process`. They count as those in
 `faults.json` do, and move there when one of them is acknowledged.
 """
 
