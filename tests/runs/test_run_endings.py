@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.small_disk import run_on_small_disk
 from helpers.tickets import write_checked_ticket
 from kill_bench import TAG, VICTIMS, tagged, wait_for
 from runs.conftest import written
@@ -129,14 +130,8 @@ print("\\n" + json.dumps({"code": code, "latched": latched, "stored": stored, "l
 def test_a_disk_that_is_really_full_keeps_the_cause_of_the_fault(arm: Path, tmp_path: Path) -> None:
     write_checked_ticket(load_arm(arm), tmp_path / "kept" / "state")
     disk = tmp_path / "disk"
-    disk.mkdir()
-    # A file system of its own in a namespace of its own, which needs no privilege where the kernel lets users have one.
-    mount = f"mount -t tmpfs -o size=4m,mode=700 tmpfs {disk} && cp -r {tmp_path}/kept/state {disk}"
-    space = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
-    if subprocess.run([*space, mount], check=False, capture_output=True).returncode:
-        pytest.skip("this kernel lets no user mount a file system")
-    command = f'{mount} && exec "$0" -c "$1" {arm} {disk}'
-    ended = subprocess.run([*space, command, sys.executable, FILLED], check=False, capture_output=True, text=True)
+    script = f'cp -r {tmp_path}/kept/state {disk} && exec "$0" -c "$1" {arm} {disk}'
+    ended = run_on_small_disk(disk, "4m", script, sys.executable, FILLED)
     said = json.loads(ended.stdout.splitlines()[-1])
     assert (said["code"], list(said["latched"])) == (4, ["recorder_behind"]), ended.stderr
     assert "No space left on device" in said["latched"]["recorder_behind"]
