@@ -30,7 +30,7 @@ from ident_service.model.base_parameters import base_parameters, remarks_on_angl
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
 from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_urdf_bodies
-from ident_service.model.mechanism import count_mechanism, read_mechanism
+from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
 from ident_service.model.outline import mesh_capsules
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
@@ -326,6 +326,7 @@ def new_description(
         raise UsageError(f"{urdf}: cannot be read: {error}") from None
     file = TextFile(name=urdf.name, text=text)
     count_mechanism(file, "urdf")
+    require_urdf(file)
     draft = Draft(called, urdf.name, arm_part(text, file.name, base, tip))
     with tempfile.TemporaryDirectory() as staging:
         trial = Path(staging) / "arm.yaml"

@@ -213,7 +213,7 @@ def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.Captu
 
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "bars.urdf").write_text(BARS.replace(BOUNDS, 'lower="-115" upper="115"'))
-    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 1
+    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 2
     assert "shoulder turns from -115 to 115 rad: limits of a URDF are radians" in capsys.readouterr().err
     assert not (tmp_path / "bars.yaml").exists()
 
@@ -229,9 +229,9 @@ def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("text", "code", "words"),
     [
-        ("no xml", 1, "not a URDF that can be read"),
-        ('<robot name="x"><link name="a"/></robot>', 1, "no movable joint"),
-        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 1, "2 links hang on no joint"),
+        ("no xml", 2, "not a URDF that can be read"),
+        ('<robot name="x"><link name="a"/></robot>', 2, "no movable joint"),
+        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 2, "2 links hang on no joint"),
     ],
 )
 def test_a_file_that_holds_no_arm_leaves_nothing(
