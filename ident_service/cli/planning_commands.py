@@ -204,7 +204,7 @@ def _new(arguments: argparse.Namespace) -> Answer:
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
-    return DONE, "\n".join(lines), {"description": str(path), "guessed": list(guessed)}
+    return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 
 def _check(arguments: argparse.Namespace) -> Answer:

@@ -356,7 +356,8 @@ def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
     lines += [job["detail"]] if job["detail"] else []
     lines += [f"run {job['run']}"] if job["run"] else []
-    code = _CODES.get(job["state"], FAILED) if code is None else code
+    if code is None:  # bad input has the code that it has at the machine
+        code = USAGE if (job["state"], job["exit_code"]) == ("failed", USAGE) else _CODES.get(job["state"], FAILED)
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 

@@ -28,7 +28,7 @@ from drivers.can.can_frame import Frame
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanBus, CanopenDriver
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, UsageError
 from sim_backend.can_bus.host import LocalPort
 from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.emulator.build import build_emulator
@@ -291,17 +291,22 @@ def emulate(
         The summary.
 
     Raises:
-        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a malformed fault.
+        UsageError: drives that are no CANopen drives, or in the process that moves them; a malformed fault.
+        DriverError: as `build_emulator`, an interface that cannot be had or is lost.
     """
     driver = config.driver
-    if isinstance(driver, CanopenDriver) and any(bus.interface == INTERFACE for bus in driver.buses):
-        raise DriverError(
+    if not isinstance(driver, CanopenDriver):
+        raise UsageError(f"{config.name}: the driver is not CANopen's, so there is no drive to emulate")
+    if any(bus.interface == INTERFACE for bus in driver.buses):
+        raise UsageError(
             f"{config.name}: {INTERFACE} drives live in the process that moves them; "
             "name an interface such as socketcan, udp_multicast or ident_wire"
         )
     emulator = build_emulator(config)
-    emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
-    assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
+    try:
+        emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
+    except DriverError as error:
+        raise UsageError(str(error)) from None
     ours = {bus.interface == WIRE_INTERFACE for bus in driver.buses}
     if len(ours) > 1:
         raise DriverError(
