@@ -68,6 +68,7 @@ class Fit:
     Attributes:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
+        weighed: the same without row weights, rows near standstill multiplied by `shares`.
         covariance: from blocks of scores, with the doubt about fitted shapes of friction, shape (base, base).
         deviations: standard deviations on the careful side, shape (base,), see `uncertainty.py`.
         degrees: degrees of freedom of the deviations, shape (base,).
@@ -81,6 +82,7 @@ class Fit:
 
     fit: LeastSquares
     equations: Equations
+    weighed: Equations
     covariance: Array
     deviations: Array
     degrees: Array
@@ -201,14 +203,14 @@ def unconstrained(
     if not prepared.shapes:
         return found
     # The weights of Huber's rows are in his equations, not among those per joint.
-    weights = weighted_least_squares(prepared.equations.with_near(found.shares).total).weights
+    weights = weighted_least_squares(found.weighed.total).weights if found.method == "huber" else found.fit.weights
     added = shape_covariance(
         recordings,
         prepared.model,
         base,
         prepared.shapes,
         found.fit.beta,
-        weights if found.method == "huber" else found.fit.weights,
+        weights,
         prepared.torque_scales,
         found.shares,
     )
@@ -240,7 +242,7 @@ def _with_known_shape(
             return replace(_doubted("wls", fit, gathered, shares), choices=choices)
     if method != "iv":
         fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares)
-        found = _doubted("huber", fit, reweighted, shares)
+        found = replace(_doubted("huber", fit, reweighted, shares), weighed=gathered)
         return replace(found, choices=choices, remarks=_unsettled("Huber's weights", change, robust_regression.SETTLED))
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
@@ -249,7 +251,7 @@ def _with_known_shape(
     remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
     degrees = uncertainty(gathered, fit).degrees
     deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)
-    return Fit(moved, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
+    return Fit(moved, gathered, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
 
 
 def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
@@ -263,7 +265,9 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
 
 def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
     found = uncertainty(equations, fit)
-    return Fit(fit, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method)
+    return Fit(
+        fit, equations, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method
+    )
 
 
 def allowed_change(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> ChangeEllipsoid | None:
