@@ -26,7 +26,7 @@ from ident_service.estimation.friction_fit import fit_friction, free_friction_nu
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
-from ident_service.estimation.shape_uncertainty import shape_covariance
+from ident_service.estimation.shape_uncertainty import shape_uncertainty
 from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.estimation.torque_delay import Delay, choose_delay, estimate_delay, with_delay
 from ident_service.estimation.uncertainty import uncertainty, widening
@@ -204,7 +204,7 @@ def unconstrained(
         return found
     # The weights of Huber's rows are in his equations, not among those per joint.
     weights = weighted_least_squares(found.weighed.total).weights if found.method == "huber" else found.fit.weights
-    added = shape_covariance(
+    shape = shape_uncertainty(
         recordings,
         prepared.model,
         base,
@@ -214,8 +214,8 @@ def unconstrained(
         prepared.torque_scales,
         found.shares,
     )
-    deviations = np.sqrt(found.deviations**2 + np.diag(added) * widening(found.degrees) ** 2)
-    return replace(found, covariance=found.covariance + added, deviations=deviations)
+    deviations, degrees = shape.joined(found.deviations, found.degrees)
+    return replace(found, covariance=found.covariance + shape.covariance, deviations=deviations, degrees=degrees)
 
 
 def _with_known_shape(
