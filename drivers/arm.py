@@ -51,6 +51,8 @@ class ArmDescription:
         scheduled_stamps: whether stamps are those of a schedule, whole periods apart, as of a plant that moves by whole
             periods; how late a cycle came only the loop's clock says then. Otherwise stamps are the clock's.
         lost_cycles: in a row, without an axis' position, after which it counts as gone.
+        streams_position: whether drives close the position loop: `exchange_position` is what moves the arm, and
+            `Sample.torque` is what they measured last, in place of what they are given.
     """
 
     joint_names: tuple[str, ...]
@@ -62,6 +64,7 @@ class ArmDescription:
     software: str
     scheduled_stamps: bool = False
     lost_cycles: int = 3
+    streams_position: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +228,20 @@ class Arm(ABC):
             DriverError: not open, a torque while not enabled, a torque that is not finite or of the wrong shape,
                 or the bus is gone. A torque that raises has not been sent.
         """
+
+    def exchange_position(self, position: Vector) -> Sample:
+        """Exchange one cycle with axes that close the position loop by themselves: send positions, return the sample.
+
+        Args:
+            position: where each joint shall be one cycle from here [rad or m], shape (joints,).
+
+        Returns:
+            The sample of this cycle; its torque is the one measured last.
+
+        Raises:
+            DriverError: as `exchange`, and for arms that are given torques (`ArmDescription.streams_position`).
+        """
+        raise DriverError("this arm is given torques, not positions")
 
     @abstractmethod
     def stop(self, kind: StopKind) -> None:

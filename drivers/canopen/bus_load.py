@@ -211,6 +211,7 @@ EMERGENCY_SLOTS = (od.LAST_EMERGENCY, od.ERROR_REGISTER, *(VENDOR_BYTE,) * 5)
 _VALUES: dict[Entry, Callable[[random.Random], int]] = {
     od.POSITION: lambda draw: draw.randint(-40_000, 40_000),
     od.TARGET_TORQUE: lambda draw: draw.randint(-100, 100),
+    od.TARGET_POSITION: lambda draw: draw.randint(-40_000, 40_000),
     od.TORQUE_ACTUAL: lambda draw: draw.randint(-100, 100),
     od.STATUS_WORD: lambda draw: draw.choice((0x1637, 0x1E37)),
     od.LAST_EMERGENCY: lambda draw: draw.choice((0x2310, 0x3220, 0x4310, 0x7305, 0x8130, 0x8250, 0x8611)),
@@ -385,9 +386,11 @@ def _lines(profile: BusProfile) -> Iterator[Line]:
     for frame in profile.torque_frames:
         if len(frame.nodes) > 1:
             whose = f"torques of nodes {', '.join(map(str, frame.nodes))}"
-            yield _line(profile, whose, (frame.cob_id,), (od.TARGET_TORQUE,) * len(frame.nodes), rate, cyclic=True)
+            yield _line(profile, whose, (frame.cob_id,), (frame.target,) * len(frame.nodes), rate, cyclic=True)
     if alone:
-        yield _line(profile, "torques, one drive each", alone, (od.TARGET_TORQUE,), rate, cyclic=True)
+        target = profile.torque_frames[0].target
+        whose = "torques" if target is od.TARGET_TORQUE else "target positions"
+        yield _line(profile, f"{whose}, one drive each", alone, (target,), rate, cyclic=True)
     yield _line(profile, "positions", tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
     status = profile.status_slots
     yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
@@ -429,7 +432,7 @@ def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str
 
 
 def _variants(driver: CanopenDriver) -> Iterator[tuple[str, CanopenDriver]]:
-    if driver.torque_frames == "single" and driver.shares_by_sheet:
+    if driver.torque_frames == "single" and driver.streams == "torque" and driver.shares_by_sheet:
         words = "let up to four drives share a torque frame (driver.torque_frames: shared)"
         yield words, driver.model_copy(update={"torque_frames": "shared"})
     if len(driver.buses) == 1 and len(driver.drives) > 1:

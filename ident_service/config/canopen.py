@@ -90,6 +90,7 @@ class NodeGuarding(Section):
 
 
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
+_SLOTS = 4  # torques of 16 bits in a frame of eight bytes
 _KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
 _DUMMIES = frozenset({2, 3, 5, 6})  # data types of 8 or 16 bits, which fill the 16 bits of a torque
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
@@ -254,7 +255,9 @@ class CanopenDriver(ExtendedSection):
     says whether drives report the torque that they measure (6077h): with their positions, in every cycle
     (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
     object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the
-    host is gone. `profiles` are files of families of drives, which count before the shipped ones.
+    host is gone. `profiles` are files of families of drives, which count before the shipped ones. `streams` says
+    what the host sends in every cycle: the torque of each drive, or its position (cyclic synchronous position), where
+    the drives close the position loop by themselves and tell the torque that they measure.
     """
 
     kind: Literal["canopen"]
@@ -270,7 +273,8 @@ class CanopenDriver(ExtendedSection):
     watchdog_reason: Annotated[str, Field(max_length=200)] = ""
     guarding: NodeGuarding = NodeGuarding()
     profiles: tuple[TextBeside, ...] = ()
-    later = frozenset({"measured_torque", "watchdog_reason", "guarding", "profiles"})
+    streams: Literal["torque", "position"] = "torque"
+    later = frozenset({"measured_torque", "watchdog_reason", "guarding", "profiles", "streams"})
     heartbeats: Heartbeats = Heartbeats()
     reactions: Reactions = Reactions()
     status: StatusReports = StatusReports()
@@ -314,7 +318,14 @@ class CanopenDriver(ExtendedSection):
         """Return whether drives report measured torque in every cycle, with their status, or not at all."""
         if self.measured_torque is not None:
             return self.measured_torque
+        if self.streams == "position":
+            return "cyclic"
         return "status" if all(sheet.has(0x6077) for sheet in self.sheets) else "none"
+
+    @property
+    def drives_a_frame(self) -> int:
+        """Return how many drives a torque or position frame is for, at most; two positions fit, but no dummies do."""
+        return _SLOTS if self.torque_frames == "shared" and self.streams == "torque" else 1
 
     @property
     def report_delay(self) -> float:
@@ -354,6 +365,41 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
     known = np.array([0.0 if one is None else one for one in velocities])
     motors = np.abs(np.array(transmission.ratios)) * (np.abs(coupling) @ known)
     return [float(speed) for speed in motors * 60.0 / (2.0 * math.pi)]
+
+
+def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[float]:
+    """Return the most that each joint can be given when the others are given nothing [N m or N].
+
+    Args:
+        driver: the section `driver`, with as many drives as ratios.
+        transmission: the arm's.
+    """
+    size = len(transmission.ratios)
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    motors = np.array([drive.max_torque for drive in driver.drives])
+    # tau_motor = J^-T tau: a joint alone asks each of its motors for a share.
+    shares = np.abs(np.linalg.inv(np.array(transmission.ratios)[:, None] * coupling))  # (joints, motors)
+    with np.errstate(divide="ignore"):
+        return [float(most) for most in (motors / np.where(shares > 1e-12, shares, 0.0)).min(axis=1)]
+
+
+def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Sequence[float | None]) -> list[float]:
+    """Return the torque of each motor that keeps all joints within their limits, whatever the other motors give [N m].
+
+    Args:
+        driver: the section `driver`, with as many drives as ratios.
+        transmission: the arm's.
+        torques: limits of the joints [N m or N]; None where one has none.
+    """
+    size = len(transmission.ratios)
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    reach = np.abs(np.array(transmission.ratios)[:, None] * coupling)  # (motors, joints): tau = J^T tau_motor
+    most = np.array([drive.max_torque for drive in driver.drives])
+    allowed = np.array([np.inf if one is None else one for one in torques])
+    share = np.minimum(
+        allowed / (reach.T @ most), 1.0
+    )  # of every joint, when all of its motors give all that they have
+    return [float(torque * share[row > 0.0].min()) for torque, row in zip(most, reach, strict=True)]
 
 
 def quick_stop_decelerations(

@@ -568,6 +568,11 @@ class InterruptibleArm(Arm):
             self._require_not_asked()
         return self._arm.exchange(torque)
 
+    def exchange_position(self, position: Vector) -> Sample:
+        """Exchange with the wrapped arm; raises DriverError instead of sending a position likewise."""
+        self._require_not_asked()
+        return self._arm.exchange_position(position)
+
     def watchdogs(self) -> tuple[Watchdog, ...]:
         """Return the wrapped arm's watchdogs."""
         return self._arm.watchdogs()

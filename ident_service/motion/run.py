@@ -28,7 +28,7 @@ from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import Contact
 from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.pinocchio_models import InverseDynamics
-from ident_service.motion.after_stop import after_stop
+from ident_service.motion.after_stop import ONLY_BRAKED, AfterStop, after_stop
 from ident_service.motion.clearance import ClearanceChecker
 from ident_service.motion.command_channel import Controls, StopCondition
 from ident_service.motion.control_loop import REST_CYCLES, REST_SPEED, Loop, Peaks
@@ -39,7 +39,7 @@ from ident_service.motion.encoder_observer import frozen_encoder_observer
 from ident_service.motion.faults import FAULTS, HOLD, ActiveFaults
 from ident_service.motion.lowering import lowest_point
 from ident_service.motion.run_plan import ExcitationPlan, Plan
-from ident_service.motion.safety_monitor import SafetyMonitor
+from ident_service.motion.safety_monitor import NOT_APPLIED, SafetyMonitor
 from ident_service.motion.sequencer import TrajectorySequencer
 from ident_service.motion.speed_scaling import require_factor, slowed_limits
 from ident_service.motion.state_machine import TRANSITIONS, State, StateMachine
@@ -277,13 +277,15 @@ class _Run:
         )
 
     def _prepared(self) -> tuple[Loop, Vector]:
-        """Check and assemble the loop; returns it with the torque that holds the arm where it stands."""
+        """Check and assemble the loop; returns it with the target that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
         limits, prior = motion_limits(model.config), control_model(model).prior
         if prior is None:
             raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         self.after_stop = after_stop(model, limits)
         described = arm.describe()
+        if described.streams_position and self.after_stop is not AfterStop.BRAKE:
+            raise MotionRefused(f"{model.config.name}: {ONLY_BRAKED}")
         if described.joint_names != chain.names:
             raise MotionRefused(
                 f"the drives have the joints {', '.join(described.joint_names)}, "
@@ -318,10 +320,17 @@ class _Run:
             contact=contact,
             owed=owed,
             max_age=described.lost_cycles,
+            most_torque=(1.0 + NOT_APPLIED) * limits.torque if described.streams_position else None,
         )
         friction = friction_feedforward(model, limits)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home, friction)
-        torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
+        holding = control.torque(home, sample.valid, rest(home))
+        if described.streams_position:
+            # A guard of its own: what drives are given is not compared with this torque.
+            _, cannot_hold = SafetyMonitor(chain.names, limits, period, home).torque(holding)
+            target = home
+        else:
+            target, cannot_hold = guard.torque(holding)
         if cannot_hold is not None:
             raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")
         self.states = StateMachine(self.latch, self._entered)
@@ -353,8 +362,9 @@ class _Run:
             Peaks(np.zeros_like(home), np.zeros_like(home)),
             self.after_stop,
             self._at_floor(),
+            described.streams_position,
         )
-        return loop, torque
+        return loop, target
 
     def _at_floor(self) -> Callable[[Vector], bool]:
         """Create the function that returns whether the arm's lowest point is at the floor of its description."""

@@ -27,6 +27,7 @@ from ident_service.motion.ticket import (
     joint_units,
     measure,
     measures,
+    skipped,
 )
 from ident_service.motion.trajectory import PathReference, plan_trajectory, rest
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
@@ -119,7 +120,12 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
 
 @unhurried()
 def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
-    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion."""
+    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion.
+
+    Drives that are given positions close the loop by themselves, with gains of their maker's tool.
+    """
+    if getattr(model.config.driver, "streams", "torque") == "position":
+        return skipped("stability", "the drives close the position loop by themselves (driver.streams: position)")
     path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path
     postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
     if path is not None:

@@ -123,7 +123,7 @@ def watchdog_check(
                 arm.withhold(kind)
             begin_ns: int | None = None
             while True:
-                sample = arm.exchange(None if of_torque else session.torque)
+                sample = session.exchange(sends=not of_torque)
                 status = arm.drive_status() or tuple(AxisStatus(word) for word in sample.status)
                 if begin_ns is None:
                     begin_ns = sample.stamp_ns

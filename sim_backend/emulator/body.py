@@ -9,7 +9,7 @@ This is written apart from the driver's conversion, so that one can be checked a
 Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
 position and speed can. A step of exactly the nominal period is the simulated arm's. The arm is supported until all
-motors are powered and one of them has been given torque: drives are enabled with none.
+motors are powered and one of them has been given torque, or holds a position: drives are enabled with no torque.
 """
 
 from __future__ import annotations
@@ -240,7 +240,8 @@ class Body:
         self._torque = self.gears.joint_torque(np.array([torque for _, torque in outputs]))
         self._torque.setflags(write=False)
         if self.supported:
-            self.supported = not (all(power is Power.TORQUE for power, _ in outputs) and self._torque.any())
+            acts = self._torque.any() or any(motor.holds for motor in self.motors)
+            self.supported = not (all(power is Power.TORQUE for power, _ in outputs) and acts)
         if [power for power, _ in before] == [power for power, _ in outputs]:
             return
         powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)

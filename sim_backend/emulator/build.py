@@ -18,6 +18,7 @@ from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model
 from sim_backend.build import build_machine
 from sim_backend.canopen_device.drive import CanopenDrive as Drive
+from sim_backend.canopen_device.drive import Tuning
 from sim_backend.canopen_device.personality import personality_of
 from sim_backend.emulator.body import Body, Gears
 from sim_backend.emulator.emulator import Emulator
@@ -72,15 +73,36 @@ def build_emulator(config: ArmConfig, faults: Sequence[DriveFault] = ()) -> Emul
         )
         for number, drive in enumerate(driver.drives)
     )
+    tuned = _tuned(body)
     own = itertools.cycle(emulation.eds or (None,))
     faces = [
-        Drive(driver.eds.text, drive.node, motor, _identity(drive))
+        Drive(driver.eds.text, drive.node, motor, _identity(drive), tuning=tuning)
         if sheet is None
-        else Drive(sheet.text, drive.node, motor, like=personality_of(sheet.text, drive, driver.families))
-        for drive, motor, sheet in zip(driver.drives, body.motors, own, strict=False)
+        else Drive(
+            sheet.text, drive.node, motor, like=personality_of(sheet.text, drive, driver.families), tuning=tuning
+        )
+        for drive, motor, sheet, tuning in zip(driver.drives, body.motors, own, tuned, strict=False)
     ]
     at_first = configured(emulation.faults, names, machine.plant.period)
     return Emulator(body, faces, [drive.bus for drive in driver.drives], names, (*at_first, *faults))
+
+
+_BANDWIDTH = 2.0 * np.pi * 12.0  # rad/s of position loops, as a maker's tool would tune them at this arm
+_SETTLES = 0.2  # of the bandwidth, of their integral part
+
+
+def _tuned(body: Body) -> list[Tuning]:
+    """Return the gains of every drive's position loop, for the inertia that its motor feels where the arm stands."""
+    to_joints = np.linalg.inv(body.gears.matrix)
+    felt = np.diag(to_joints.T @ np.diag(body.plant.inertia) @ to_joints)
+    return [
+        Tuning(
+            float(inertia * _BANDWIDTH**2),
+            float(1.6 * inertia * _BANDWIDTH),
+            float(_SETTLES * inertia * _BANDWIDTH**3),
+        )
+        for inertia in felt
+    ]
 
 
 def _identity(drive: CanopenDrive) -> dict[int, int]:

@@ -145,6 +145,22 @@ def test_a_drive_that_would_take_its_torque_back_below_a_joints_velocity_limit_i
     assert "its motor turns at 431" in what
 
 
+def test_a_joints_torque_limit_and_what_its_gears_give_are_not_units_apart() -> None:
+    """Before anything is energised: N m m for N m, or a gear left out, is a factor of 10 or 1000 somewhere."""
+    config = load_arm("wam7_canopen")
+    driver, names = config.driver, list(config.joints)
+    limits = [joint.torque for joint in config.joints.values()]
+
+    def told(factor: float) -> list[str]:
+        torques = [None if limit is None else factor * limit for limit in limits]
+        return [what for _, what in disagreements(driver, config.transmission, names, 500.0, torques=torques)]  # type: ignore[arg-type]
+
+    assert told(1.0) == []
+    for factor in (1e3, 1e-3):
+        assert len(told(factor)) == len(names)
+        assert "which is another unit or gear" in told(factor)[0]
+
+
 def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) -> None:
     real, simulated = (arm_model(load_arm(arms / f"{name}.yaml")) for name in ("wam7_canopen", "wam7_sim"))
     np.testing.assert_array_equal(real.chain.coupling, simulated.chain.coupling)
