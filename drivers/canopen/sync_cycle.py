@@ -19,10 +19,10 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.can.bus_load import worst
 from drivers.can.bus_state import EventCode
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
-from drivers.canopen.bus_load import worst
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
