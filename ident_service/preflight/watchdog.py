@@ -30,7 +30,9 @@ _WORDS = {
     "rpdo_timer": "torque frames",
     "torque_frames": "torque frames",
     "sync_loss": "SYNC",
+    "bus_silence": "requests and torques",
 }
+_BLIND = ("sync_loss", "bus_silence")  # without these no position comes
 _ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
 _LATER = 2.0  # times the configured time, plus some cycles and the report's delay, until a drive must have reported
 _CYCLES = 10
@@ -141,7 +143,7 @@ def watchdog_check(
                         strange.append(f"{dogs[number].drive} stopped when {_WORDS[kind]} stayed away, not by its own")
                 if strange:
                     break
-                if kind == "sync_loss":
+                if kind in _BLIND:
                     session.wait_in_silence()
                 else:
                     setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)

@@ -188,6 +188,12 @@ class Emulator:
         self._now_ns = max(now_ns, self._now_ns)
         return sent
 
+    def press(self, key: str, now_ns: int) -> None:
+        """Press a key of the pendant, `activate` or `idle`; does nothing on an arm without one."""
+        for companion in self.companions:
+            companion.press(key, now_ns)
+        self._deadline = None
+
     def go_on(self, now_ns: int) -> None:
         """Advance the arm when the next cycle is late, by `Body.overdue_ns`, instead of when the cycle comes.
 

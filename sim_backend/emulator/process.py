@@ -448,8 +448,7 @@ class _Run:
             case "state":
                 self._told = ("",) * len(self._told)
             case "activate" | "idle":
-                for companion in self._emulator.companions:
-                    companion.press(line.strip(), now_ns)
+                self._emulator.press(line, now_ns)
             case _:
                 try:
                     self._emulator.inject([parse_fault(line, self._emulator.names)], now_ns)
