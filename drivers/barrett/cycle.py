@@ -92,6 +92,7 @@ class PuckCodec:
         pucks: the motor pucks, in the arm's order.
         safety: the safety puck.
         late: positions that came outside a cycle, or second in one.
+        unexplained: cycles since an arm was seen to leave ACTIVE while the pendant has not said why; None for no such.
     """
 
     def __init__(self, driver: BarrettDriver, motors: Properties, safety: Properties) -> None:
@@ -105,6 +106,8 @@ class PuckCodec:
         self.pucks = tuple(MotorPuck(puck.node) for puck in driver.pucks)
         self.safety = SafetyPuck(driver.safety_node)
         self.late = 0
+        self.unexplained: int | None = None
+        self._waits_for: set[int] = set()
         self.controller = ControllerState.ACTIVE
         self.request = get(Group.ARM, motors.number("P"), group=True)
         self._torque = motors.number("T")
@@ -135,6 +138,11 @@ class PuckCodec:
             frames.append(torque_frame(group, self._torque, slots))
         return frames
 
+    @property
+    def reasons(self) -> list[Frame]:
+        """Return the frames that ask the safety puck why the arm is not active."""
+        return [get(self.safety.node, self._safety.number(name)) for name in ("MODE", "PEN")]
+
     def questions(self) -> list[Frame]:
         """Return the frames that ask for the state of everybody, in the order in which they are sent."""
         mode = get(self.safety.node, self._safety.number("MODE"))
@@ -152,6 +160,8 @@ class PuckCodec:
         """Open a cycle after positions have been asked for: from now on each puck may answer once."""
         self._open, self._missing = True, len(self.pucks)
         self.safety.status_age += 1
+        if self.unexplained is not None:
+            self.unexplained += 1
         for puck in self.pucks:
             puck.answered = False
             puck.age += 1
@@ -202,6 +212,7 @@ class PuckCodec:
         if (puck := self._by_node.get(answer.node)) is not None:
             if answer.number == self._mode:
                 if puck.mode == Mode.TORQUE and answer.value != Mode.TORQUE:
+                    self._ask_why()
                     self._tell(EventCode.DRIVE_STATE, puck.node, f"MODE {answer.value}, was {puck.mode}")
                 puck.mode, puck.status_age = answer.value, 0
                 if answer.value == Mode.TORQUE:
@@ -213,15 +224,26 @@ class PuckCodec:
         elif answer.node == self.safety.node:
             self.safety.status_age = 0
             if answer.number == self._safety.number("MODE"):
+                if self.safety.mode == SafetyMode.ACTIVE and answer.value != SafetyMode.ACTIVE:
+                    self._ask_why()
                 self.safety.mode = answer.value
             elif answer.number == self._safety.number("PEN"):
                 self._on_pendant(pendant_of(answer.value))
+            self._waits_for.discard(answer.number)
+            if not self._waits_for:
+                self.unexplained = None
+
+    def _ask_why(self) -> None:
+        if self.unexplained is None:
+            self.unexplained = 0
+            self._waits_for = {self._safety.number("MODE"), self._safety.number("PEN")}
 
     def _on_pendant(self, shown: Pendant) -> None:
         before, self.safety.pendant = self.safety.pendant, shown
         if new := [cause for cause in shown.warnings if cause not in before.warnings]:
             self._tell(EventCode.DRIVE_WARNING, self.safety.node, f"the pendant shows {' and '.join(new)} warning")
-        if new := [cause for cause in shown.faults if cause not in before.faults]:
+        # An e-stop shows in MODE as well, and a lost heartbeat is the watchdog's.
+        if new := [one for one in shown.faults if one not in before.faults and one not in ("e-stop", "heartbeat")]:
             self._tell(EventCode.EMERGENCY, self.safety.node, f"the pendant shows {' and '.join(new)} fault")
 
     def _on_other(self, frame: Frame) -> None:
@@ -359,8 +381,11 @@ class PuckBus:
         return stamp_ns
 
     def _ask(self, asks_safety: bool) -> None:
-        if asks_safety:
-            self.link.send(self.codec.questions()[0])
+        if self.codec.unexplained is not None:
+            for frame in self.codec.reasons:
+                self.link.send(frame)
+        elif asks_safety:
+            self.link.send(self.codec.reasons[0])
         self._count += 1
         if self._count % self._every:
             return

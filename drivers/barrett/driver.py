@@ -44,6 +44,7 @@ _FAREWELL = 20  # cycles, at most, in which pucks report that they are idle
 _RAISED = 0.5  # s that all motors may take to follow the safety puck
 _RESET = 1.0  # s
 _LOWER_EVERY = 5  # cycles between two commands to an arm that is active while nobody drives it
+_EXPLAINED = 4  # cycles, at most, that news of an arm that is not active any more wait for the pendant's reason
 _SHIFT_IDLE = "find the cause, then press Shift-Idle on the pendant"
 
 _CODES: dict[EventCode, AxisEventCode] = {
@@ -123,6 +124,7 @@ class BarrettArm(Arm):
         self._unwrapped: list[int] = []
         self._cycle = 0
         self._stale: set[int] = set()
+        self._status: tuple[int, ...] = ()
         self._checks: tuple[SetupCheck, ...] = ()
 
     def look(self) -> Arm:
@@ -485,8 +487,11 @@ class BarrettArm(Arm):
         if not bus.complete:
             ages = [max(pucks[k].age for k in needed) for needed in self._motors_of]
             valid = (age := np.array(ages, dtype=np.int64)) == 0
-        words = self.drive_status()
-        status = tuple(int(_joined([words[k] for k in needed])) for needed in self._motors_of)
+        told: list[AxisEvent] = []
+        if bus.codec.unexplained is None or bus.codec.unexplained > _EXPLAINED:
+            words = self.drive_status()
+            self._status = tuple(int(_joined([words[k] for k in needed])) for needed in self._motors_of)
+            told = self._events(bus)
         return Sample(
             self._cycle,
             stamp_ns,
@@ -496,15 +501,18 @@ class BarrettArm(Arm):
             valid,
             age,
             bus.lost,
-            status,
+            self._status,
             max(safety.status_age, *(puck.status_age for puck in pucks)),
-            tuple(self._events(bus)),
+            tuple(told),
             (f"pendant: {safety.pendant}",) if self._looks else (),
             stamp_doubt_ns=bus.stamp_doubt_ns,
         )
 
     def _events(self, bus: PuckBus) -> list[AxisEvent]:
-        found = [self._event(event) for event in bus.codec.take_events() if event.code in _CODES]
+        taken = [event for event in bus.codec.take_events() if event.code in _CODES]
+        if bus.codec.safety.mode != SafetyMode.ACTIVE:  # then no single puck has left it
+            taken = [event for event in taken if event.code is not EventCode.DRIVE_STATE]
+        found = [self._event(event) for event in taken]
         stale = set(bus.stale)
         for node in sorted(stale - self._stale):
             words = f"puck {node} has not said its MODE for too long"
