@@ -1,8 +1,8 @@
 """Work out what the frames of an arm of pucks cost on their bus, and whether they fit (`drivers/can/bus_load.py`).
 
-A cycle has the request for positions, as many positions as there are pucks, and one or two frames of torques; beside
-it everybody's MODE is asked for once a status period, and the pendant's. Typical values are positions within ten motor
-turns of zero, torques of up to 500 counts.
+A cycle has the request for positions, as many positions as there are pucks, and one or two frames of torques; beside it
+MODE is asked for once a status period, the safety puck's twice, and what the pendant shows. Typical values are positions
+within ten motor turns of zero, torques of up to 500 counts.
 """
 
 from __future__ import annotations
@@ -65,13 +65,16 @@ def _lines(driver: BarrettDriver, rate: float) -> Iterator[Line]:
     groups = sorted({puck.group for puck in driver.pucks})
     torques = tuple(torque_frame(group, 0, ()).identifier for group in groups)
     yield line_of("torques", torques, 8, rate, bus, _of_torques, cyclic=True)
-    nodes = [driver.safety_node, *(puck.node for puck in driver.pucks)]
-    asked = tuple(get(node, 0).identifier for node in nodes)
-    answers = tuple(reply(node, 0, 0, wide=False).identifier for node in nodes)
-    yield line_of("questions for MODE", asked, 1, often, bus, _of_question)
-    yield line_of("answers to them", answers, 4, often, bus, _of_answer)
-    yield line_of("question for the pendant", asked[:1], 1, often, bus, _of_question)
-    yield line_of("answer to it", answers[:1], 6, often, bus, _of_pendant)
+    for whose, nodes, times in (
+        ("MODE of pucks", [puck.node for puck in driver.pucks], 1.0),
+        ("MODE of the safety puck", [driver.safety_node], 2.0),
+    ):
+        asked = tuple(get(node, 0).identifier for node in nodes)
+        answers = tuple(reply(node, 0, 0, wide=False).identifier for node in nodes)
+        yield line_of(f"asks {whose}", asked, 1, times * often, bus, _of_question)
+        yield line_of("answers", answers, 4, times * often, bus, _of_answer)
+    yield line_of("asks for the pendant", asked, 1, often, bus, _of_question)
+    yield line_of("answer", answers, 6, often, bus, _of_pendant)
 
 
 @lru_cache(maxsize=64)

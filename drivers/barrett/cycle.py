@@ -46,6 +46,7 @@ _LEAST = 0.5  # of a period, from the request on, that positions are waited for 
 _MISSED = 0.25  # of a period late, and the slot is left to the next
 _DOUBT = 0.25  # of a period: sending a request takes less, unless this computer stalls
 _MOST_EVENTS = 256  # that wait to be taken; a flood must neither eat the memory nor hide what matters
+_OF_SAFETY = 3  # questions a status period: MODE twice, and the pendant
 _STALE = 5.0  # status periods without an answer
 _CONTROLLER = {ControllerState.PASSIVE: EventCode.ERROR_PASSIVE, ControllerState.BUS_OFF: EventCode.BUS_OFF}
 
@@ -314,7 +315,7 @@ class PuckBus:
         wire = sum(worst(length).seconds(driver.bus.bitrate) for length in frames)
         self._least_ns = round(min(max(_LEAST * period_ns, 1e9 * wire), _RECEIVE * period_ns))
         cycles = driver.status_period * 1e9 / period_ns
-        asked = len(codec.questions())
+        asked = len(codec.pucks) + _OF_SAFETY  # of an active arm; one that is idle is asked for STAT, too
         self._every, self._at_once = max(1, int(cycles / asked)), max(1, math.ceil(asked / cycles))
         self._stale = round(_STALE * max(cycles, asked * self._every / self._at_once))
         self._questions: list[Frame] = []
