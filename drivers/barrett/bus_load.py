@@ -1,8 +1,8 @@
 """Work out what the frames of an arm of pucks cost on their bus, and whether they fit (`drivers/can/bus_load.py`).
 
 A cycle has the request for positions, as many positions as there are pucks, and one or two frames of torques; beside it
-MODE is asked for once a status period, the safety puck's twice, and what the pendant shows. Typical values are positions
-within ten motor turns of zero, torques of up to 500 counts.
+MODE is asked for once a status period, the safety puck's twice, and what the pendant shows. Typical values are
+positions within ten motor turns of zero, torques of up to 500 counts.
 """
 
 from __future__ import annotations

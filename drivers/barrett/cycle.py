@@ -40,12 +40,14 @@ from drivers.can.bus_state import MILD, ControllerState, Event, EventCode, contr
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from ident_service.config.barrett import BarrettDriver
+from ident_service.errors import DriverError
 
 _RECEIVE = 0.97  # of a period, within which a position counts for its cycle
 _LEAST = 0.5  # of a period, from the request on, that positions are waited for in any case
 _MISSED = 0.25  # of a period late, and the slot is left to the next
 _DOUBT = 0.25  # of a period: sending a request takes less, unless this computer stalls
 _MOST_EVENTS = 256  # that wait to be taken; a flood must neither eat the memory nor hide what matters
+_ANSWER = 0.01  # s that the safety puck may take to answer
 _OF_SAFETY = 3  # questions a status period: MODE twice, and the pendant
 _STALE = 5.0  # status periods without an answer
 _CONTROLLER = {ControllerState.PASSIVE: EventCode.ERROR_PASSIVE, ControllerState.BUS_OFF: EventCode.BUS_OFF}
@@ -301,6 +303,7 @@ class PuckBus:
         lost: positions that did not come in their cycle, so far.
         stamp_doubt_ns: of the last cycle, see `Sample`.
         silent: whether nothing is sent that the safety puck watches, so that it can be seen to act.
+        looks: whether positions are asked for only where the arm is not active, as nobody drives it from here.
     """
 
     def __init__(self, link: Link, codec: PuckCodec, driver: BarrettDriver, period_ns: int) -> None:
@@ -308,7 +311,7 @@ class PuckBus:
         self.link, self.codec, self.clock = link, codec, link.clock
         self.complete = False
         self.lost = self.stamp_doubt_ns = 0
-        self.silent = False
+        self.silent = self.looks = False
         self._period_ns = period_ns
         frames = [1, *(8 for _ in codec.torque_frames([0] * len(codec.pucks)))]
         frames += [6 if puck.node in driver.joint_encoders else 3 for puck in codec.pucks]
@@ -357,6 +360,8 @@ class PuckBus:
         torques = [] if counts is None else codec.torque_frames(counts)
         for heard in link.drain():
             codec.receive(heard)
+        if self.looks:
+            self._require_inactive()
         before_ns = clock.now_ns()
         # What is withheld is withheld until the safety puck has acted.
         silent = self.silent and codec.safety.mode == SafetyMode.ACTIVE
@@ -380,6 +385,21 @@ class PuckBus:
             self.lost += sum(not puck.answered for puck in codec.pucks)
         self._ask(asks_safety)
         return stamp_ns
+
+    def _require_inactive(self) -> None:
+        """Raise DriverError unless the safety puck says, now, that the arm is not active."""
+        safety = self.codec.safety
+        safety.mode = None
+        self.link.send(self.codec.reasons[0])
+        until_ns = self.clock.now_ns() + round(_ANSWER * 1e9)
+        while safety.mode is None and (frame := self.link.receive(until_ns)) is not None:
+            self.codec.receive(frame)
+        if safety.mode is None:
+            raise DriverError("the safety puck does not answer")
+        if safety.mode == SafetyMode.ACTIVE:
+            raise DriverError(
+                "the arm is active: another host drives it, and questions from here would keep its heartbeat quiet"
+            )
 
     def _ask(self, asks_safety: bool) -> None:
         if self.codec.unexplained is not None:

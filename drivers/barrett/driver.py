@@ -178,9 +178,7 @@ class BarrettArm(Arm):
             self._found = found
             self._checks = setup.checks(found, self._driver)
             self._require_reachable(found)
-            if self._looks:
-                self._require_inactive(port.read(found.safety_node, found.safety, "MODE"))
-            else:
+            if not self._looks:
                 setup.lower(port.link, found)
                 setup.limit(port, found, self._driver)
             if not setup.is_zeroed(port, found):
@@ -190,6 +188,7 @@ class BarrettArm(Arm):
                 )
             codec = PuckCodec(self._driver, found.motors, found.safety)
             self._bus = PuckBus(port.link, codec, self._driver, self._period_ns)
+            self._bus.looks = self._looks
             if not self._looks:
                 setup.ignore_jumps(port, found)
             self._begin(self._bus)
@@ -300,7 +299,7 @@ class BarrettArm(Arm):
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
         if not self._enabled:
             self._keep_idle(bus)
-        stamp_ns = bus.cycle(None if torque is None else self._counts, asks_safety=self._looks)
+        stamp_ns = bus.cycle(None if torque is None else self._counts)
         sample = self._sample(bus, stamp_ns)
         self._cycle += 1
         return sample
@@ -438,9 +437,8 @@ class BarrettArm(Arm):
 
     def _keep_idle(self, bus: PuckBus) -> None:
         """Lower an arm that nobody drives and that says it is active; repeat a stop that no frame could carry."""
-        if self._looks:
-            self._require_inactive(bus.codec.safety.mode)
-        elif self._untold or (not self._is_idle(bus) and self._cycle % _LOWER_EVERY == 0):
+        is_due = self._cycle % _LOWER_EVERY == 0
+        if not self._looks and (self._untold or (is_due and not self._is_idle(bus))):
             self._lower(bus)
 
     def _lower(self, bus: PuckBus) -> None:
@@ -451,13 +449,6 @@ class BarrettArm(Arm):
             self._untold = False
         except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
             self._untold = True
-
-    @staticmethod
-    def _require_inactive(mode: int | None) -> None:
-        if mode == SafetyMode.ACTIVE:
-            raise DriverError(
-                "the arm is active: another host drives it, and questions from here would keep its heartbeat quiet"
-            )
 
     def _require_reachable(self, found: setup.FoundArm) -> None:
         if lost := setup.unreachable(found):
