@@ -388,13 +388,15 @@ class PuckBus:
 
     def _require_inactive(self) -> None:
         """Raise DriverError unless the safety puck says, now, that the arm is not active."""
-        safety = self.codec.safety
-        safety.mode = None
-        self.link.send(self.codec.reasons[0])
+        safety, question = self.codec.safety, self.codec.reasons[0]
+        self.link.send(question)
         until_ns = self.clock.now_ns() + round(_ANSWER * 1e9)
-        while safety.mode is None and (frame := self.link.receive(until_ns)) is not None:
+        while (frame := self.link.receive(until_ns)) is not None:
             self.codec.receive(frame)
-        if safety.mode is None:
+            answer = answer_of(frame)
+            if isinstance(answer, Reply) and (answer.node, answer.number) == (safety.node, question.data[0]):
+                break
+        else:
             raise DriverError("the safety puck does not answer")
         if safety.mode == SafetyMode.ACTIVE:
             raise DriverError(
