@@ -1,4 +1,4 @@
-"""A run of an arm that a person enables: what is told, what happens when it is moved meanwhile, and how waiting ends."""
+"""A run of an arm that a person enables: what is told, what if it is moved meanwhile, and how waiting ends."""
 
 from __future__ import annotations
 
