@@ -83,6 +83,15 @@ DOORS: dict[str, set[str]] = {
     "starlette": {"daemon"},
     "uvicorn": {"daemon"},
 }
+# What may know CANopen: its driver, its emulation, its configuration, and the commands that scan and probe its nodes.
+CANOPEN_ROOMS = ("drivers/canopen/", "sim_backend/canopen_device/")
+CANOPEN_FILES = {
+    "ident_service/config/arm.py",
+    "ident_service/config/canopen.py",
+    "ident_service/config/load.py",
+    "ident_service/operations/fieldbus.py",
+    "sim_backend/emulator/build.py",
+}
 HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn")
 
 
@@ -166,6 +175,20 @@ def python_files() -> list[str]:
 def test_every_file_imports_only_what_its_layer_may() -> None:
     found = [text for file in python_files() for text in violations((ROOT / file).read_text(encoding="utf-8"), file)]
     assert found == []
+
+
+def test_canopen_is_known_in_its_own_folder_only() -> None:
+    """Everything else reaches drives by the Arm contract, whatever protocol they speak."""
+    foreign = []
+    for file in python_files():
+        if file.startswith(CANOPEN_ROOMS) or file in CANOPEN_FILES:
+            continue
+        foreign += [
+            f"{file}:{found.line}: {found.module}"
+            for found in imports_in((ROOT / file).read_text(encoding="utf-8"), file)
+            if found.module.startswith(("drivers.canopen", "ident_service.config.canopen", "canopen"))
+        ]
+    assert foreign == []
 
 
 def test_the_files_are_where_this_test_looks() -> None:

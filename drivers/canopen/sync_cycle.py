@@ -19,11 +19,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.can.bus_load import worst
 from drivers.can.bus_state import EventCode
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import worst
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,

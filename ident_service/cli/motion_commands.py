@@ -446,7 +446,15 @@ def _check(arguments: argparse.Namespace) -> Answer:
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
-            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds, closed=closed)
+            ticket = preflight(
+                stoppable,
+                model,
+                motion,
+                confirm=confirm,
+                rate_seconds=seconds,
+                closed=closed,
+                announce=lambda action: tell(arguments, f"{config.name}: {action}"),
+            )
         if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
             positions.keep(arm)
     write_ticket(path, ticket)

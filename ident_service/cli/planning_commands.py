@@ -1,4 +1,4 @@
-"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `doctor`, `emulate`."""
+"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `driver`, `doctor`, `emulate`."""
 
 from __future__ import annotations
 
@@ -259,6 +259,14 @@ def _add_bus(verbs: VerbList) -> None:
         "--run", type=Path, metavar="DIR", help="run folder whose can.log goes along (`ident run --can-log`)"
     )
 
+    driver = verbs.group("driver", "drivers of arms, your own ones too (docs/drivers.md)")
+    text = "try a driver on the promises of the Arm contract, with zero torque alone (exit code 3: one is broken)"
+    sub = driver.add("test", _driver_test, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument(
+        "--confirm", metavar="NAME", help="the arm's name: it is supported, and nobody is within its reach"
+    )
+
 
 def _bus_report(arguments: argparse.Namespace) -> Answer:
     from datetime import UTC, datetime
@@ -311,6 +319,28 @@ def _store(arguments: argparse.Namespace) -> Answer:
     told = "have stored what they hold" if stores else "take back what they were shipped with when power comes next"
     text = f"{config.name}: drives {', '.join(map(str, nodes))} {told}\n"
     return DONE, text, {"arm": config.name, "stored": stores, "nodes": list(nodes)}
+
+
+def _driver_test(arguments: argparse.Namespace) -> Answer:
+    from dataclasses import asdict
+
+    from ident_service.config.load import load_arm
+    from ident_service.motion.command_channel import ControlFile
+    from ident_service.operations.driver_contract import Outcome, contract_text, try_driver
+    from ident_service.registry.state_folder import control_path
+
+    config = load_arm(arguments.arm)
+
+    def confirm(question: str) -> str:
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(question) if sys.stdin.isatty() and not arguments.json else ""
+
+    with ControlFile.take(control_path(own_state_folder(arguments), config.name), None):
+        found = try_driver(config, confirm)
+    broken = any(one.outcome is Outcome.BROKEN for one in found)
+    document = {"arm": config.name, "kept": not broken, "promises": [asdict(one) for one in found]}
+    return VERDICT_NO if broken else DONE, contract_text(config.name, found), document
 
 
 def _load(arguments: argparse.Namespace) -> Answer:

@@ -127,7 +127,6 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
 
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
-    from ident_service.config.canopen import CanopenDriver
     from ident_service.operations.recovery import home_posture, set_home
 
     posture, lease = home_posture(config), requested_lease(arguments, config)
@@ -145,7 +144,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     done = set_home(config, own_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
     lines += [f"  still active: {fault.code}: {fault.cause}" for fault in done.faults]
-    if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
+    if config.can_buses and all(bus.interface == "lock_step" for bus in config.can_buses):
         lines.append(
             "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.canopen.bus_load import Budget
+from drivers.can.bus_load import Budget
 from ident_service.config.load import config_error, load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import ParameterTable
@@ -27,7 +27,7 @@ class CheckedDescription:
 
     Attributes:
         model: of its arm.
-        budget: of its buses; None for an arm without CANopen drives.
+        budget: of its buses; None for an arm without drives on CAN.
         gains: how stable they are; None for an arm that can be identified but not moved.
         after_stop: what follows a stop, or why nothing may move; None likewise.
         falling: joints that gravity moves when their drives are off.

@@ -20,10 +20,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
+from drivers.can.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line
 from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links
-from drivers.canopen.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line, budget
+from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
 from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, entry_of, named, where
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
@@ -31,11 +32,13 @@ from drivers.canopen.drive_setup import IDENTITY, differences
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
+from ident_service.config.can_bus import CanBus
+from ident_service.config.canopen import CanopenDrive, CanopenDriver
 from ident_service.config.eds import data_sheet
 from ident_service.config.load import config_error
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
+from ident_service.motion.arm_factory import make_arm
 from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
 from ident_service.recordings.files import write_atomically
 
@@ -53,14 +56,15 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
     Raises:
         UsageError: the arm's driver has no bus that frames could be counted on.
     """
-    if not isinstance(config.driver, CanopenDriver):
+    found = make_arm(config).bus_budget(rate) if config.can_buses else None
+    if found is None:
         kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
-        raise UsageError(f"{config.name} has {kind}; a bus load is that of CANopen drives (driver.kind: canopen)")
-    return budget(config.driver, config.control.rate if rate is None else rate)
+        raise UsageError(f"{config.name} has {kind}; a bus load is that of drives on CAN (canopen, barrett)")
+    return found
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """Return the bus budget of an arm with CANopen drives, which must fit; None for other arms.
+    """Return the bus budget of an arm with drives on CAN, which must fit; None for other arms.
 
     Args:
         arm: its file, or its name if it is shipped.
@@ -69,7 +73,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
     Raises:
         ConfigError: over budget; the mistake has the place of the driver, and the remedies.
     """
-    if not isinstance(config.driver, CanopenDriver):
+    if not config.can_buses:
         return None
     found = bus_load(config)
     if not found.fits:
@@ -80,7 +84,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
 def bus_lines(found: Budget) -> str:
     """Format the verdict as one line per bus."""
     return "".join(
-        f"bus {bus.profile.number} ({bus.profile.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
+        f"bus {bus.number} ({bus.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
         f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
         for bus in found.buses
     )
@@ -111,7 +115,7 @@ def bus_document(name: str, found: Budget) -> dict[str, Any]:
 
 def _bus_lines(bus: BusLoad) -> list[str]:
     cycle, load = bus.cycle, bus.load
-    lines = [f"bus {bus.profile.number}: {_described(bus.profile.bus)}", _HEAD, _UNDER]
+    lines = [f"bus {bus.number}: {_described(bus.bus)}", _HEAD, _UNDER]
     lines += [_row(line.name, _ids(line), f"{line.length}", f"{line.per_second:.4g}", line) for line in bus.lines]
     return [
         *lines,
@@ -142,13 +146,12 @@ def _ids(line: Line) -> str:
 
 
 def _bus_document(bus: BusLoad) -> dict[str, Any]:
-    profile = bus.profile
     return {
-        "number": profile.number,
-        "interface": profile.bus.interface,
-        "channel": profile.bus.channel,
-        "bitrate": profile.bus.bitrate,
-        "data_bitrate": profile.bus.data_bitrate,
+        "number": bus.number,
+        "interface": bus.bus.interface,
+        "channel": bus.bus.channel,
+        "bitrate": bus.bus.bitrate,
+        "data_bitrate": bus.bus.data_bitrate,
         "fits": bus.fits,
         "highest_rate": bus.highest_rate,
         "cycle_us": _values(bus.cycle, 1e6),
