@@ -23,9 +23,10 @@ import numpy as np
 
 from ident_service import __version__
 from ident_service.config.arm import ArmConfig, Method
+from ident_service.config.recording import RecordingFormat
 from ident_service.errors import IdentError, RecordingError, StorageError, UsageError
 from ident_service.estimation.change_detection import Kind, parameter_groups
-from ident_service.estimation.equations import MAX_BLOCKS, Equations, equations
+from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.fit import prepare
 from ident_service.estimation.least_squares import (
@@ -53,6 +54,7 @@ from ident_service.recordings.resampling import grid
 _FORMAT: Final = 1
 STRETCHES: Final = 12  # kept of a recording, as few as the uncertainty of one needs
 FAN_IN: Final = 16  # factors that one task merges
+MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge in pairs beyond, so that memory does not grow with recordings
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
 FACTORS, ROWS, SEEN, SETTLED = "factors", "rows", "seen", "settled"
@@ -331,7 +333,7 @@ def reduce_recording(part: Part, described: Described, store: Store, version: st
             computed = row is None
             if row is None:
                 if part.of > 1:
-                    recording = _piece(recording, part)
+                    recording = _piece(recording, part, described.config.recording)
                 row, content = _reduced(recording, key, part.label, described)
     except (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError) as error:
         if isinstance(error, StorageError) and error.url.startswith(store.url):
@@ -361,8 +363,8 @@ def stored_row(store: Store, key: str) -> Row | None:
         return None
 
 
-def _piece(recording: Recording, part: Part) -> Recording:
-    stamps = grid(recording)
+def _piece(recording: Recording, part: Part, fmt: RecordingFormat) -> Recording:
+    stamps = grid(recording, fmt)
     seconds = (stamps.last_ns - stamps.first_ns) * 1e-9
     begin = (stamps.first_ns - first_stamp(recording)) * 1e-9
     start, end = (begin + seconds * number / part.of for number in (part.number, part.number + 1))
@@ -543,7 +545,7 @@ def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]
         return missing
     whole = [part for part in parts if isinstance(part, Merged)]
     clusters = [cluster for part in whole for cluster in part.clusters]
-    while len(clusters) > MAX_BLOCKS:
+    while len(clusters) > MOST_CLUSTERS:
         clusters = [Information.sum(clusters[k : k + 2]) for k in range(0, len(clusters), 2)]
     return Merged(
         Information.sum([part.moving for part in whole]),
@@ -551,3 +553,8 @@ def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]
         tuple(clusters),
         sum(part.samples for part in whole),
     )
+
+
+def missing(merged: Merged | tuple[str, ...]) -> tuple[str, ...]:
+    """Return the keys of the factors that are damaged or gone; none where all could be merged."""
+    return () if isinstance(merged, Merged) else merged

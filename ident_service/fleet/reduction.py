@@ -20,22 +20,24 @@ from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from ident_service import __version__
 from ident_service.config.load import load_arm
-from ident_service.errors import IdentError, RecordingError, StorageError, Unavailable, UsageError
+from ident_service.errors import RecordingError, StorageError, Unavailable, UsageError
 from ident_service.fleet.factor import (
+    FACTORS,
     FAN_IN,
     SETTLED,
     STRETCHES,
     Described,
-    Merged,
     Outcome,
     Part,
     Problem,
     Row,
     merge,
     merge_stored,
+    missing,
     reduce_recording,
     require_mergeable,
     settle,
+    stored_row,
 )
 from ident_service.fleet.storage import Source, Store, find
 
@@ -98,6 +100,27 @@ class Recorded:
         return self.url.rpartition("/")[2] + self.row.label
 
 
+@dataclass(frozen=True)
+class Tree:
+    """Futures of one arm's information (`factor.Merged`), which stays on the workers.
+
+    Attributes:
+        single: of the first recording, in the order of hashes.
+        trained: of those that are not held out.
+        held: of those held out to judge, a third; None where there is one recording only.
+        merged: of all.
+        by_recording: whether each recording is a cluster of the uncertainty.
+        count: recordings that are not held out.
+    """
+
+    single: Any
+    trained: Any
+    held: Any | None
+    merged: Any
+    by_recording: bool
+    count: int
+
+
 @dataclass
 class Reduced:
     """Fleet whose recordings are reduced.
@@ -106,7 +129,7 @@ class Reduced:
         described: the arms, with numbers for all that could be chosen.
         pilot: URL of the recording that chose them; empty where there was nothing to choose.
         arms: recordings of each arm, by time.
-        merged: information of each arm.
+        trees: information of each arm, on the workers.
         problems: why recordings were left out.
         computed: factors that were computed, the others having been in the store.
     """
@@ -114,7 +137,7 @@ class Reduced:
     described: Described
     pilot: str
     arms: dict[str, list[Recorded]] = field(default_factory=dict)
-    merged: dict[str, Merged] = field(default_factory=dict)
+    trees: dict[str, Tree] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     computed: int = 0
 
@@ -355,49 +378,54 @@ def _mapped(client: Client, parts: Sequence[Part], described: Described, store: 
 def _merge_arms(client: Client, reduced: Reduced, store: Store, parts: Sequence[Part], tell: Tell) -> None:
     waiting = list(reduced.arms)
     for attempt in range(2):
-        trees = {arm: _tree(client, reduced.arms[arm], reduced.described, store) for arm in waiting}
+        for arm in waiting:
+            reduced.trees[arm] = _tree(client, reduced.arms[arm], reduced.described, store)
+        checks = {arm: client.submit(missing, reduced.trees[arm].merged, pure=False) for arm in waiting}
         damaged: dict[str, tuple[str, ...]] = {}
-        for arm, tree in trees.items():
+        for arm, check in checks.items():
             try:
-                merged = tree.result()
+                if found := check.result():
+                    damaged[arm] = found
             except KilledWorker:
                 raise Unavailable(f"{arm}: merging it ended every worker; give workers more with --memory") from None
-            if isinstance(merged, Merged):
-                reduced.merged[arm] = merged
-            else:
-                damaged[arm] = merged
         if not damaged:
             return
         keys = {key for found in damaged.values() for key in found}
         if attempt:
-            raise StorageError(
-                store.url, f"factors that were just written cannot be read: {', '.join(sorted(keys)[:3])}"
-            )
+            told = ", ".join(sorted(keys)[:3])
+            raise StorageError(store.url, f"factors that were just written cannot be read: {told}")
         tell(f"{len(keys)} factors are damaged in the store and are computed again")
         urls = {(one.url, one.row.label) for arm in damaged for one in reduced.arms[arm] if one.row.key in keys}
-        tasks = [
-            (part, reduced.described, store, __version__, True)
-            for part in parts
-            if (part.source.url, part.label) in urls
-        ]
+        again = [part for part in parts if (part.source.url, part.label) in urls]
+        tasks = [(part, reduced.described, store, __version__, True) for part in again]
         for future in [client.submit(reduce_recording, *task, pure=False) for task in tasks]:
             outcome = future.result()
             if outcome.problem is not None:
                 raise StorageError(outcome.problem.url, f"its factor is damaged, and {outcome.problem.message}")
+        reduced.computed += len(tasks)
         waiting = list(damaged)
 
 
-def _tree(client: Client, recordings: Sequence[Recorded], described: Described, store: Store) -> Any:
-    """Return the future of an arm's information, merged in the order of the recordings' hashes."""
+def _tree(client: Client, recordings: Sequence[Recorded], described: Described, store: Store) -> Tree:
+    """Merge an arm's factors in the order of the recordings' hashes."""
     keys = [one.row.key for one in sorted(recordings, key=lambda one: (one.row.sha256, one.row.label, one.row.key))]
-    whole = len(keys) >= STRETCHES
-    level = [
-        client.submit(merge_stored, keys[k : k + FAN_IN], described, store, whole, pure=False)
-        for k in range(0, len(keys), FAN_IN)
-    ]
-    while len(level) > 1:
-        level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
-    return level[0]
+    count = len(keys) - (max(len(keys) // 3, 1) if len(keys) > 1 else 0)
+    whole = count >= STRETCHES
+
+    def branch(of: Sequence[str]) -> Any:
+        level = [
+            client.submit(merge_stored, of[k : k + FAN_IN], described, store, whole, pure=False)
+            for k in range(0, len(of), FAN_IN)
+        ]
+        while len(level) > 1:
+            level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
+        return level[0]
+
+    single = client.submit(merge_stored, keys[:1], described, store, False, pure=False)
+    trained = single if count == 1 else branch(keys[:count])
+    held = branch(keys[count:]) if count < len(keys) else None
+    merged = trained if held is None else client.submit(merge, [trained, held], pure=False)
+    return Tree(single, trained, held, merged, whole, count)
 
 
 def status_of(request: FleetRequest) -> Mapping[str, Any]:
@@ -407,8 +435,6 @@ def status_of(request: FleetRequest) -> Mapping[str, Any]:
         UsageError, ConfigError: the request or the description is not valid.
         StorageError: storage cannot be reached.
     """
-    from ident_service.fleet.factor import FACTORS, stored_row
-
     config = load_arm(request.arm)
     store = Store(_absolute(request.store))
     sizes = [size for _, size in store.names(FACTORS)]
@@ -433,10 +459,5 @@ def status_of(request: FleetRequest) -> Mapping[str, Any]:
 
 
 def _is_stored(store: Store, described: Described, part: Part) -> bool:
-    from ident_service.fleet.factor import stored_row
-
     noted = store.read(described.seen(part))
     return noted is not None and stored_row(store, noted.decode(errors="replace")) is not None
-
-
-__all__ = ["FleetRequest", "IdentError", "Recorded", "Reduced", "connected", "reduce_fleet", "status_of"]
