@@ -15,6 +15,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any, Final, Literal
@@ -57,6 +58,8 @@ FAN_IN: Final = 16  # factors that one task merges
 MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge in pairs beyond, so that memory does not grow with recordings
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
+# Raised for what is in a recording; a file of random bytes can make a reader raise any of these.
+_UNUSABLE: Final = (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError)
 FACTORS, ROWS, SEEN, SETTLED = "factors", "rows", "seen", "settled"
 
 
@@ -77,7 +80,7 @@ class Part:
     @property
     def label(self) -> str:
         """Return what stands behind the file's name; empty for a whole recording."""
-        return "" if self.of == 1 else f"#{self.number + 1}/{self.of}"
+        return "" if self.of == 1 else f"#{self.number + 1}of{self.of}"
 
 
 @dataclass(frozen=True)
@@ -280,30 +283,49 @@ def require_mergeable(config: ArmConfig) -> None:
         )
 
 
-def settle(source: Source, description: str) -> str | Problem:
-    """Return the description with every choice as a number, as this recording decides them; a problem if it cannot.
+def settle(sources: Sequence[Source], description: str) -> str | tuple[Problem, ...]:
+    """Return the description with every choice as a number, as recordings of one arm decide them together.
 
     Args:
-        source: the recording.
+        sources: the recordings; those that cannot be used are left out.
         description: as JSON.
+
+    Returns:
+        The description as JSON; or what is wrong with each recording, where none can be used.
     """
     config = ArmConfig.model_validate_json(description)
     model = arm_model(config)
     base = base_parameters(model.chain, model.layout)
-    try:
-        with local_copy(source) as path, one_blas_thread():
-            recording = open_for_arm(path, model)
-            _require_usable(recording, model)
-            conditions = feasible_set(config.feasible_set, base.names, config)
-            settled = prepare([recording], model, base, conditions).model.config
-            torque = torque_in(recording)
-    except (IdentError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        return _problem(source, "", error)
+    problems: list[Problem] = []
+    usable: list[Recording] = []
+    with ExitStack() as copies, one_blas_thread():
+        for source in sources:
+            try:
+                recording = open_for_arm(copies.enter_context(local_copy(source)), model)
+                _require_usable(recording, model)
+            except _UNUSABLE as error:
+                problems.append(_problem(source, "", error))
+            else:
+                usable.append(recording)
+        kinds = {torque_in(recording) for recording in usable}
+        # Measured torques are not mixed with commanded ones, here as elsewhere.
+        told = "commanded" if "commanded" in kinds else "measured" if "measured" in kinds else None
+        options = config.identification.model_copy(update={"torque": told or config.identification.torque})
+        model = replace(model, config=config.model_copy(update={"identification": options}))
+        if len(kinds) > 1:
+            usable = [open_for_arm(recording.path, model) for recording in usable]
+        if not usable:
+            return tuple(problems)
+        conditions = feasible_set(config.feasible_set, base.names, config)
+        try:
+            settled = prepare(usable, model, base, conditions).model.config
+        except _UNUSABLE as error:
+            return (*problems, _problem(sources[0], "", error))
     options = settled.identification
     method: Method = "wls" if options.method == "choose" else options.method
-    told = torque if torque in ("measured", "commanded") else options.torque
-    options = options.model_copy(update={"method": method, "torque": told})
-    return settled.model_copy(update={"identification": options}).model_dump_json()
+    return settled.model_copy(
+        update={"identification": options.model_copy(update={"method": method})}
+    ).model_dump_json()
 
 
 @one_blas_thread()
@@ -335,7 +357,7 @@ def reduce_recording(part: Part, described: Described, store: Store, version: st
                 if part.of > 1:
                     recording = _piece(recording, part, described.config.recording)
                 row, content = _reduced(recording, key, part.label, described)
-    except (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError) as error:
+    except _UNUSABLE as error:
         if isinstance(error, StorageError) and error.url.startswith(store.url):
             raise
         return Outcome(part, None, _problem(source, part.label, error))

@@ -203,7 +203,7 @@ def _arm_files(
     """Return the files of one arm's results, and what the fleet's own say of it."""
     from ident_service.config.arm import ArmConfig
 
-    chosen = arm_estimate(alone, merged, recordings, described, pooled if more["pooled"] else None)
+    chosen = arm_estimate(alone, merged, recordings, described, pooled if more["pooled"] else None, more["arms"])
     own = chosen.candidates[chosen.chosen]
     unusable = reasons_against(chosen)
     fleet = {

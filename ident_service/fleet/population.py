@@ -37,7 +37,7 @@ from ident_service.estimation.least_squares import (
     torque_error,
     weighted_least_squares,
 )
-from ident_service.estimation.uncertainty import Uncertainty, negligible, uncertainty, verdicts
+from ident_service.estimation.uncertainty import Uncertainty, negligible, uncertainty, verdicts, widening
 from ident_service.fleet.factor import Described, Merged, Row
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
@@ -280,6 +280,7 @@ def arm_estimate(
     recordings: Sequence[tuple[str, str]],
     described: Described,
     pooled: LeastSquares | None = None,
+    arms: int = 1,
 ) -> Estimate:
     """Return one arm's estimate inside its feasible set, as `ident identify` has it.
 
@@ -289,6 +290,7 @@ def arm_estimate(
         recordings: name and hash of each.
         described: the arm.
         pooled: its estimate drawn to the fleet's; that of the arm alone when None.
+        arms: of the fleet; how far they differ is known the less, the fewer they are.
 
     Raises:
         SolverError: the solver stopped without an optimum.
@@ -296,7 +298,8 @@ def arm_estimate(
     model, base, conditions = described.model, described.base, _conditions(described)
     fit = alone.fit if pooled is None else pooled
     held = constrained_least_squares(fit, base, conditions)
-    deviations = alone.doubt.deviations if pooled is None else pooled.standard_deviations
+    degrees = alone.doubt.degrees if pooled is None else np.full(base.size, max(arms - 2.0, 1.0))
+    deviations = alone.doubt.deviations if pooled is None else pooled.standard_deviations * widening(degrees)
     covariance = alone.doubt.covariance if pooled is None else pooled.inverse @ pooled.inverse.T
     likely = likely_bodies(model)
     near = allowed_change(fit, base, deviations, held.beta) if held.tight and pooled is None else None
@@ -324,7 +327,7 @@ def arm_estimate(
         covariance=covariance,
         standard_deviations=deviations,
         white_standard_deviations=fit.standard_deviations,
-        degrees=alone.doubt.degrees,
+        degrees=degrees,
         negligible=as_zero,
         noise_deviations=None,
         constrained_intervals=None,

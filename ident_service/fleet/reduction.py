@@ -49,7 +49,8 @@ MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
 _ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
 _CONNECT_S: Final = 10.0
 _WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
-_PILOTS: Final = 5  # recordings that are tried to settle choices with
+_PILOTS: Final = 3  # recordings of one arm that choices are settled with
+_ARMS_TRIED: Final = 5
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class Reduced:
 
     Attributes:
         described: the arms, with numbers for all that could be chosen.
-        pilot: URL of the recording that chose them; empty where there was nothing to choose.
+        pilot: URLs of the recordings that chose them; empty where there was nothing to choose.
         arms: recordings of each arm, by time.
         trees: information of each arm, on the workers.
         problems: why recordings were left out.
@@ -257,7 +258,8 @@ def reduce_fleet(client: Client, request: FleetRequest, tell: Tell) -> Reduced:
     sources = find(request.patterns)
     whose = {source.url: named(source.url) for source in sources}
     store = Store(_absolute(request.store))
-    described, pilot = _settled(client, sources, config.model_dump_json(), config.sha256, store, request, tell)
+    arm_of = {url: arm for url, (arm, _) in whose.items()}
+    described, pilot = _settled(client, sources, arm_of, config.model_dump_json(), config.sha256, store, request, tell)
     parts = [
         Part(source, number, count)
         for source in sources
@@ -329,29 +331,36 @@ def _timestamp(text: str) -> float:
 def _settled(
     client: Client,
     sources: Sequence[Source],
+    whose: Mapping[str, str],
     description: str,
     sha256: str,
     store: Store,
     request: FleetRequest,
     tell: Tell,
 ) -> tuple[Described, str]:
-    """Return the description with numbers, from the store or settled by the first recording that can be used."""
+    """Return the description with numbers, from the store or settled by the first arm that can be used."""
     name = f"{SETTLED}/{sha256}.json"
     kept = None if request.settle_again else store.read(name)
     if kept is not None:
         pilot, _, text = kept.decode().partition("\n")
         return Described(text), pilot
-    problems = []
-    for source in sources[:_PILOTS]:
-        tell(f"{source.name}: filter, delay and friction's shape are chosen from it")
-        found = client.submit(settle, source, description, pure=False).result()
+    # Of one arm, as others have other parameters; the first whose recordings can be used.
+    arms: dict[str, list[Source]] = {}
+    for source in sources:
+        arms.setdefault(whose[source.url], []).append(source)
+    problems: list[Problem] = []
+    for arm in sorted(arms)[:_ARMS_TRIED]:
+        pilots = arms[arm][:_PILOTS]
+        tell(f"{arm}: filter, delay and friction's shape are chosen from {len(pilots)} of its recordings")
+        found = client.submit(settle, pilots, description, pure=False).result()
         if isinstance(found, str):
-            store.write(name, f"{source.url}\n{found}".encode())
-            return Described(found), source.url
-        problems.append(found)
-    first = problems[0]
+            names = ", ".join(source.url for source in pilots)
+            store.write(name, f"{names}\n{found}".encode())
+            return Described(found), names
+        problems.extend(found)
+    reasons = "; ".join(f"{one.url}: {one.message}" for one in problems[:3])
     raise RecordingError(
-        first.url, f"{first.message} (and {len(problems) - 1} more that choices could be made from, none usable)"
+        problems[0].url, f"filter, delay and friction's shape cannot be chosen, no recording can be used: {reasons}"
     )
 
 

@@ -118,16 +118,19 @@ def find(patterns: Sequence[str]) -> list[Source]:
 
 def _listed(system: Any, path: str) -> dict[str, dict[str, Any]]:
     if any(sign in path for sign in "*?["):
-        listed: dict[str, dict[str, Any]] = system.glob(path, detail=True)
-        return listed
+        return _visible(system.glob(path, detail=True))
     try:
         info = system.info(path)
     except FileNotFoundError:
         return {}
     if info["type"] != "directory":
         return {info["name"]: info}
-    inside: dict[str, dict[str, Any]] = system.find(path, detail=True)
-    return {name: one for name, one in inside.items() if not Path(name).name.startswith(".")}
+    return _visible(system.find(path, detail=True))
+
+
+def _visible(listed: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return a listing without files whose name begins with a point, as of copies that are not complete."""
+    return {name: one for name, one in listed.items() if not Path(name).name.startswith(".")}
 
 
 def _is_local(system: Any) -> bool:
