@@ -58,6 +58,7 @@ FAN_IN: Final = 16  # factors that one task merges
 MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge in pairs beyond, so that memory does not grow with recordings
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
+_PILOTS: Final = 3  # recordings that settle choices
 # Raised for what is in a recording; a file of random bytes can make a reader raise any of these.
 _UNUSABLE: Final = (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError)
 FACTORS, ROWS, SEEN, SETTLED = "factors", "rows", "seen", "settled"
@@ -283,23 +284,39 @@ def require_mergeable(config: ArmConfig) -> None:
         )
 
 
-def settle(sources: Sequence[Source], description: str) -> str | tuple[Problem, ...]:
+@dataclass(frozen=True)
+class Settled:
+    """Description with every choice as a number.
+
+    Attributes:
+        description: as JSON.
+        pilots: URLs of the recordings that decided.
+    """
+
+    description: str
+    pilots: tuple[str, ...]
+
+
+def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:
     """Return the description with every choice as a number, as recordings of one arm decide them together.
 
     Args:
-        sources: the recordings; those that cannot be used are left out.
+        sources: the recordings, of which the first few that can be used decide.
         description: as JSON.
 
     Returns:
-        The description as JSON; or what is wrong with each recording, where none can be used.
+        The settled description; or what is wrong with each recording, where none can be used.
     """
     config = ArmConfig.model_validate_json(description)
     model = arm_model(config)
     base = base_parameters(model.chain, model.layout)
     problems: list[Problem] = []
     usable: list[Recording] = []
+    pilots: list[str] = []
     with ExitStack() as copies, one_blas_thread():
         for source in sources:
+            if len(usable) == _PILOTS:
+                break
             try:
                 recording = open_for_arm(copies.enter_context(local_copy(source)), model)
                 _require_usable(recording, model)
@@ -307,6 +324,7 @@ def settle(sources: Sequence[Source], description: str) -> str | tuple[Problem, 
                 problems.append(_problem(source, "", error))
             else:
                 usable.append(recording)
+                pilots.append(source.url)
         kinds = {torque_in(recording) for recording in usable}
         # Measured torques are not mixed with commanded ones, here as elsewhere.
         told = "commanded" if "commanded" in kinds else "measured" if "measured" in kinds else None
@@ -323,9 +341,8 @@ def settle(sources: Sequence[Source], description: str) -> str | tuple[Problem, 
             return (*problems, _problem(sources[0], "", error))
     options = settled.identification
     method: Method = "wls" if options.method == "choose" else options.method
-    return settled.model_copy(
-        update={"identification": options.model_copy(update={"method": method})}
-    ).model_dump_json()
+    settled = settled.model_copy(update={"identification": options.model_copy(update={"method": method})})
+    return Settled(settled.model_dump_json(), tuple(pilots))
 
 
 @one_blas_thread()

@@ -173,9 +173,12 @@ def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]
     floor = (_LEAST * residual) ** 2
     spread = np.median(np.abs(beta - np.median(beta, axis=0)), axis=0) ** 2
     tau2 = np.array([max(float(np.mean(spread[one])), floor) for one in member])
-    for _ in range(_ROUNDS):
+    if len(arms) == 1:
+        tau2[:] = floor  # one arm says nothing of how far arms differ
+    for _ in range(_ROUNDS if len(arms) > 1 else 0):
         gained, expected = _moments(P, right, tau2 @ member, member)
-        step = np.sqrt(gained.sum(axis=0) / np.maximum(expected.sum(axis=0), np.finfo(float).tiny))
+        seen = expected.sum(axis=0) > np.finfo(float).tiny
+        step = np.sqrt(np.where(seen, gained.sum(axis=0) / np.where(seen, expected.sum(axis=0), 1.0), 1.0))
         before, tau2 = tau2, np.clip(tau2 * step, floor, None)
         if np.max(np.abs(np.sqrt(tau2 / before) - 1.0)) < _SETTLED:
             break

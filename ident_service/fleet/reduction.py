@@ -31,6 +31,7 @@ from ident_service.fleet.factor import (
     Part,
     Problem,
     Row,
+    Settled,
     merge,
     merge_stored,
     missing,
@@ -49,8 +50,7 @@ MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
 _ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
 _CONNECT_S: Final = 10.0
 _WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
-_PILOTS: Final = 3  # recordings of one arm that choices are settled with
-_ARMS_TRIED: Final = 5
+_PILOTS_TRIED, _ARMS_TRIED = 20, 5  # recordings of an arm that choices may be settled with, and arms
 
 
 @dataclass(frozen=True)
@@ -350,13 +350,12 @@ def _settled(
         arms.setdefault(whose[source.url], []).append(source)
     problems: list[Problem] = []
     for arm in sorted(arms)[:_ARMS_TRIED]:
-        pilots = arms[arm][:_PILOTS]
-        tell(f"{arm}: filter, delay and friction's shape are chosen from {len(pilots)} of its recordings")
-        found = client.submit(settle, pilots, description, pure=False).result()
-        if isinstance(found, str):
-            names = ", ".join(source.url for source in pilots)
-            store.write(name, f"{names}\n{found}".encode())
-            return Described(found), names
+        tell(f"filter, delay and friction's shape are chosen from recordings of {arm}")
+        found = client.submit(settle, arms[arm][:_PILOTS_TRIED], description, pure=False).result()
+        if isinstance(found, Settled):
+            names = ", ".join(found.pilots)
+            store.write(name, f"{names}\n{found.description}".encode())
+            return Described(found.description), names
         problems.extend(found)
     reasons = "; ".join(f"{one.url}: {one.message}" for one in problems[:3])
     raise RecordingError(

@@ -21,6 +21,7 @@ from ident_service.fleet.factor import (
     Outcome,
     Part,
     Row,
+    Settled,
     merge,
     merge_stored,
     missing,
@@ -52,8 +53,9 @@ def folder(usual: Kind, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def described(usual: Kind, folder: Path) -> Described:
     settled = settle(find([str(folder)]), usual.model.config.model_dump_json())
-    assert isinstance(settled, str)
-    return Described(settled)
+    assert isinstance(settled, Settled)
+    assert len(settled.pilots) == 3
+    return Described(settled.description)
 
 
 @pytest.fixture(scope="module")
