@@ -11,7 +11,8 @@ Given both, an arm's parameters minimise
     |R_i (beta - beta_i^)|^2 + sum_g |D_g^-1 (beta - mu)_g|^2 / tau_g^2,    R_i^T R_i = C_i^-1
 
 inside the feasible set: where an arm's own recordings say much they decide, elsewhere the fleet does. C_i^-1 comes from
-the triangles, scaled to the variances from blocks, and what differs from recording to recording is added to C_i.
+the triangles, scaled by one number to the variances from blocks, and what differs from recording to recording is added
+to C_i.
 
 Shares of variance between arms, between recordings and noise are moment estimates per parameter (DerSimonian and Laird
 1986, twice). Whether pooling helps is decided on recordings that no estimate has seen.
@@ -95,8 +96,9 @@ def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit
     variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
     white = fit.standard_deviations
     known = np.isfinite(white) & np.isfinite(doubt.deviations) & (white > 0.0)
-    wider = np.where(known, doubt.deviations / np.where(known, white, 1.0), 1.0)
-    precision = fit.R1.T @ fit.R1 / max(variance, np.finfo(float).tiny) / np.outer(wider, wider)
+    # One factor for all: factors of their own would turn the combinations that are known well into others.
+    wider = float(np.median((doubt.deviations[known] / white[known]) ** 2)) if known.any() else 1.0
+    precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * wider)
     if between is not None:
         precision = _widened(precision, between)
     everything = merged.everything
@@ -121,8 +123,8 @@ class Population:
         covariance: of them, shape (base, base).
         variances: T, between arms, shape (base,).
         without: T as the other arms alone have it, per arm, shape (arms, base).
-        weights: M_i = (C_i + T)^-1 of every arm, shape (arms, base, base).
-        weighted: M_i times the arm's estimate, shape (arms, base).
+        precisions: C_i^-1 of every arm, shape (arms, base, base).
+        right: C_i^-1 times the arm's estimate, shape (arms, base).
     """
 
     arms: tuple[str, ...]
@@ -132,8 +134,8 @@ class Population:
     covariance: Array
     variances: Array
     without: Array
-    weights: Array
-    weighted: Array
+    precisions: Array
+    right: Array
 
     @property
     def common(self) -> Array:
@@ -150,8 +152,11 @@ class Population:
         if len(self.arms) == 1:
             return self.mean, self.covariance, self.variances
         place = self.arms.index(arm)
-        covariance = _inverse(self.weights.sum(axis=0) - self.weights[place])
-        return covariance @ (self.weighted.sum(axis=0) - self.weighted[place]), covariance, self.without[place]
+        others = np.arange(len(self.arms)) != place
+        # With the spread of the others: one that the odd arm widens would make their mean seem less sure, too.
+        variances = self.without[place]
+        mean, covariance, *_ = _common(self.precisions[others], self.right[others], variances)
+        return mean, covariance, variances
 
 
 @one_blas_thread()
@@ -187,7 +192,7 @@ def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]
     others = np.maximum(expected.sum(axis=0) - expected, np.finfo(float).tiny)
     ratio = np.clip((gained.sum(axis=0) - gained) / others, 1e-6, 1.0) if len(arms) > 2 else np.ones_like(gained)
     variances = tau2 @ member
-    mean, covariance, weights, weighted = _common(P, right, variances)
+    mean, covariance, *_ = _common(P, right, variances)
     return Population(
         arms=arms,
         scale=scale,
@@ -196,8 +201,8 @@ def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]
         covariance=covariance,
         variances=variances,
         without=np.maximum(tau2 * ratio, floor) @ member,
-        weights=weights,
-        weighted=weighted,
+        precisions=P,
+        right=right,
     )
 
 
