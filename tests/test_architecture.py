@@ -32,6 +32,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("preflight", "results"),
     ("registry",),
     ("operations",),
+    ("fleet",),
     ("client",),
     ("daemon",),
     ("cli",),
@@ -75,10 +76,14 @@ DOORS: dict[str, set[str]] = {
     "canopen": {"drivers", "sim_backend"},
     "can": {"drivers", "sim_backend"},
     "cronsim": {"operations"},
+    "dask": {"fleet"},
+    "distributed": {"fleet"},
     "fastapi": {"daemon"},
     "httpx": {"client"},
-    "jinja2": {"daemon"},
+    "fsspec": {"fleet"},
+    "jinja2": {"daemon", "fleet"},
     "prometheus_client": {"daemon"},
+    "pyarrow": {"fleet"},
     "standardwebhooks": {"daemon"},
     "starlette": {"daemon"},
     "uvicorn": {"daemon"},
@@ -92,7 +97,10 @@ CANOPEN_FILES = {
     "ident_service/operations/fieldbus.py",
     "sim_backend/emulator/build.py",
 }
-HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn")
+HEAVY = (
+    *("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn"),
+    *("distributed", "fsspec", "pyarrow"),
+)
 
 
 @dataclass(frozen=True)
@@ -298,6 +306,8 @@ def test_the_architecture_page_names_what_exists() -> None:
         ("ident_service/estimation/x.py", "from mcap.reader import make_reader", "mcap may only"),
         ("ident_service/cli.py", "import fastapi", "fastapi may only"),
         ("ident_service/motion/x.py", "from can import Bus", "can may only"),
+        ("ident_service/operations/x.py", "from distributed import Client", "distributed may only"),
+        ("ident_service/results/x.py", "import ident_service.fleet.factor", "results imports fleet"),
         ("ident_service/attic/x.py", "import json", "no package is called 'attic'"),
     ],
 )

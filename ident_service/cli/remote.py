@@ -288,6 +288,7 @@ REMOTE: dict[str, Verb] = {
 LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
+    **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
