@@ -88,12 +88,14 @@ DOORS: dict[str, set[str]] = {
     "starlette": {"daemon"},
     "uvicorn": {"daemon"},
 }
-# What may know CANopen: its driver, its emulation, its configuration, and the commands that scan and probe its nodes.
+# What may know CANopen: its driver, its emulation, its configuration, and the commands that scan, probe and
+# configure its nodes.
 CANOPEN_ROOMS = ("drivers/canopen/", "sim_backend/canopen_device/")
 CANOPEN_FILES = {
     "ident_service/config/arm.py",
     "ident_service/config/canopen.py",
     "ident_service/config/load.py",
+    "ident_service/operations/drive_configuration.py",
     "ident_service/operations/fieldbus.py",
     "sim_backend/emulator/build.py",
 }

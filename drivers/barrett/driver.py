@@ -184,7 +184,7 @@ class BarrettArm(Arm):
             if not setup.is_zeroed(port, found):
                 raise PositionUnknown(
                     f"{self._config.name} has not been zeroed since its pucks have power (ZERO is 0): lead it home by "
-                    f"hand, then `ident home {self._config.name} --zero`"
+                    f"hand, then `ident set-home {self._config.name}`"
                 )
             codec = PuckCodec(self._driver, found.motors, found.safety)
             self._bus = PuckBus(port.link, codec, self._driver, self._period_ns)

@@ -6,7 +6,7 @@ numbers of all other properties follow; group frames need the same numbers for P
 each says of itself is compared with the description (`checks`).
 
 A puck counts from where it was when power came. Its positions are the arm's once a person has led the arm home and has
-said so (`ident home ARM --zero`); the safety puck remembers that (ZERO = 1) for as long as it has power. A motor with
+said so (`ident set-home ARM`); the safety puck remembers that (ZERO = 1) for as long as it has power. A motor with
 an absolute encoder and a calibrated `zero_angle` corrects what the person could not see, within half a turn:
 
     error = wrap(J home + zero_angle - 2 pi MECH/CTS),    P = CTS/(2 pi) (J home - error).

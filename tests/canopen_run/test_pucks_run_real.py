@@ -78,7 +78,7 @@ class Bench:
             assert main(["ack", str(self.arm), code, "--state", str(self.state)]) == 0
 
     def zero(self) -> None:
-        words = ["home", str(self.arm), "--zero", "--confirm", NAME, "--state", str(self.state)]
+        words = ["set-home", str(self.arm), "--confirm", NAME, "--state", str(self.state)]
         assert main(words) == 0
 
 
