@@ -2,7 +2,7 @@
 
 `make bench-realtime`, or `python -m benchmarks.realtime [TRIES]`, about a minute a try: the WAM at 500 Hz as
 `docs/fieldbus.md` has it, but lowered after a stop, as nobody is there to confirm that it is supported; and planar2
-behind two drives at 1 kHz. `ident emulate`, `ident check`, and then `ident run` again and again (10 times). What stalls
+behind two drives at 1 kHz. `ident emulate`, `ident preflight`, then `ident run` again and again (10 times). What stalls
 the machine meanwhile is in the figures.
 """
 

@@ -1,1 +1,1 @@
-"""Drive arms: the Arm contract and one package per fieldbus; nothing here knows of identification."""
+"""Drive arms: the `Arm` contract and one package per fieldbus, independent of identification."""

@@ -1,6 +1,6 @@
-"""Robot identification service: from an arm on a bus to dynamic parameters a real body could have.
+"""Identify a robot arm: from an arm on a bus to physically feasible dynamic parameters.
 
-Importing this package loads no large library; each room below does that behind its own door.
+Importing this package loads no large library; its sub-packages load theirs when they are imported.
 """
 
 __version__ = "0.1.0"

@@ -916,7 +916,7 @@ def _require_expressions(claim: Claim, arm: Arm) -> None:
         same = [other for other in left if _same_row(row, other)]
         if not same:
             raise VerificationError(
-                f"expression {number} is no base parameter of {arm.name}; `ident base` prints those that it has"
+                f"expression {number} is no base parameter of {arm.name}; `ident base-parameters` prints them"
             )
         left.remove(same[0])
     if left:

@@ -18,12 +18,13 @@
     │   └── PersonNeeded               a re-identification that judged nothing: somebody must look at the arm first
     ├── Unavailable (RuntimeError)     this machine, or a daemon, cannot do it now; asked again later, it may
     │   ├── RegistryBusy               another process keeps the registry of the state folder
-    │   └── DiskFull (OSError)         the disk of the state folder has no room
+    │   ├── DiskFull (OSError)         the disk of the state folder has no room
+    │   └── StorageError (OSError)     storage of a fleet's recordings or factors is gone, or too slow
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
         │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
-        ├── Stopped                    a motion did not come to its end, because somebody asked for a stop
+        ├── Stopped                    a motion did not come to its end, because a stop was requested
         └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
@@ -157,6 +158,17 @@ class DiskFull(Unavailable, OSError):
     """The disk of the state folder has no room."""
 
 
+class StorageError(Unavailable, OSError):
+    """Storage of recordings or factors cannot be reached, or does not give what it lists; the message names the URL."""
+
+    def __init__(self, url: str, message: str) -> None:
+        self.url = url
+        super().__init__(f"{url}: {message}")
+
+    def __reduce__(self) -> tuple[type[StorageError], tuple[str, str]]:
+        return type(self), (self.url, str(self).removeprefix(f"{self.url}: "))
+
+
 class ArmError(IdentError, RuntimeError):
     """Something below the motion loop failed."""
 
@@ -174,7 +186,7 @@ class PositionUnknown(DriverError):
 
 
 class Stopped(ArmError):
-    """A motion did not come to its end: somebody asked for a stop, or nobody renewed its lease."""
+    """A motion did not come to its end: a stop was requested, or nobody renewed its lease."""
 
 
 class ArmFault(ArmError):

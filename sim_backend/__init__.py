@@ -1,1 +1,1 @@
-"""Simulate arms: a plant with true parameters, behind the same contract as a real arm."""
+"""Simulate arms: a plant with true parameters behind the `Arm` contract, and emulated drives on a bus."""

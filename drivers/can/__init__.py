@@ -1,1 +1,1 @@
-"""CAN: frames, links to a bus, its state and its log; nothing of CANopen."""
+"""Access CAN buses: frames, links, bus state and logs, independent of CANopen."""

@@ -29,7 +29,7 @@ _REMEDY: dict[Kind, str] = {
     "down": "the interface is down; " + _UP,
     "off": "the controller has left the bus after too many errors (bus-off); check wiring, termination and bit rate, "
     "then restart it: `ip link set {name} down`, and " + _UP,
-    "full": "the transmit queue is full: nobody acknowledges, or the bus is overloaded; check that the drives have "
+    "full": "the transmit queue is full: no node acknowledges, or the bus is overloaded; check that the drives have "
     "power and the same bit rate, that the bus is terminated, and `ident bus load`",
     "gone": "the interface has gone; check the adapter and its cable",
     "refused": "cannot be used; check driver.buses in the arm's file",
@@ -107,7 +107,7 @@ _CLASSES = {
     _LOST_ARBITRATION: "arbitration lost",
     0x008: "protocol violated on the wire",
     0x010: "transceiver",
-    _ACKNOWLEDGE: "nobody acknowledges: no other node, no power, or a broken cable",
+    _ACKNOWLEDGE: "no node acknowledges: no other node, no power, or a broken cable",
     0x080: "bus error",
 }
 # Bits of the second data byte, when the class bit of the controller is set.

@@ -1,1 +1,1 @@
-"""Drive arms with CANopen: a cyclic plane of frames and clocks, and a configuration plane of the canopen library."""
+"""Drive arms with CANopen: cyclic frames by our own codec, configuration by the canopen library."""

@@ -17,17 +17,18 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.axis_status import AxisStatus
+from drivers.can.bus_load import worst
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import BusLock, Link
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import worst
 from drivers.canopen.cia402 import NmtState, axis_status, drive_words, joint_status, nmt_words
 from drivers.canopen.drive_setup import identify
-from drivers.canopen.motor_units import coordinates, unwrapped
+from drivers.canopen.motor_units import coordinates
 from drivers.canopen.pdo_mapping import HEARTBEAT, SDO_REPLY, SYNC
 from drivers.canopen.sdo import TIMEOUT, Answers, Objects, Place, poll
 from drivers.canopen.stored_zero import zeros_of
 from drivers.clock import Clock, RealClock
+from drivers.motor_units import unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError, PositionUnknown
@@ -204,15 +205,15 @@ class MonitoringArm(Arm):
 
     def zero(self) -> tuple[str, ...]:
         """Refuse to set a zero; raises DriverError."""
-        raise DriverError("an arm that is only looked at cannot be zeroed")
+        raise DriverError("a read-only arm cannot be zeroed")
 
     def enable(self) -> None:
         """Refuse to enable the arm; raises DriverError."""
-        raise DriverError("an arm that is only looked at cannot be enabled")
+        raise DriverError("a read-only arm cannot be enabled")
 
     def reset(self) -> None:
         """Refuse to reset the drives; raises DriverError."""
-        raise DriverError("an arm that is only looked at cannot be reset")
+        raise DriverError("a read-only arm cannot be reset")
 
     def exchange(self, torque: Vector | None) -> Sample:
         """Ask every drive once for its position, status and errors.
@@ -223,7 +224,7 @@ class MonitoringArm(Arm):
         """
         self._require_open()
         if torque is not None:
-            raise DriverError("an arm that is only looked at takes no torque")
+            raise DriverError("a read-only arm takes no torque")
         stamp_ns = self._wait()
         self._heard.drain(self._links)
         deadlines = [stamp_ns + round(share * self._period_ns) for share in _UNTIL]
@@ -261,9 +262,7 @@ class MonitoringArm(Arm):
     def _require_alone(self) -> None:
         if self._heard.streaming:
             buses = ", ".join(self._driver.buses[bus].channel for bus in sorted(self._heard.streaming))
-            raise DriverError(
-                f"another host sends SYNC on {buses}; looking would delay its frames: stop it, or look from there"
-            )
+            raise DriverError(f"another host sends SYNC on {buses}; reading would delay its frames: stop it first")
 
     def _ask(self, places: tuple[Place, ...] | list[Place], entry: od.Entry, deadline_ns: int) -> Answers:
         return poll(self._links, places, entry, deadline_ns, self._heard.take)

@@ -64,12 +64,12 @@ _POWERS = range(1, 7)
 
 # Why a drive without these cannot be driven.
 _INDISPENSABLE: Sequence[tuple[Entry, str]] = (
-    (od.VENDOR, "nobody knows whose it is"),
-    (od.CONTROL_WORD, "it cannot be led to `operation enabled`, nor out of it"),
-    (od.STATUS_WORD, "it does not tell its state"),
+    (od.VENDOR, "its maker is unknown"),
+    (od.CONTROL_WORD, "it cannot be enabled or disabled"),
+    (od.STATUS_WORD, "it does not report its state"),
     (od.MODE, "its mode of operation cannot be set"),
-    (od.MODE_DISPLAY, "it does not tell its mode of operation"),
-    (od.POSITION, "it does not tell its position"),
+    (od.MODE_DISPLAY, "it does not report its mode of operation"),
+    (od.POSITION, "it does not report its position"),
     (od.RPDO_COB_ID, "torques have no frame"),
     (od.RPDO_COUNT, "torques have no frame"),
     (pdo_entry(od.RPDO_COB_ID, 2), "control words have no frame"),
@@ -80,16 +80,16 @@ _INDISPENSABLE: Sequence[tuple[Entry, str]] = (
 # What happens without these.
 _OPTIONAL: Sequence[tuple[Entry, str]] = (
     (od.SYNC_COB_ID, "SYNC is taken to be 080h; a position proves it"),
-    (od.SYNC_PERIOD, "it is not told the cycle"),
-    (od.PERIOD_NUMBER, "it is not told the interpolation period"),
+    (od.SYNC_PERIOD, "its cycle time cannot be set"),
+    (od.PERIOD_NUMBER, "its interpolation period cannot be set"),
     (od.EMERGENCY_COB_ID, "emergencies are taken to be 080h + node"),
-    (od.EMERGENCY_INHIBIT, "a storm of emergencies is not held back"),
-    (od.ERROR_BEHAVIOUR, "a lost host may end `operational`: without status reports its watchdog cannot be proven"),
-    (od.ABORT_CONNECTION, "what it does when its host is gone is its maker's"),
+    (od.EMERGENCY_INHIBIT, "emergencies are not rate-limited"),
+    (od.ERROR_BEHAVIOUR, "a lost host may end `operational`: without status reports its watchdog cannot be tested"),
+    (od.ABORT_CONNECTION, "its reaction to a lost host is the maker's"),
     (od.QUICK_STOP_OPTION, "`disable voltage` is the only stop that is known"),
-    (od.FAULT_OPTION, "what it does in a fault is its maker's"),
-    (od.LOWER_LIMIT, "it knows no position limits, which are no wall in torque mode either"),
-    (od.ZERO_COUNTS, "it cannot keep a zero (`zero: at_home`)"),
+    (od.FAULT_OPTION, "its reaction to a fault is the maker's"),
+    (od.LOWER_LIMIT, "it has no position limits (which would not stop a drive in torque mode either)"),
+    (od.ZERO_COUNTS, "it cannot store a zero (`zero: at_home`)"),
 )
 _OTHERS: Sequence[Entry] = (
     *(od.DEVICE_TYPE, od.PRODUCT, od.REVISION, od.SERIAL, od.SYNC_WINDOW, od.SYNC_OVERFLOW, od.GUARD_TIME),
@@ -312,14 +312,14 @@ def assess(
     elif torque is None:
         problems = [Problem("6502h", _no_position(found) if positions else family.refuse or _no_torque(family, found))]
     elif kind is None and found.asked:
-        problems.insert(0, Problem("1000h", "does not tell that it is a drive of CiA 402"))
+        problems.insert(0, Problem("1000h", "does not report to be a drive of CiA 402"))
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
     notes += _other_limits(family, found, drive, limit)
     speeds = [entry_of(text, "largest speed", "turns per minute") for text in family.speed_limit]
     speed = next((entry for entry in speeds if found.has(entry)), None)
     if speed is None:
-        notes.append("no limit of the speed in the drive: the host alone watches it")
+        notes.append("no speed limit in the drive: only the host monitors it")
     watchdogs = tuple(_watchdogs(family, found, drive))
     changes: list[Problem] = []
     if torque is not None:
@@ -331,7 +331,9 @@ def assess(
             tried = ", ".join(sorted({named(one.entry) for one in family.torque_limit})) or "none is known"
             problems.append(Problem(tried, "missing; the drive itself must limit the torque"))
         if not watchdogs:
-            problems.append(Problem("1400h:05, 1016h:01, 100Ch", "missing; nothing stops it when its host is gone"))
+            problems.append(
+                Problem("1400h:05, 1016h:01, 100Ch", "missing; nothing would stop it when its host is gone")
+            )
         elif drive.watchdog not in watchdogs:
             words = f"{drive.watchdog}: this drive lacks it; it has {', '.join(watchdogs)}"
             changes.append(Problem("drives.watchdog", words))
@@ -339,7 +341,7 @@ def assess(
             words = "at_home: it has no 1020h to keep a zero in; its encoder must know its position (absolute)"
             changes.append(Problem("driver.zero", words))
         if driver.torque_reports != "none" and not found.has(od.TORQUE_ACTUAL):
-            changes.append(Problem("driver.measured_torque", "it does not tell its torque (6077h): set it to none"))
+            changes.append(Problem("driver.measured_torque", "it does not report its torque (6077h): set it to none"))
     event = found.has(pdo_entry(od.TPDO_PERIOD, 2))
     if not event:
         notes.append("1801h:05 is missing: status reports come with every n-th SYNC")
@@ -428,7 +430,7 @@ def _unit_problems(family: Family, found: DriveEntries, count: float | None) -> 
     if unit is None or unit.writable or unit.rated is None or not found.asked:
         return
     if count is None and not found.get(entry_of(unit.rated, "")):
-        words = "is 0 or not there, so that nobody knows what a count is: enter the motor by its maker's tool"
+        words = "is 0 or not there, so the value of a count is unknown: enter the motor data with the maker's tool"
         yield Problem(named(unit.rated), words)
 
 

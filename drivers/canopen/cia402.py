@@ -135,7 +135,7 @@ EMERGENCIES: dict[int, str] = {
     0x8600: "positioning",
     0x8611: "following error",
     0x8612: "reference limit",
-    0x8700: "SYNC: it has stayed away",
+    0x8700: "SYNC missing",
     0x9000: "external error",
     0xF000: "additional functions",
     0xFF00: "specific to the device",

@@ -20,7 +20,7 @@ from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, entry_of, where
 from drivers.canopen.cia402 import POWER_OFF, state_of
-from drivers.canopen.motor_units import Coordinates, torque_limit_counts
+from drivers.canopen.motor_units import count_limits, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
 from drivers.canopen.sdo import (
@@ -33,6 +33,7 @@ from drivers.canopen.sdo import (
     optional,
 )
 from drivers.canopen.stored_zero import Zeros
+from drivers.motor_units import Coordinates
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import (
     CanopenDrive,
@@ -307,7 +308,7 @@ def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
     assert isinstance(driver, CanopenDriver)  # noqa: S101 - refused in the beginning
     assert gears is not None  # noqa: S101 - likewise
     lowest, highest = np.array([joint.position or (-np.inf, np.inf) for joint in joints]).T
-    limits = found.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+    limits = count_limits(found, lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
     speeds = motor_speeds(gears, [joint.velocity for joint in joints])
     brakes = quick_stop_decelerations(driver, gears, [joint.acceleration for joint in joints])
     torques = motor_torques(driver, gears, [joint.torque for joint in joints])

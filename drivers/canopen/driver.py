@@ -26,10 +26,12 @@ from numpy.typing import NDArray
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
+from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
 from drivers.can.can_link import BusLock, Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links, require_format
 from drivers.canopen import object_dictionary as od
+from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.capabilities import required
 from drivers.canopen.cia402 import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, DriveState, NmtCommand, joint_status
@@ -43,13 +45,14 @@ from drivers.canopen.drive_setup import (
     watchdogs_of,
 )
 from drivers.canopen.homing import ZeroingArm
-from drivers.canopen.motor_units import Coordinates, coordinates, signed, unwrapped
+from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.stored_zero import zeros_of
 from drivers.canopen.sync_cycle import Buses, EnableSequence, Resetting, hold
 from drivers.clock import Clock, RealClock, VirtualClock
+from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError, PositionUnknown
@@ -411,7 +414,13 @@ class CanopenArm(Arm):
             "drivers.canopen",
             lost_cycles=self._driver.lost_cycles,
             streams_position=self._positions,
+            watchdog=self._driver.watchdog,
+            report_delay=self._driver.report_delay,
         )
+
+    def bus_budget(self, rate: float | None = None) -> Budget:
+        """Return the load of the buses, see `Arm`."""
+        return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def enable(self) -> None:
         """Energise all drives together with zero torque, through the states of CiA 402.
@@ -613,7 +622,7 @@ class CanopenArm(Arm):
                 if self._stops == stops:
                     buses.control(number, word)
             if self._stops != stops:
-                raise DriverError("the arm was stopped on its drives' way to another state")
+                raise DriverError("the arm was stopped while its drives changed state")
 
     def _sample(self, buses: Buses, stamp_ns: int) -> Sample:
         drives = buses.drives

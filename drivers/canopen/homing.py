@@ -15,9 +15,9 @@ from drivers.arm import Vector
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.cia402 import DriveState, drive_words, state_of
-from drivers.canopen.motor_units import unwrapped
 from drivers.canopen.sdo import TIMEOUT, Place
 from drivers.canopen.stored_zero import Zeros
+from drivers.motor_units import unwrapped
 from ident_service.errors import DriverError
 
 APART = 0.5  # s between two readings of a standing arm
@@ -60,7 +60,7 @@ class ZeroingArm(MonitoringArm):
             self._set(zeros, counts)
         except BaseException as error:
             left = self._taken_back(zeros)
-            end = f"; drives {', '.join(left)} could not be told: switch their power off and on" if left else ""
+            end = f"; drives {', '.join(left)} could not be cleared: switch their power off and on" if left else ""
             if isinstance(error, DriverError):
                 raise DriverError(f"{error}; no drive has a zero now{end}") from None
             error.add_note(f"no drive has a zero now{end}")
@@ -95,7 +95,7 @@ class ZeroingArm(MonitoringArm):
         status, codes = self._all(od.STATUS_WORD), self._all(od.LAST_EMERGENCY, needed=False)
         if on := [place for place, word in status.items() if state_of(word) not in _OFF]:
             states = "; ".join(f"node {node}: {drive_words(status[bus, node])}" for bus, node in on)
-            raise DriverError(f"drives must be off while they are zeroed: {states}; stop whoever has the arm")
+            raise DriverError(f"drives must be off while home is set: {states}; stop the program that uses the arm")
         return tuple(f"node {p[1]}: {drive_words(status[p], codes.get(p, 0))}" for p in self._places)
 
     def _require_still(self, before: Sequence[int], after: Sequence[int]) -> None:

@@ -356,7 +356,7 @@ class BusCodec:
                 on = bool(status & bit)
                 self._tell(code if on else EventCode.OVER, drive.node, words if on else f"{words} no longer")
         if changed & FOLLOWS and not status & FOLLOWS and state is was is DriveState.OPERATION_ENABLED:
-            self._tell(EventCode.DEAF, drive.node, "does not follow its torque any more (status word, bit 12)")
+            self._tell(EventCode.DEAF, drive.node, "does not follow its target torque any more (status word, bit 12)")
 
     def _on_emergency(self, drive: Drive, frame: Frame) -> None:
         data = frame.data
@@ -406,11 +406,11 @@ class BusCodec:
         if identifier in self._ours:
             if identifier not in self._foreign:
                 self._foreign.add(identifier)
-                words = f"somebody else sends frames {identifier:03X}h, which only this host may"
+                words = f"another host sends frames {identifier:03X}h, which only this host may"
                 self._tell(EventCode.SECOND_HOST, HOST, words)
         elif identifier not in self._strangers and len(self._strangers) < _FOLLOWED:
             self._strangers.add(identifier)
-            self._tell(EventCode.STRANGER, identifier & 0x7F, f"frames {identifier:03X}h of a node that is not ours")
+            self._tell(EventCode.STRANGER, identifier & 0x7F, f"frames {identifier:03X}h of an unknown node")
 
     def _on_error(self, frame: Frame) -> None:
         self.counters.errors += 1

@@ -15,7 +15,8 @@ from functools import cached_property
 
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.object_dictionary import Entry, pdo_entry
-from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver, WatchdogKind
+from ident_service.config.can_bus import CanBus
+from ident_service.config.canopen import CanopenDrive, CanopenDriver, WatchdogKind
 
 NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080
 TPDO1, RPDO1, TPDO2, RPDO2 = 0x180, 0x200, 0x280, 0x300

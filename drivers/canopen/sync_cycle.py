@@ -19,11 +19,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.can.bus_load import worst
 from drivers.can.bus_state import EventCode
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import worst
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
@@ -515,7 +515,7 @@ def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]
         if drive in chosen:
             last = drive.emergency
             why = "" if last is None else f" ({emergency_words(last.code, last.register, last.vendor)})"
-            silent = "has told no status word" + (" since it booted" if drive.boots else "")
+            silent = "has sent no status word" + (" since it booted" if drive.boots else "")
             says = silent if drive.status is None else f"is in the state {drive.state}{why}"
             words.append(f"{name} {says}")
     return "; ".join(words)

@@ -1,6 +1,6 @@
 """Run the command `ident`: parse its arguments, call the functions of the Python API, print, return an exit code.
 
-One file per group of verbs: `GROUPS` lists them, each registers its verbs with `add(verbs)` and answers them.
+One file per group of commands: `GROUPS` lists them; each registers its commands with `add(verbs)` and runs them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ from ident_service.errors import (
     IdentError,
     ModelError,
     MotionRefused,
+    ParameterError,
     PersonNeeded,
+    RecordingError,
     UsageError,
 )
 
@@ -57,9 +59,11 @@ GROUPS = (
     *(identification_commands, planning_commands, motion_commands, recovery_commands, archive_commands),
     *(maintenance_commands, daemon_commands, remote),
 )
-_EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
-    (ConfigError, USAGE),
-    (UsageError, USAGE),
+# One rule for all verbs: USAGE when what was given cannot be used, be it words, a description or any other file; FAILED
+# when it was understood and came to nothing.
+_BAD_INPUT: tuple[type[IdentError], ...] = (UsageError, ConfigError, ModelError, RecordingError, ParameterError)
+_EXIT_CODES: tuple[tuple[type[IdentError] | tuple[type[IdentError], ...], int], ...] = (
+    (_BAD_INPUT, USAGE),
     (PersonNeeded, PERSON_NEEDED),
     (MotionRefused, VERDICT_NO),
     (ArmFault, FAULTED),
@@ -110,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         print_answer(arguments, code, text, document)
     except OSError as error:
-        print_to_person(f"ident: done, but the answer cannot be written: {error.strerror}\n")
+        print_to_person(f"ident: done, but the output cannot be written: {error.strerror}\n")
         discard(sys.stdout)
         return FAILED
     return code
@@ -164,7 +168,7 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
     if error.errno == errno.ENAMETOOLONG:
         return UsageError(f"{place[:40]}...: this name is too long for a file")
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFull(f"{place}: cannot be written: {error.strerror}; make room, then ask again")
+        return DiskFull(f"{place}: cannot be written: {error.strerror}; free disk space, then try again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         from ident_service.registry.state_folder import shut_out
 
@@ -177,7 +181,7 @@ def parser() -> Parser:
     """Build the argument parser with all verbs and their arguments."""
     top = Parser(
         prog="ident",
-        description="Commission a robot arm: excite it, record it, identify parameters a real body could have.",
+        description="Commission a robot arm: move it, record it, and identify physically feasible dynamic parameters.",
     )
     top.add_argument("--version", action="version", version=f"ident-service {__version__}")
     verbs = VerbList.of(top)

@@ -21,7 +21,7 @@ _PATIENCE = 1.0  # s to wait for a locked registry when an act that is done is e
 
 def add_by(sub: Parser) -> None:
     """Add the option `--by`, the name of the person who acts, to a verb."""
-    sub.add_argument("--by", metavar="NAME", help="who says so (default: the name you are logged in with)")
+    sub.add_argument("--by", metavar="NAME", help="your name (default: your login name)")
 
 
 def terminal_user(arguments: argparse.Namespace) -> str:
@@ -78,35 +78,39 @@ def audit_act(arguments: argparse.Namespace, what: str, about: str, **detail: An
 
 def add(verbs: VerbList) -> None:
     """Register `accept`, `rollback`, `import`, `prune`, `delete`, `backup` and `restore`."""
-    sub = verbs.add("accept", _accept, "make a run's parameters the arm's current ones; earlier sets are kept")
-    sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
-    sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
+    sub = verbs.add("accept", _accept, "accept a run's parameters as the arm's current ones; earlier sets are kept")
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
+    sub.add_argument("--note", required=True, help="the reason, for people who read it years later")
     add_by(sub)
     sub = verbs.add("rollback", _rollback, "make an earlier accepted set the current one again")
     sub.add_argument("arm", metavar="NAME", help="of the arm")
-    sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
-    sub.add_argument("--to", type=count, metavar="NUMBER", help="acceptance (default: before the current set's)")
+    sub.add_argument("--note", required=True, help="the reason, for people who read it years later")
+    sub.add_argument(
+        "--to", type=count, metavar="NUMBER", help="of the accepted set (default: the one before the current)"
+    )
     add_by(sub)
-    sub = verbs.add("import", _import, "a run folder from another machine: verified, copied below the state folder")
+    sub = verbs.add("import", _import, "import a run folder from another machine, after its files were verified")
     sub.add_argument("run", type=Path, metavar="RUNFOLDER")
     add_by(sub)
-    sub = verbs.add("prune", _prune, "let recordings go of runs that nobody accepted; deletes only with --yes")
-    sub.add_argument("--keep", type=count, required=True, metavar="N", help="newest runs of each arm keep theirs")
+    sub = verbs.add("prune", _prune, "list old recordings of runs that nobody accepted; delete them with --yes")
+    sub.add_argument("--keep", type=count, required=True, metavar="N", help="number of newest runs of each arm to keep")
     sub.add_argument("--yes", action="store_true", help="DELETE them")
     add_by(sub)
-    delete = verbs.group("delete", "a run, a motion or an arm of the registry; what refers to it is named first")
+    delete = verbs.group("delete", "delete a run, a motion or an arm; refused while something refers to it")
     for kind in ("run", "motion", "arm"):
         sub = delete.add(kind, _delete, f"delete one {kind} and its files")
         sub.add_argument("name", metavar="NAME" if kind == "arm" else "ID")
-        sub.add_argument("--anyway", action="store_true", help="although something refers to it")
+        sub.add_argument("--anyway", action="store_true", help="also if something refers to it")
         add_by(sub)
-    sub = verbs.add("backup", _backup, "the state folder as one file: registry, documents, recordings, hashes")
-    sub.add_argument("file", type=Path, metavar="FILE", help="which must not exist; a daemon may serve meanwhile")
-    sub.add_argument("--without-recordings", action="store_true", help="the copy's registry calls them deleted")
+    sub = verbs.add("backup", _backup, "write the state folder into one file; a daemon may run meanwhile")
+    sub.add_argument("file", type=Path, metavar="FILE", help="must not exist")
+    sub.add_argument(
+        "--without-recordings", action="store_true", help="leave recordings out; the copy lists them as deleted"
+    )
     add_by(sub)
-    sub = verbs.add("restore", _restore, "a backup into the state folder, checked first; no daemon may serve it")
+    sub = verbs.add("restore", _restore, "restore a backup into the state folder; stop the daemon first")
     sub.add_argument("file", type=Path, metavar="FILE")
-    sub.add_argument("--replace", action="store_true", help="move what is there into a folder replaced-... in it")
+    sub.add_argument("--replace", action="store_true", help="move present contents into a subfolder replaced-DATE")
     add_by(sub)
 
 
@@ -146,7 +150,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
     folder = state / RUNS / row["id"]
     return (
         DONE,
-        f"{row['id']}: every file is what its manifest names\nfiles: {folder}\n",
+        f"{row['id']}: every file matches its manifest\nfiles: {folder}\n",
         {
             **row,
             "folder": str(folder),
@@ -203,7 +207,7 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     done = restore(arguments.file, state, terminal_user(arguments), replace=arguments.replace)
     when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
-    text += "" if done.replaced is None else f"what stood there before: {done.replaced}\n"
+    text += "" if done.replaced is None else f"previous contents: {done.replaced}\n"
     text += (
         "tokens that were revoked since then count again (ident token list), the owner's does not: the daemon writes "
     )
@@ -219,7 +223,7 @@ def deleted_text(document: Mapping[str, Any]) -> str:
 
 def pruned_text(document: Mapping[str, Any]) -> str:
     """Format the answer of `prune`: the recordings that were deleted, or would be."""
-    gone, verb = document["recordings"], "deleted" if document["deleted"] else "would be deleted; say --yes"
+    gone, verb = document["recordings"], "deleted" if document["deleted"] else "would be deleted; add --yes"
     text = "".join(f"{one['run']}/{one['name']}  {one['bytes'] / 2**20:.1f} MiB\n" for one in gone)
-    text += "".join(f"left alone: {line}\n" for line in document["left_alone"])
+    text += "".join(f"skipped: {line}\n" for line in document["left_alone"])
     return f"{text}{len(gone)} recordings, {document['bytes'] / 2**20:.1f} MiB, {verb}\n"

@@ -62,25 +62,42 @@ class VerbList:
     def of(cls, parser: Parser) -> VerbList:
         """Create the list of verbs of a command."""
         common = Parser(add_help=False)
-        common.add_argument("--json", action="store_true", help="one JSON object on stdout, nothing else")
-        common.add_argument("--server", metavar="URL", help="have a daemon there do it; things are named by its ids")
+        common.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+        common.add_argument(
+            "--server", metavar="URL", help="run it on the daemon there; runs, motions and jobs are named by id"
+        )
         common.add_argument("--state", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)")
         return cls(parser.add_subparsers(required=True, metavar="VERB"), common)
 
-    def add(self, name: str, run: Callable[[argparse.Namespace], Answer], text: str, **rest: Any) -> Parser:
+    def add(
+        self,
+        name: str,
+        run: Callable[[argparse.Namespace], Answer],
+        text: str,
+        *,
+        former: str | None = None,
+        hidden: bool = False,
+        **rest: Any,
+    ) -> Parser:
         """Add a verb.
 
         Args:
             name: the word.
             run: answers it.
             text: one line of help.
+            former: the verb's earlier name, which is still understood and not listed.
+            hidden: leave the verb out of the list of verbs.
             rest: for `argparse.ArgumentParser`.
 
         Returns:
             Its parser, to add arguments to.
         """
-        parser = self.commands.add_parser(name, parents=[self.common], help=text, description=text, **rest)
+        if not hidden:
+            rest["help"] = text
+        parser = self.commands.add_parser(name, parents=[self.common], description=text, **rest)
         parser.set_defaults(verb=run, word=f"{self.prefix}{name}", words=parser)
+        if former is not None:
+            self.commands.choices[former] = parser
         return parser
 
     def group(self, name: str, text: str) -> VerbList:

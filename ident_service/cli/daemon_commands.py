@@ -17,26 +17,30 @@ _PORT = 8470
 
 def add(verbs: VerbList) -> None:
     """Register `serve`, `token add`, `token list` and `token revoke`."""
-    sub = verbs.add("serve", _serve, "the daemon: API, jobs and registry of the state folder")
-    sub.add_argument("--host", default="127.0.0.1", help="address to listen on; any but a loopback one needs TLS")
+    sub = verbs.add("serve", _serve, "start the daemon: HTTP API, pages, jobs and schedules")
+    sub.add_argument("--host", default="127.0.0.1", help="address to listen on; other than loopback needs TLS")
     sub.add_argument("--port", type=_port, default=_PORT, help=f"default {_PORT}; 0 for any that is free")
     sub.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
     sub.add_argument("--tls-key", type=Path, metavar="FILE", help="its key, PEM")
-    sub.add_argument("--name", action="append", default=[], metavar="HOST", help="host name that clients use, too")
+    sub.add_argument("--name", action="append", default=[], metavar="HOST", help="further host name that clients use")
     sub.add_argument("--motion-door", type=Path, metavar="SOCKET", help="of the unit that motions run in")
 
     sub.add_argument(
-        "--webhook", metavar="URL", help="is told what is due, and of drift; https, or http to this machine"
+        "--webhook",
+        metavar="URL",
+        help="receives notices of due re-identifications and drift; https, or http to this machine",
     )
-    sub.add_argument("--webhook-secret", type=Path, metavar="FILE", help="which notices are signed with; chmod 600")
+    sub.add_argument(
+        "--webhook-secret", type=Path, metavar="FILE", help="file with the secret that signs notices; chmod 600"
+    )
 
-    token = verbs.group("token", "who may talk to the daemon")
-    sub = token.add("add", _add, "make a token and print it; nothing can print it again")
-    sub.add_argument("name", metavar="NAME", help="which the audit trail will show")
+    token = verbs.group("token", "access tokens of the daemon")
+    sub = token.add("add", _add, "create a token and print it once")
+    sub.add_argument("name", metavar="NAME", help="shown in the audit log")
     sub.add_argument("--role", choices=["viewer", "operator"], required=True)
     add_by(sub)
-    token.add("list", _list, "names and roles")
-    sub = token.add("revoke", _revoke, "let a token, and the sessions that it began, count no more")
+    token.add("list", _list, "list names and roles")
+    sub = token.add("revoke", _revoke, "revoke a token and its sessions")
     sub.add_argument("name", metavar="NAME")
     add_by(sub)
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight
+from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -25,40 +25,53 @@ _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for p
 
 def _add_commission(verbs: VerbList) -> None:
     """Register `simulate` and `identify`."""
-    sub = verbs.add("simulate", _simulate, "the whole job on a simulated arm, scored against the known truth")
+    sub = verbs.add("simulate", _simulate, "commission a simulated arm and compare the result with its true parameters")
     sub.add_argument("arm", nargs="?", default="wam7_sim", metavar="ARM", help="description with a simulated driver")
     sub.add_argument("--out", type=Path, help="run folder; must not exist (default: below the state folder)")
     sub.add_argument("--motion", type=Path, metavar="MOTION", help="motion.json to identify from (default: the arm's)")
     sub.add_argument("--seed", type=seed, help="seed of the simulated arm's noise (default: the description's)")
     sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"])
 
-    sub = verbs.add("identify", _identify, "recordings to parameters.json, URDF and report")
+    sub = verbs.add(
+        "identify", _identify, "identify parameters from recordings; writes parameters.json, URDF and report"
+    )
     sub.add_argument(
         "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@41:60 reads 41 s to 60 s of it"
     )
     sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument(
-        "--validate", action="append", default=[], type=Path, metavar="RECORDING", help="judge on this one too"
+        "--validate",
+        action="append",
+        default=[],
+        type=Path,
+        metavar="RECORDING",
+        help="validate on this recording; may be repeated",
     )
     sub.add_argument(
         "--columns",
         action="append",
         default=[],
         metavar="[RECORDING=]FILE",
-        help="YAML that says how the recordings are laid out, or RECORDING alone; may be repeated",
+        help="YAML file with column names and units, for all recordings or one; may be repeated",
     )
     sub.add_argument(
         "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
     )
     sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
-    sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="draw the estimate to the arm's prior")
+    sub.add_argument("--prior", choices=["none", "euclidean", "entropic"], help="regularise towards the arm's prior")
     sub.add_argument("--prior-weight", type=weight, metavar="W", help="default: chosen on held-out data")
-    sub.add_argument("--delay", type=delay, metavar="SECONDS", help="of the torque's stamps, 'estimate' or 'choose'")
     sub.add_argument(
-        "--bootstrap", type=replicates, default=0, metavar="N", help="replicates of the constrained estimate"
+        "--delay", type=delay, metavar="SECONDS", help="delay of the torque stamps [s], 'estimate' or 'choose'"
     )
-    sub.add_argument("--essential", action="store_true", help="also the smallest model that predicts as well")
-    sub.add_argument("--sdpa", action="store_true", help="also the problems in SDPA format, for other solvers")
+    sub.add_argument(
+        "--bootstrap",
+        type=replicates,
+        default=0,
+        metavar="N",
+        help="number of bootstrap replicates of the constrained estimate",
+    )
+    sub.add_argument("--essential", action="store_true", help="also identify the smallest model that predicts as well")
+    sub.add_argument("--sdpa", action="store_true", help="also write the problems in SDPA format, for other solvers")
     sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"], help="default: the arm's; none: unconstrained")
     sub.add_argument(
         "--second-opinion", action="store_true", help="solve the constrained problem again, in cvxpy, and compare"
@@ -70,7 +83,7 @@ def _add_commission(verbs: VerbList) -> None:
         "--out",
         type=Path,
         metavar="DIR",
-        help="where results go, in the place of an earlier result (default: a new folder below the state folder)",
+        help="result folder; replaces an earlier result (default: a new folder below the state folder)",
     )
 
 
@@ -102,9 +115,9 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     lines = [
         "",
         summary(estimate, result.unusable),
-        "score against the truth, which the estimate never saw",
+        "comparison with the true parameters",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
-        f"  validation residual over what the true parameters leave: {scored.residual_ratio:.4f}",
+        f"  validation residual over that of the true parameters: {scored.residual_ratio:.4f}",
         f"  worst identified parameter: {scored.worst_identified:.2f} deviations off, {scored.worst_expression}",
         "",
         f"files: {result.folder}",
@@ -202,21 +215,127 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
     }
 
 
+def _add_fleet(verbs: VerbList) -> None:
+    """Register `fleet identify` and `fleet status`."""
+    fleet = verbs.group("fleet", "many recordings of many arms, on several processes or a cluster")
+    sub = fleet.add(
+        "identify",
+        _fleet_identify,
+        "each arm and what is common, trends, one page (exit code 3: recordings left out, or an arm changed)",
+    )
+    sub.add_argument(
+        "patterns",
+        nargs="+",
+        metavar="PATTERN",
+        help="files, folders or globs; also as URLs: s3://, gs://, sftp:// ...",
+    )
+    _fleet_options(sub)
+    sub.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster, tcp://HOST:8786 (default: this machine)"
+    )
+    sub.add_argument("--workers", type=workers, metavar="N", help="processes on this machine (default: one per core)")
+    sub.add_argument("--memory", default="500MiB", metavar="SIZE", help="limit of each of them (default: 500MiB)")
+    sub.add_argument(
+        "--settle-again", action="store_true", help="choose filter, delay and friction's shape anew; factors follow"
+    )
+    sub.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where results go, in the place of an earlier result (default: a new folder below the state folder)",
+    )
+    sub = fleet.add("status", _fleet_status, "what the store has of these recordings; nothing is computed")
+    sub.add_argument("patterns", nargs="*", metavar="PATTERN", help="as for identify")
+    _fleet_options(sub)
+
+
+def _fleet_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--arm", required=True, metavar="ARM", help="description of every arm: file, or shipped name")
+    sub.add_argument(
+        "--names",
+        metavar="REGEX",
+        help="finds (?P<arm>...), and (?P<date>...) if any, in a recording's URL (default: the arm is its folder)",
+    )
+    sub.add_argument(
+        "--store", metavar="URL", help="where factors are kept, a folder or URL (default: below the state folder)"
+    )
+
+
+def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
+    try:
+        from ident_service.fleet.reduction import FleetRequest
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in ("distributed", "dask", "fsspec"):
+            raise
+        raise UsageError(f"{error.name} is not installed; pip install 'ident-service[fleet]'") from None
+    store = arguments.store or str(own_state_folder(arguments) / "fleet" / "store")
+    return FleetRequest(
+        arm=arguments.arm, patterns=tuple(arguments.patterns), store=store, names=arguments.names, **more
+    )
+
+
+def _fleet_identify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.registry.state_folder import new_run_folder
+
+    request = _fleet_request(
+        arguments,
+        scheduler=arguments.scheduler,
+        workers=arguments.workers,
+        memory=arguments.memory,
+        settle_again=arguments.settle_again,
+    )
+    from ident_service.fleet.identify import identify_fleet
+    from ident_service.fleet.results import fleet_text
+
+    name = load_arm(arguments.arm).name
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), name, "fleets")
+    result = identify_fleet(request, folder, lambda line: tell(arguments, line))
+    good = not result.document["left_out"] and not result.changed
+    return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
+
+
+def _fleet_status(arguments: argparse.Namespace) -> Answer:
+    request = _fleet_request(arguments)
+    from ident_service.fleet.reduction import status_of
+
+    document = dict(status_of(request))
+    lines = [f"{document['factors']} factors, {document['bytes'] / 2**20:.1f} MiB, in {document['store']}"]
+    if document["settled"]:
+        lines.append(f"filter, delay and friction's shape are settled by {document['settled_by']}")
+    for arm, counts in document.get("arms", {}).items():
+        lines.append(f"  {arm}: {counts['reduced']} of {counts['recordings']} recordings reduced")
+    lines += [f"  new: {url}" for url in document.get("new", [])]
+    return DONE, "\n".join(lines) + "\n", document
+
+
 def _add_comparing(verbs: VerbList) -> None:
     """Register `compare` and `payload`."""
-    sub = verbs.add("compare", _compare, "has the arm changed? (exit code 3: yes, or it cannot be said)")
+    sub = verbs.add(
+        "compare", _compare, "compare parameter sets: has the arm changed? (exit code 3: yes, or undecided)"
+    )
     sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
-    sub.add_argument("others", type=Path, nargs="+", metavar="B", help="what is compared with it")
+    sub.add_argument(
+        "others", type=Path, nargs="+", metavar="B", help="folder of results, or parameters.json, to compare"
+    )
     out = sub.add_mutually_exclusive_group()
     out.add_argument("--out", type=Path, metavar="PATH", help="FILE.json, or a folder for JSON, text and page")
-    out.add_argument("--keep", action="store_true", help="in the folder B itself, named by its manifest; one B")
+    out.add_argument("--keep", action="store_true", help="write into folder B and its manifest; one B only")
 
-    sub = verbs.add("payload", _payload, "what does an identified arm carry? (exit code 3: nothing, or no real body)")
+    sub = verbs.add(
+        "payload", _payload, "identify the payload of an identified arm (exit code 3: none, or no physical body)"
+    )
     sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")
-    sub.add_argument("recordings", nargs="+", type=Path, metavar="RECORDING", help="with the load; or FILE@41:60")
-    sub.add_argument("--refit-offsets", action="store_true", help="torque offsets may differ from the arm's")
     sub.add_argument(
-        "--out", type=Path, metavar="DIR", help="where results go (default: a new folder below the state folder)"
+        "recordings",
+        nargs="+",
+        type=Path,
+        metavar="RECORDING",
+        help="with the payload; FILE@41:60 reads 41 s to 60 s of it",
+    )
+    sub.add_argument("--refit-offsets", action="store_true", help="estimate the torque offsets again")
+    sub.add_argument(
+        "--out", type=Path, metavar="DIR", help="result folder (default: a new folder below the state folder)"
     )
 
 
@@ -252,23 +371,26 @@ def _payload(arguments: argparse.Namespace) -> Answer:
 
 
 def _add_parameters(verbs: VerbList) -> None:
-    """Register `base`, `feasible`, `correct` and `verify`."""
-    sub = verbs.add("base", _base, "base parameters and their expressions")
+    """Register `base-parameters`, `feasible`, `project` and `verify`."""
+    sub = verbs.add("base-parameters", _base, "list the base parameters and their expressions", former="base")
     sub.add_argument("arm", metavar="ARM")
 
-    sub = verbs.add("feasible", _feasible, "could a real body have these parameters? (exit code 3: no)")
+    sub = verbs.add("feasible", _feasible, "test whether parameters are physically feasible (exit code 3: no)")
     sub.add_argument("file", type=Path, metavar="FILE")
     sub.add_argument("--feasible-set", choices=FEASIBLE_SETS)
-    sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
-    sub.add_argument("--notation", choices=NOTATIONS, help="of the file's names, where it is not ours")
+    sub.add_argument("--arm", metavar="ARM", help="adds the arm's constraints on mass, centre of mass and signs")
+    sub.add_argument("--notation", choices=NOTATIONS, help="notation of the parameter names in the file")
 
-    sub = verbs.add("correct", _correct, "the nearest feasible parameters")
+    text = "write the feasible parameters nearest to those of a file"
+    sub = verbs.add("project", _correct, text, former="correct")
     sub.add_argument("file", type=Path, metavar="FILE")
-    sub.add_argument("--metric", choices=["euclidean", "covariance"], default="euclidean", help="what nearest means")
+    sub.add_argument(
+        "--metric", choices=["euclidean", "covariance"], default="euclidean", help="metric of the distance"
+    )
     sub.add_argument("--out", type=Path, required=True, metavar="FILE")
     sub.add_argument("--feasible-set", choices=FEASIBLE_SETS)
-    sub.add_argument("--arm", metavar="ARM", help="adds the arm's mass, centre-of-mass and sign conditions")
-    sub.add_argument("--notation", choices=NOTATIONS, help="of the file's names, where it is not ours")
+    sub.add_argument("--arm", metavar="ARM", help="adds the arm's constraints on mass, centre of mass and signs")
+    sub.add_argument("--notation", choices=NOTATIONS, help="notation of the parameter names in the file")
 
     sub = verbs.add(
         "verify", _verify, "check a certificate in exact arithmetic (exit code 3: infeasible, or not valid)"
@@ -277,7 +399,7 @@ def _add_parameters(verbs: VerbList) -> None:
     sub.add_argument(
         "--arm",
         metavar="ARM",
-        help="description that the conditions must come from; without it, a file is held against its own conditions",
+        help="description whose constraints apply; without it, the file's own constraints are used",
     )
 
 
@@ -312,7 +434,7 @@ def _feasible(arguments: argparse.Namespace) -> Answer:
     word = "feasible" if result.feasible else "INFEASIBLE"
     text = f"{arguments.file}: {word} ({tested.kind}), margin {result.margin:.6g}\n"
     if not result.feasible:
-        text += "contradicted by:\n" + "".join(f"  {name}\n" for name in result.tight)
+        text += "violated constraints:\n" + "".join(f"  {name}\n" for name in result.tight)
     text += "".join(f"note: {note}\n" for note in tested.notes)
     document = {
         "file": str(arguments.file),
@@ -370,9 +492,11 @@ _FORMATS = "urdf,mjcf,sdf,json,csv,c"
 
 def _add_exports(verbs: VerbList) -> None:
     """Register `export`."""
-    sub = verbs.add("export", _export, "identified parameters for other tools, each file read back and checked")
-    sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of `identify` or `simulate`")
-    sub.add_argument("--format", default=_FORMATS, metavar="LIST", help=f"with commas between (default: {_FORMATS})")
+    sub = verbs.add(
+        "export", _export, "export identified parameters for other tools; each file is read back and checked"
+    )
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
+    sub.add_argument("--format", default=_FORMATS, metavar="LIST", help=f"comma-separated (default: {_FORMATS})")
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
 
 
@@ -386,7 +510,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
     lines, files = [f"files: {folder}"], []
     for export in made:
         lines.append(f"  {export.name} ({export.format})")
-        lines += [f"    has no place for: {what}" for what in export.not_carried]
+        lines += [f"    not in this format: {what}" for what in export.not_carried]
         lines += [f"    {note}" for note in export.notes]
         entry: dict[str, Any] = {"format": export.format, "file": export.name}
         files.append({**entry, "not_carried": list(export.not_carried), "notes": list(export.notes)})
@@ -395,12 +519,12 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
 def _add_results(verbs: VerbList) -> None:
     """Register `report` and `figures`."""
-    sub = verbs.add("report", _report, "the report of a folder of results, as one page without network")
-    sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
+    sub = verbs.add("report", _report, "write the report of a result folder as one HTML file")
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the folder")
 
-    sub = verbs.add("figures", _figures, "the drawings of a report as files, for papers and tickets")
-    sub.add_argument("run", type=Path, metavar="RUN", help="folder that `identify` or `simulate` made")
+    sub = verbs.add("figures", _figures, "write the figures of a report as files")
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
 
@@ -423,5 +547,5 @@ def _figures(arguments: argparse.Namespace) -> Answer:
 
 def add(verbs: VerbList) -> None:
     """Register the verbs of this module."""
-    for register in (_add_commission, _add_comparing, _add_parameters, _add_exports, _add_results):
+    for register in (_add_commission, _add_fleet, _add_comparing, _add_parameters, _add_exports, _add_results):
         register(verbs)

@@ -21,38 +21,42 @@ if TYPE_CHECKING:
 
 def add(verbs: VerbList) -> None:
     """Register `schedule`, `maintenance`, `due` and `alarm`."""
-    group = verbs.group("schedule", "when an arm is to be re-identified")
-    sub = group.add("add", _add, "add a time or a trigger; what is due asks for a person")
+    group = verbs.group("schedule", "schedules of re-identification")
+    sub = group.add("add", _add, "add a schedule; a due re-identification waits for a person")
     _arm(sub)
     when = sub.add_mutually_exclusive_group(required=True)
     when.add_argument("--cron", metavar="FIELDS", help="five fields, UTC: '0 6 * * mon'")
-    when.add_argument("--hours", type=float, metavar="H", help="of operation, as runs of this registry count them")
-    when.add_argument("--maintenance", action="store_true", help="after each `ident maintenance`")
+    when.add_argument("--hours", type=float, metavar="H", help="operating hours between re-identifications")
+    when.add_argument("--maintenance", action="store_true", help="after each maintenance event")
     sub.add_argument("--motion", metavar="ID", help="of a motion of the registry; default: the description's")
     add_by(sub)
-    sub = group.add("list", _list, "schedules, and when they are due")
+    sub = group.add("list", _list, "list schedules and when they are due")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
     for name, verb, text in (
-        ("remove", _remove, "take one away"),
-        ("enable", _enable, "let one count again from now"),
-        ("disable", _disable, "let one count no more"),
+        ("remove", _remove, "remove a schedule"),
+        ("enable", _enable, "enable a schedule"),
+        ("disable", _disable, "disable a schedule"),
     ):
         sub = group.add(name, verb, text)
         sub.add_argument("number", type=count, metavar="NUMBER")
         add_by(sub)
-    sub = verbs.add("maintenance", _maintenance, "enter that maintenance was done")
+    sub = verbs.add("maintenance", _maintenance, "record a maintenance event")
     _arm(sub)
     sub.add_argument("--what", required=True, help='a few words: "gear oil changed"')
-    sub.add_argument("--note", default="", help="more of it")
+    sub.add_argument("--note", default="", help="further details")
     add_by(sub)
-    group = verbs.group("due", "what is due")
-    sub = group.add("list", _due, "what asks for a person")
+    group = verbs.group("due", "due re-identifications")
+    sub = group.add("list", _due, "list due re-identifications")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _remark(group.add("dismiss", _dismiss, "it is not to be done"))
+    _remark(group.add("dismiss", _dismiss, "dismiss a due re-identification"))
     group = verbs.group("alarm", "drift alarms")
-    sub = group.add("list", _alarms, "alarms that stand (exit code 3: there are some)")
+    sub = group.add("list", _alarms, "list open alarms (exit code 3: there are some)")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _remark(group.add("ack", _ack, "a person knows of it; the accepted set stays as it is"))
+    _remark(
+        group.add(
+            "acknowledge", _ack, "confirm that a person knows of it; the accepted set stays as it is", former="ack"
+        )
+    )
 
 
 def registry(arguments: argparse.Namespace) -> Database:
@@ -66,12 +70,12 @@ def registry(arguments: argparse.Namespace) -> Database:
 
 
 def _arm(sub: Parser) -> None:
-    sub.add_argument("arm", metavar="NAME", help="of an arm that the registry knows: shipped, or uploaded to a daemon")
+    sub.add_argument("arm", metavar="NAME", help="name of a shipped arm, or of one uploaded to a daemon")
 
 
 def _remark(sub: Parser) -> None:
     sub.add_argument("number", type=count, metavar="NUMBER")
-    sub.add_argument("--note", required=True, help="why; for whoever reads it years later")
+    sub.add_argument("--note", required=True, help="the reason, for people who read it years later")
     add_by(sub)
 
 
@@ -134,9 +138,9 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
         name = _known(db, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
         due = pending(db, name)
-    text = f"{name}: entered: {row['what']}\n" + "".join(due_line(one) for one in due)
+    text = f"{name}: recorded: {row['what']}\n" + "".join(due_line(one) for one in due)
     if not due:
-        text += f"nothing is due by it; `ident schedule add {name} --maintenance` would make it so\n"
+        text += f"nothing is due after it; see `ident schedule add {name} --maintenance`\n"
     return DONE, text, {**row, "due": [dict(one) for one in due]}
 
 
@@ -192,7 +196,7 @@ def due_line(row: Row) -> str:
 def alarm_lines(rows: Sequence[Row]) -> str:
     """Format drift alarms as lines for a person."""
     lines = [f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows]
-    return "".join(lines) or "no alarm stands\n"
+    return "".join(lines) or "no open alarms\n"
 
 
 def _day(at: float) -> str:

@@ -1,4 +1,4 @@
-"""Commands at an arm: `watch`, `check`, `rehearse`, `run`, and what all that move one share.
+"""Commands at an arm: `watch`, `preflight`, `run`, `stop`, `pause` and others, and functions that all motions share.
 
 `stop` needs no lease, no ticket and no confirmation, and waits for no other process. Running motions is
 `operations/motion_run.py`.
@@ -161,7 +161,7 @@ def run_and_report(
     state = own_state_folder(arguments)
     path = ticket_path(state, config.name)
     if not path.exists():
-        raise MotionRefused(f"{config.name}: not checked yet; `ident check` comes before every motion")
+        raise MotionRefused(f"{config.name}: no preflight ticket; run `ident preflight` first")
     folder = arguments.out or new_run_folder(state, config.name)
     begun = False
 
@@ -205,7 +205,7 @@ def _add_facts(error: IdentError, folder: Path, state: Path, arm: str) -> None:
     files = _files(folder)
     recorded = next((str(folder / name) for name in ("run.mcap", "run.mcap.partial") if name in files), None)
     if recorded is not None:
-        error.add_note(f"recorded until then: {recorded}")
+        error.add_note(f"recording until the fault: {recorded}")
     error.add_note("\n".join([f"files: {folder}", *(f"  {name}" for name in files)]))
     error.facts = {"folder": str(folder), "faults": faults, "recording": recorded, "files": files}
 
@@ -233,9 +233,7 @@ def dry_run(arguments: argparse.Namespace) -> Answer:
 
 def add_can_log(sub: Parser) -> None:
     """Add the option `--can-log` to a verb that moves an arm."""
-    sub.add_argument(
-        "--can-log", action="store_true", help="keep every frame of the fieldbus in can.log, beside the recording"
-    )
+    sub.add_argument("--can-log", action="store_true", help="log every CAN frame to can.log, beside the recording")
 
 
 def require_terminal(arguments: argparse.Namespace) -> int:
@@ -246,8 +244,8 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     """
     if arguments.json or not sys.stdin.isatty():
         raise UsageError(
-            "a rehearsal moves only while a key is held, and there is no terminal to hold one at; give --no-key to "
-            "rehearse without, and have `ident stop` ready in another terminal"
+            "there is no terminal at which to hold the space bar; `ident run --speed 0.2` (or `rehearse --no-key`) "
+            "moves the arm without; have `ident stop` ready in another terminal"
         )
     return sys.stdin.fileno()
 
@@ -259,7 +257,7 @@ def _target_text(until: dict[str, Any]) -> str:
     if not missed:
         return f"target of {until['share']:.2%}: reached\n"
     lines = [
-        f"  {one['parameter']}: " + ("not seen" if one["share"] is None else f"known to {one['share']:.2%}")
+        f"  {one['parameter']}: " + ("not excited" if one["share"] is None else f"known to {one['share']:.2%}")
         for one in missed
     ]
     head = f"target of {until['share']:.2%}: missed by {len(missed)} parameters (deviation over the larger of size and"
@@ -295,62 +293,72 @@ def _report_text(report: dict[str, Any]) -> str:
     )
 
 
-_REHEARSAL = 0.2
+SLOW = 0.2  # of the motion's own speed, while a key is held
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
 _HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: VerbList) -> None:
-    """Register `watch`, `check`, `run`, `rehearse`, `stop`, `pause`, `resume`, `finish`, `supported` and `ack`."""
-    sub = verbs.add("watch", _watch, "look at the arm without a torque or a change of state")
+    """Register `watch`, `preflight`, `run`, `stop`, `pause`, `resume`, `finish`, `supported` and `acknowledge`."""
+    sub = verbs.add("watch", _watch, "show positions and drive states; sends no torque and changes nothing")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
-    sub = verbs.add("check", _check, "preflight: what must be true before the arm moves (exit code 3: it is not)")
+    text = (
+        "test the arm and its drives before a motion, and write the ticket that `run` asks for (exit code 3: refused)"
+    )
+    sub = verbs.add("preflight", _check, text, former="check")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
-    sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover`, and no motion")
+    sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover` instead of a motion")
     sub.add_argument(
-        "--rate-seconds", type=seconds, metavar="S", help="hold the arm for so long to measure the rate (60 when new)"
+        "--rate-seconds",
+        type=seconds,
+        metavar="S",
+        help="hold the arm for so long to measure the cycle rate (60 for a new arm)",
     )
     sub.add_argument(
-        "--scale", action="store_true", help="move nothing: a person turns each joint by hand by an angle that is typed"
+        "--scale", action="store_true", help="check position scales: turn each joint by hand and type the angle"
     )
-    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
     add_dry_run(sub)
     add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
-    sub.add_argument("--speed", type=speed, default=1.0, metavar="SHARE", help="of the motion's own speed")
+    sub.add_argument(
+        "--speed", type=speed, metavar="SHARE", help="of the motion's own speed (default: 1, with --hold-to-run 0.2)"
+    )
+    sub.add_argument("--hold-to-run", action="store_true", help="the arm moves only while the space bar is held")
     sub.add_argument(
         "--until",
         type=share,
         metavar="SHARE",
-        help="end early, in order, once every deviation is at most this share of its parameter (0.05)",
+        help="finish early, once every standard deviation is at most this share of its parameter, such as 0.05",
     )
     sub.add_argument(
         "--parameter",
         dest="chosen",
         action="append",
         metavar="EXPRESSION",
-        help="with --until: only this base parameter counts, as `ident base` prints it; may be repeated",
+        help="with --until: only this base parameter counts, as `ident base-parameters` prints it; may be repeated",
     )
-    sub = verbs.add("rehearse", _rehearse, "the run at a fifth of its speed, while the space bar is held")
+    # The former name of `run --hold-to-run`.
+    sub = verbs.add("rehearse", _rehearse, "the same as `run --hold-to-run`", hidden=True)
     _motion(sub)
     sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
-    sub.add_argument("--speed", type=speed, default=_REHEARSAL, metavar="SHARE", help="of the motion's own speed")
+    sub.add_argument("--speed", type=speed, default=SLOW, metavar="SHARE", help="of the motion's own speed")
     for name, text in (
-        ("stop", "bring the arm, or every arm, to a controlled stop; needs no lease and always works"),
-        ("pause", "let the arm stand"),
-        ("resume", "let it go on"),
-        ("finish", "leave out the rest of the motion: the arm goes back to where it stood, and the run is done"),
-        ("supported", "confirm that an arm that is held after a stop is supported or home: it is let down"),
+        ("stop", "stop the arm, or every arm, under control"),
+        ("pause", "pause the motion"),
+        ("resume", "resume the motion"),
+        ("finish", "end the motion early: the arm returns to where the run began"),
+        ("supported", "confirm that an arm held after a stop is supported; it is then lowered"),
     ):
         sub = verbs.add(name, _stop if name == "stop" else _ask, text)
         sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
         if name == "supported":
-            sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees it")
+            sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees the arm")
         sub.set_defaults(asks=name)
-    sub = verbs.add("ack", _ack, "acknowledge a latched fault by its name")
+    sub = verbs.add("acknowledge", _ack, "acknowledge an active fault by its name", former="ack")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("fault", metavar="FAULT")
     add_by(sub)
@@ -385,7 +393,7 @@ def _watch(arguments: argparse.Namespace) -> Answer:
 
     config = load_arm(arguments.arm)
     if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
-        raise DriverError(f"{config.name}: process {pid} moves the arm; its recording shows what it does")
+        raise DriverError(f"{config.name}: process {pid} is moving the arm; see its recording")
     stopping = StopOnSignal()
     with stopping:
         seen = watch(make_arm(config), arguments.seconds, stop_requested=stopping.requested)
@@ -438,7 +446,15 @@ def _check(arguments: argparse.Namespace) -> Answer:
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
-            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds, closed=closed)
+            ticket = preflight(
+                stoppable,
+                model,
+                motion,
+                confirm=confirm,
+                rate_seconds=seconds,
+                closed=closed,
+                announce=lambda action: tell(arguments, f"{config.name}: {action}"),
+            )
         if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
             positions.keep(arm)
     write_ticket(path, ticket)
@@ -451,7 +467,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     from ident_service.operations.arm_checks import FILE, check_scale
 
     if arguments.json or not sys.stdin.isatty():
-        raise UsageError("--scale asks a person at a terminal, who turns each joint by hand")
+        raise UsageError("--scale needs a person at a terminal who turns each joint by hand")
     found = check_scale(config, own_state_folder(arguments), lambda question: input(f"{question} "))
     lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]
     lines.append(f"kept in {FILE} of the arm's folder" if found else "no joint was turned")
@@ -459,7 +475,18 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     return (DONE if good else VERDICT_NO), "\n".join([*lines, ""]), {"joints": [asdict(one) for one in found]}
 
 
-def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
+def _run(arguments: argparse.Namespace) -> Answer:
+    if not arguments.hold_to_run:
+        return _move(arguments, 1.0 if arguments.speed is None else arguments.speed)
+    require_no_target(arguments)
+    return _hold_to_run(arguments, SLOW if arguments.speed is None else arguments.speed)
+
+
+def _rehearse(arguments: argparse.Namespace) -> Answer:
+    return _move(arguments, arguments.speed) if arguments.no_key else _hold_to_run(arguments, arguments.speed)
+
+
+def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float | None = None) -> Answer:
     """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
     if arguments.dry_run:
         return dry_run(arguments)
@@ -468,7 +495,7 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
     config = load_arm(arguments.arm)
     lease = requested_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
-    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s"
+    sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s"
     stopping = StopOnSignal()
     with stopping:
         return run_and_report(
@@ -476,50 +503,58 @@ def _run(arguments: argparse.Namespace, seconds: float | None = None) -> Answer:
             config,
             motion,
             sentence,
-            speed=arguments.speed,
+            speed=share_of_speed,
             lease=seconds,
             stop_requested=stop_or_lapsed(stopping.requested, lease),
             until=_target(arguments),
         )
 
 
+def require_no_target(arguments: argparse.Namespace) -> None:
+    """Refuse an accuracy target of a run that ends when a key is released.
+
+    Raises:
+        UsageError: `--until` or `--parameter` was given.
+    """
+    if arguments.until is not None or arguments.chosen:
+        raise UsageError("--until and --parameter are for a run without --hold-to-run")
+
+
 def _target(arguments: argparse.Namespace) -> Target | None:
     """Return the parameter accuracy at which the run may end early; None if the verb asks for none."""
     if getattr(arguments, "until", None) is None:
         if getattr(arguments, "chosen", None):
-            raise UsageError("--parameter is what --until SHARE is about; give both")
+            raise UsageError("--parameter needs --until SHARE")
         return None
     from ident_service.estimation.target import Target
 
     return Target(arguments.until, tuple(arguments.chosen or ()))
 
 
-def _rehearse(arguments: argparse.Namespace) -> Answer:
-    if arguments.no_key or arguments.dry_run:
-        return _run(arguments)
-    if arguments.lease_from_stdin:
-        from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
-
-        return _run(arguments, HOLD_TO_RUN_SECONDS)
-    terminal = require_terminal(arguments)
+def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 
+    if arguments.lease_from_stdin:
+        return _move(arguments, share_of_speed, HOLD_TO_RUN_SECONDS)
+    terminal = require_terminal(arguments)
     config = load_arm(arguments.arm)
     motion = _chosen(config, arguments.motion)
-    sentence = f"{motion.name} motion of {motion.duration / arguments.speed:g} s while the space bar is held"
+    sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
     with stopping, HeldKey(terminal) as key:
         tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
-        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
         if not key.wait(stopping.requested):
-            raise MotionRefused("nobody held the key; nothing has moved")
+            raise MotionRefused("the space bar was not held; nothing has moved")
         return run_and_report(
             arguments,
             config,
             motion,
             sentence,
-            speed=arguments.speed,
+            speed=share_of_speed,
             lease=HOLD_TO_RUN_SECONDS,
             stop_requested=lambda: stopping.requested() or key.released(),
         )
@@ -535,7 +570,9 @@ def _stop(arguments: argparse.Namespace) -> Answer:
     except (UsageError, PermissionError):
         if (refusal := shut_out(state_folder(arguments))) is None:
             raise
-        raise UsageError(f"nothing was stopped: {refusal}; or stop by its daemon: ident stop --server URL") from None
+        raise UsageError(
+            f"nothing was stopped: {refusal}; or stop through its daemon: ident stop --server URL"
+        ) from None
 
 
 def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
@@ -548,15 +585,15 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
         for name in known_arms(state):  # a file was made where there was none
             leave_to_owner(state, control_path(state, name))
         audit_act(arguments, "stop", "all arms", reached=reached)
-        text = f"stop asked of {', '.join(reached)}" if reached else "nobody moves an arm"
-        text += "; no motion will begin that was asked for before now\n"
+        text = f"stop requested of {', '.join(reached)}" if reached else "no arm is moving"
+        text += "; motions requested before now will not begin\n"
         return DONE, text, {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
     leave_to_owner(state, path)
     audit_act(arguments, "stop", name, reached=[] if pid is None else [name])
-    text = f"{name}: stop asked of process {pid}" if pid is not None else f"nobody moves {name}"
-    text += "" if pid is not None else "; no motion will begin that was asked for before now"
+    text = f"{name}: stop requested of process {pid}" if pid is not None else f"{name} is not moving"
+    text += "" if pid is not None else "; motions requested before now will not begin"
     return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
 
 
@@ -568,7 +605,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
     if arguments.asks == "supported":
         held = in_use(path)
         _require_typed(
-            arguments, name, "is lowered slowly" if held else "is let go by its drives AT ONCE, if they hold it"
+            arguments, name, "is lowered slowly" if held else "is released by its drives AT ONCE, if they hold it"
         )
         if not held:
             return _let_go(arguments)
@@ -582,7 +619,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
         pid = controls.pid
     audit_act(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
-    return DONE, f"{name}: {arguments.asks} asked of process {pid}\n", document
+    return DONE, f"{name}: {arguments.asks} requested of process {pid}\n", document
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
@@ -595,9 +632,7 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
     if typed is None and sys.stdin.isatty() and not arguments.json:
         typed = input(f"{name} {follows}. If it is supported and nobody is under it, type its name: ").strip()
     if typed != name:
-        raise UsageError(
-            f"that an arm is supported is confirmed by its name, typed: --confirm {name}; nothing is let go"
-        )
+        raise UsageError(f"confirm that the arm is supported by its name: --confirm {name}; nothing has changed")
 
 
 def _let_go(arguments: argparse.Namespace) -> Answer:
@@ -609,7 +644,7 @@ def _let_go(arguments: argparse.Namespace) -> Answer:
     held = release_held_drives(config, own_state_folder(arguments))
     audit_act(arguments, "supported", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "supported", "let_go": list(held)}
-    return DONE, f"{config.name}: drives have let go of {', '.join(held)}\n", document
+    return DONE, f"{config.name}: drives released {', '.join(held)}\n", document
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
@@ -646,4 +681,4 @@ def _name(arguments: argparse.Namespace) -> str:
         return load_arm(word).name
     except UsageError as error:
         known = ", ".join(known_arms(state)) or "none"
-        raise UsageError(f"{error}; arms that {state} remembers: {known}") from None
+        raise UsageError(f"{error}; arms in {state}: {known}") from None

@@ -64,12 +64,12 @@ class StdinLease:
                 break
             part = os.read(self._fd, _MOST)
             if not part:
-                self._over = "whoever asked for the motion is gone"
+                self._over = "the program that started the motion has ended"
                 return
             *lines, self._rest = (self._rest + part).split(b"\n")
             self._rest = self._rest[-_MOST:]
             if STOP in [line.strip() for line in lines]:
-                self._over = "a stop was asked for"
+                self._over = "a stop was requested"
                 return
             if lines:
                 renewed = now

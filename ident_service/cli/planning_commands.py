@@ -1,4 +1,4 @@
-"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `doctor`, `emulate`."""
+"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `driver`, `doctor`, `emulate`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ident_service.operations.motion_design import PriorData
 
 
-_UNFINISHED = "the search ended before its first start was finished; more time will find a better motion"
+_UNFINISHED = "the search ended before its first start was complete; give it more time"
 _CRITERIA = ("d_optimal", "condition_number", "a_optimal")
 _FAMILY = ("motion", "base_frequency", "harmonics", "periods", "ramp", "postures")
 _MARGINS = ("criterion", "position_margin", "torque_margin")
@@ -30,7 +30,7 @@ _MARGINS = ("criterion", "position_margin", "torque_margin")
 
 def _add_motions(verbs: VerbList) -> None:
     """Register `design` and `preview`."""
-    sub = verbs.add("design", _design, "the most informative motion that the arm can safely make")
+    sub = verbs.add("design", _design, "search for the most informative motion within the arm's limits")
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("--criterion", choices=_CRITERIA, help="default: the arm's")
     sub.add_argument(
@@ -38,7 +38,7 @@ def _add_motions(verbs: VerbList) -> None:
         action="append",
         dest="chosen",
         metavar="EXPRESSION",
-        help="a base parameter as `ident base` prints it, to be taught best (a_optimal); may be repeated",
+        help="a base parameter as `ident base-parameters` prints it, to be known best (a_optimal); may be repeated",
     )
     sub.add_argument("--motion", choices=["fourier", "postures"], help="default: the arm's")
     length = "of the motion, ramps included: whole periods of about the base frequency (default: the arm's)"
@@ -46,30 +46,32 @@ def _add_motions(verbs: VerbList) -> None:
     sub.add_argument("--base-frequency", type=frequency, metavar="HZ")
     sub.add_argument("--harmonics", type=count, metavar="N")
     sub.add_argument("--periods", type=count, metavar="N")
-    sub.add_argument("--ramp", type=weight, metavar="SECONDS", help="to swell from rest and to die down")
-    sub.add_argument("--postures", type=count, metavar="N", help="for postures: how many")
-    sub.add_argument("--position-margin", type=weight, metavar="RAD", help="kept free at every position limit")
-    sub.add_argument("--torque-margin", type=share, metavar="SHARE", help="of every torque limit, kept free")
+    sub.add_argument("--ramp", type=weight, metavar="SECONDS", help="duration of each ramp, from rest and back")
+    sub.add_argument("--postures", type=count, metavar="N", help="number of postures")
+    sub.add_argument("--position-margin", type=weight, metavar="RAD", help="margin to every position limit")
+    sub.add_argument("--torque-margin", type=share, metavar="SHARE", help="margin, as a share of every torque limit")
     _know(sub)
-    sub.add_argument("--seed", type=seed, default=0, help="of the random starts")
+    sub.add_argument("--seed", type=seed, default=0, help="seed of the random starts")
     searched = "time for the search, not the motion's length (default: 60, or none with --starts)"
     sub.add_argument("--search-time", type=seconds, metavar="SECONDS", help=searched)
     sub.add_argument("--seconds", dest="search_time", type=seconds, help=argparse.SUPPRESS)  # former name
-    sub.add_argument("--starts", type=count, metavar="N", help="random starts; the result is then the same every time")
+    sub.add_argument("--starts", type=count, metavar="N", help="number of random starts; makes the result reproducible")
     sub.add_argument("--workers", type=workers, default=2, metavar="N", help="processes")
-    sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to go on from")
+    sub.add_argument("--resume", type=Path, metavar="FILE", help="search.json of an earlier design, to continue from")
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
 
-    sub = verbs.add("preview", _preview, "what a motion asks of the arm, and what it will teach (exit code 3: refused)")
+    sub = verbs.add(
+        "preview", _preview, "show a motion's demands on the arm and its expected accuracy (exit code 3: refused)"
+    )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     _know(sub)
-    sub.add_argument("--out", type=Path, metavar="DIR", help="also write the text and the drawings there")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="also write the text and the figures there")
 
 
 def _know(sub: Parser) -> None:
     sub.add_argument(
-        "--model", type=Path, metavar="FILE", help="parameters.json to predict torques with, not the prior"
+        "--model", type=Path, metavar="FILE", help="parameters.json to predict torques with, instead of the prior"
     )
     sub.add_argument("--noise", type=Path, metavar="FILE", help="parameters.json whose residuals are the noise")
     sub.add_argument(
@@ -78,7 +80,7 @@ def _know(sub: Parser) -> None:
         default=[],
         type=Path,
         metavar="RECORDING",
-        help="add to what this one taught; or FILE@41:60",
+        help="add to the information of this recording, or of FILE@41:60",
     )
 
 
@@ -123,7 +125,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         sys.stderr.write(f"ident: {unfinished}\n")
     taught = bool(np.isfinite(seen.deviations).any())
     binding = "".join(f"  {line}\n" for line in designed.binding)
-    binding = f"what holds the motion back\n{binding}\n" if binding else ""
+    binding = f"limits that restrict the motion\n{binding}\n" if binding else ""
     text = preview_text(seen) + f"\n{binding}files: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
     document: dict[str, Any] = {
         "folder": str(folder),
@@ -176,15 +178,17 @@ def _preview(arguments: argparse.Namespace) -> Answer:
 
 def _add_configs(verbs: VerbList) -> None:
     """Register `new` and `config check`."""
-    new = verbs.add("new", _new, "write a first description of an arm from its URDF, with a simulated arm to try it")
+    new = verbs.add("new", _new, "write a first description of an arm from its URDF, with a simulated driver")
     new.add_argument("urdf", metavar="URDF", type=Path)
-    new.add_argument("--out", metavar="FILE", type=Path, help="where it goes (default: NAME.yaml, here)")
+    new.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: NAME.yaml here)")
     new.add_argument("--name", help="of the arm (default: the URDF's file name)")
-    new.add_argument("--base", metavar="LINK", help="that the arm stands on (default: the root)")
-    new.add_argument("--tip", metavar="LINK", help="that it ends at (default: where the gripper begins)")
+    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: the root)")
+    new.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where the gripper begins)")
     config = verbs.group("config", "arm descriptions")
     check = config.add(
-        "check", _check, "every mistake with file, line and column; whether the gains are stable (exit code 3: not)"
+        "check",
+        _check,
+        "check a description: mistakes with file, line and column; stability of the gains (exit code 3: unstable)",
     )
     check.add_argument("file", metavar="FILE")
 
@@ -197,10 +201,10 @@ def _new(arguments: argparse.Namespace) -> Answer:
 
     words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
     path, guessed = new_description(*words, tell)
-    lines = [f"{path}: a first description, and a simulated arm to try it with"]
+    lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
-    return DONE, "\n".join(lines), {"description": str(path), "guessed": list(guessed)}
+    return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
@@ -217,19 +221,17 @@ _HELP_ARM = "description file, or the name of a shipped one"
 def _add_bus(verbs: VerbList) -> None:
     """Register `bus load`, `bus scan` and `bus probe`."""
     bus = verbs.group("bus", "the fieldbus of an arm")
-    load = bus.add("load", _load, "what every frame costs, and whether all of them fit (exit code 3: they do not)")
+    load = bus.add("load", _load, "bus load per frame and in all (exit code 3: too much)")
     load.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     load.add_argument("--rate", type=frequency, metavar="HZ", help="cycles per second (default: control.rate)")
-    text = "who is on the buses: state, identity, errors; sends SDO uploads only (exit code 3: not who is configured)"
+    text = "list the nodes on the buses with state, identity and errors; reads only (exit code 3: not as configured)"
     sub = bus.add("scan", _scan, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
 
-    text = (
-        "what each drive can, what it lacks, its watchdogs, torque unit and rate; writes nothing (exit code 3: refused)"
-    )
+    text = "read each drive's capabilities: modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable)"
     sub = bus.add("probe", _probe, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    help_eds = "EDS or DCF files to judge in place of the drives, without a bus"
+    help_eds = "EDS or DCF files to read instead of the drives, without a bus"
     sub.add_argument("--eds", nargs="+", default=[], metavar="FILE", help=help_eds)
 
     text = (
@@ -255,6 +257,14 @@ def _add_bus(verbs: VerbList) -> None:
     sub.add_argument("--out", type=Path, metavar="FILE", help="must not exist (default: below the state folder)")
     sub.add_argument(
         "--run", type=Path, metavar="DIR", help="run folder whose can.log goes along (`ident run --can-log`)"
+    )
+
+    driver = verbs.group("driver", "drivers of arms, your own ones too (docs/drivers.md)")
+    text = "try a driver on the promises of the Arm contract, with zero torque alone (exit code 3: one is broken)"
+    sub = driver.add("test", _driver_test, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument(
+        "--confirm", metavar="NAME", help="the arm's name: it is supported, and nobody is within its reach"
     )
 
 
@@ -311,6 +321,28 @@ def _store(arguments: argparse.Namespace) -> Answer:
     return DONE, text, {"arm": config.name, "stored": stores, "nodes": list(nodes)}
 
 
+def _driver_test(arguments: argparse.Namespace) -> Answer:
+    from dataclasses import asdict
+
+    from ident_service.config.load import load_arm
+    from ident_service.motion.command_channel import ControlFile
+    from ident_service.operations.driver_contract import Outcome, contract_text, try_driver
+    from ident_service.registry.state_folder import control_path
+
+    config = load_arm(arguments.arm)
+
+    def confirm(question: str) -> str:
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(question) if sys.stdin.isatty() and not arguments.json else ""
+
+    with ControlFile.take(control_path(own_state_folder(arguments), config.name), None):
+        found = try_driver(config, confirm)
+    broken = any(one.outcome is Outcome.BROKEN for one in found)
+    document = {"arm": config.name, "kept": not broken, "promises": [asdict(one) for one in found]}
+    return VERDICT_NO if broken else DONE, contract_text(config.name, found), document
+
+
 def _load(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.operations.fieldbus import bus_document, bus_load, bus_text
@@ -350,10 +382,10 @@ _DOUBT = 3.0  # events that a Poisson process of which none came has at most, wi
 
 def _add_doctor(verbs: VerbList) -> None:
     """Register the verb."""
-    text = "is this computer fit to move an arm, and at which rates? (exit code 3: not at the described arm's)"
+    text = "check whether this computer keeps the control rate (exit code 3: not that of the arm)"
     sub = verbs.add("doctor", _doctor, text)
     sub.add_argument("arm", nargs="?", metavar="ARM", help="description file, or the name of a shipped one")
-    sub.add_argument("--seconds", type=seconds, default=60.0, help="how long lateness is measured (60)")
+    sub.add_argument("--seconds", type=seconds, default=60.0, help="duration of the measurement (60)")
 
 
 def _doctor(arguments: argparse.Namespace) -> Answer:
@@ -367,7 +399,7 @@ def _doctor(arguments: argparse.Namespace) -> Answer:
     rate = _DEFAULT_RATE if config is None else config.control.rate
     watchdogs = () if config is None or config.driver is None else make_arm(config).watchdogs()
     findings = kernel_findings(settings) + ([] if config is None else bus_findings(config))
-    tell(arguments, f"measuring for {arguments.seconds:g} s how late a loop wakes; Ctrl-C ends it early")
+    tell(arguments, f"measuring wake-up latency for {arguments.seconds:g} s; Ctrl-C ends it early")
     stopping = StopOnSignal()
     with stopping:
         woken = measure_wake_up(measuring_rate(rate), arguments.seconds, settings, stop_requested=stopping.requested)

@@ -1,4 +1,4 @@
-"""Commands that make an arm usable again: `recover`, `home`, `ack`, `supported`; and `reidentify`.
+"""Commands that make an arm usable again: `recover`, `home`, `set-home`; and `reidentify`.
 
 Each step runs in this process the verb that the daemon runs as a job; `service/maintenance` stores the result.
 """
@@ -43,22 +43,30 @@ _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 
 def _add_recovery(verbs: VerbList) -> None:
-    """Register `home` and `recover`."""
-    sub = verbs.add("home", _home, "lead the arm home, at a tenth of its velocity limits at most")
+    """Register `home`, `set-home` and `recover`."""
+    sub = verbs.add("home", _home, "move the arm home, at a tenth of its velocity limits at most")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument(
-        "--zero", action="store_true", help="move nothing: a person has led the arm home, and its encoders begin there"
-    )
-    sub.add_argument("--confirm", metavar="NAME", help="with --zero or --server: the arm's name, typed by a person")
+    sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
+    sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
     add_dry_run(sub)
     add_lease(sub, confirm=False)
+    text = (
+        "define the posture in which the arm stands as its home: sets the zero of incremental encoders, moves nothing"
+    )
+    sub = verbs.add("set-home", _home, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
+    add_lease(sub, confirm=False)
+    sub.set_defaults(zero=True, out=None, can_log=False)
     sub = verbs.add(
-        "recover", _recover, "after a fault or a stop: what is in the way, and what to do (exit code 3: something is)"
+        "recover",
+        _recover,
+        "show what must be done after a fault or a stop; reset drives (exit code 3: not usable yet)",
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm: slowly back inside its position limits")
+    sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
     add_dry_run(sub)
@@ -74,10 +82,10 @@ def _home(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     if arguments.zero:
         if arguments.out is not None or arguments.can_log:
-            raise UsageError("--out and --can-log are for a motion; with --zero nothing moves")
+            raise UsageError("--out and --can-log are for a motion; here nothing moves")
         return _zero(arguments, config)
     if arguments.confirm is not None:
-        raise UsageError("--confirm is for --zero; a motion needs the ticket of `ident check`")
+        raise UsageError("--confirm is for `ident set-home`; a motion needs the ticket of `ident preflight`")
     if held := _lead_held(arguments, config):
         return held
     return _slowly(arguments, config, Destination.HOME)
@@ -102,7 +110,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
     with stopping, ControlFile.reach(path) as controls:
         asked, pid, stopped = stop_or_lapsed(stopping.requested, lease), controls.pid, False
         controls.ask_home()
-        tell(arguments, f"{config.name}: keep out of its reach; process {pid} leads it home, slowly. Ctrl-C stops.")
+        tell(arguments, f"{config.name}: keep out of its reach; process {pid} moves it home, slowly. Ctrl-C stops.")
         while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
             if not stopped and asked():
                 controls.ask_stop()
@@ -112,38 +120,35 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
     audit_act(arguments, "home", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
-        return DONE, f"{config.name}: led home; it is held there until `ident supported {arguments.arm}`\n", document
-    why = "the story of its run says why" if stage is Homing.REFUSED else "it was stopped"
-    held = (
-        f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "nobody holds it"
-    )
-    return FAILED, f"{config.name}: not led home, {why}; {held}\n", document
+        return DONE, f"{config.name}: at home; held there until `ident supported {arguments.arm}`\n", document
+    why = "see the events of its run" if stage is Homing.REFUSED else "it was stopped"
+    held = f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "it is not held"
+    return FAILED, f"{config.name}: not moved home, {why}; {held}\n", document
 
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
-    from ident_service.config.canopen import CanopenDriver
     from ident_service.operations.recovery import home_posture, set_home
 
     posture, lease = home_posture(config), requested_lease(arguments, config)
-    tell(arguments, f"{config.name}: nothing will move. From now on the arm stands, by what you say, in this posture:")
+    tell(arguments, f"{config.name}: nothing will move. The arm's present posture will count as its home:")
     for joint in posture:
         tell(arguments, f"  {joint}")
 
     def confirm(question: str) -> str:
         if lease is not None and lease.over():
-            raise MotionRefused(f"{config.name}: not zeroed: {lease.reason}; nothing has changed")
+            raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
         if arguments.confirm is not None:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     done = set_home(config, own_state_folder(arguments), confirm)
-    lines = [f"{done.arm}: zeroed, until its drives lose their power", *(f"  {words}" for words in done.drives)]
-    lines += [f"  latched still: {fault.code}: {fault.cause}" for fault in done.faults]
-    if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
+    lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
+    lines += [f"  still active: {fault.code}: {fault.cause}" for fault in done.faults]
+    if config.can_buses and all(bus.interface == "lock_step" for bus in config.can_buses):
         lines.append(
-            "  but these drives are emulated within this command, and forget it now; over ident_wire they do not"
+            "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )
-    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident check {arguments.arm}`")
+    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident preflight {arguments.arm}`")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -191,7 +196,7 @@ def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Desti
         "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
     }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
     lease = requested_lease(arguments, config)
-    tell(arguments, f"{config.name}: keep out of its reach; where the way ends")
+    tell(arguments, f"{config.name}: keep out of its reach; at the end of the motion")
     tell(arguments, f"{ends}. Ctrl-C stops.")
     stopping = StopOnSignal()
     with stopping:
@@ -205,16 +210,16 @@ def _text(found: Recovery) -> str:
     lines = [f"{found.arm}: {'usable' if found.usable else 'NOT USABLE YET'}", ""]
     for one in found.faults:
         since = datetime.fromtimestamp(one.since, UTC).isoformat(sep=" ", timespec="seconds").removesuffix("+00:00")
-        lines.append(f"  latched since {since} UTC: {one.code}: {one.cause}")
+        lines.append(f"  active since {since} UTC: {one.code}: {one.cause}")
     if not found.faults:
-        lines.append("  no fault waits for anybody")
+        lines.append("  no active faults")
     if found.mover is not None:
-        lines.append(f"  process {found.mover} moves the arm")
+        lines.append(f"  process {found.mover} is moving the arm")
     if found.unreachable:
-        lines.append(f"  the arm cannot be looked at: {found.unreachable}")
+        lines.append(f"  the arm does not answer: {found.unreachable}")
     if found.zero_lost:
-        lines.append(f"  the arm does not know where it stands: {found.zero_lost}")
-    lines += [f"  {axis}: the drive has latched: {words}" for axis, words in found.tripped.items()]
+        lines.append(f"  the zero of the encoders is lost: {found.zero_lost}")
+    lines += [f"  {axis}: drive fault: {words}" for axis, words in found.tripped.items()]
     if found.reset:
         lines.append(f"  reset just now: {', '.join(found.reset)}")
     lines += [f"  outside its position limits: {words}" for words in found.outside]
@@ -236,11 +241,11 @@ EXIT_CODES: Final = {
 def _add_reidentify(verbs: VerbList) -> None:
     """Register `reidentify`."""
     sub = verbs.add(
-        "reidentify", _reidentify, "check, run, identify, compare with the accepted set (exit code 3: changed)"
+        "reidentify", _reidentify, "preflight, run, identify, compare with the accepted set (exit code 3: changed)"
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
-    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person: the arm is supported")
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
     add_by(sub)
 
 
@@ -259,7 +264,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
         accepted = accepted_set(state, config.name, number)[1]
         motion = [] if arguments.motion is None else [str(arguments.motion)]
         confirm = [] if arguments.confirm is None else ["--confirm", arguments.confirm]
-        code, text, _ = _step(arguments, "check", arguments.arm, *motion, *confirm)
+        code, text, _ = _step(arguments, "preflight", arguments.arm, *motion, *confirm)
         if code != DONE:
             raise PersonNeeded(f"{config.name}: preflight found reasons not to move\n{text}")
         recorded = new_id(config.name)
@@ -286,7 +291,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     }
     lines = f"{text}{verdict.words}\n"
     if verdict.state == "changed":
-        lines += "a drift alarm stands until `ident alarm ack`, or `ident accept` of another set\n"
+        lines += "a drift alarm is open until `ident alarm acknowledge`, or `ident accept` of another set\n"
     return EXIT_CODES[verdict.state], lines, answer
 
 

@@ -39,18 +39,24 @@ Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
-_MOVE = ("check", "run", "home", "leave_limit", "zero")  # a rehearsal has its own way, `remote_watching.py`
+_MOVE = (
+    "check",
+    "run",
+    "home",
+    "leave_limit",
+    "zero",
+)  # `run --hold-to-run` has its own function in `remote_watching.py`
 
 
 def add(verbs: VerbList) -> None:
     """Register `jobs list`, `jobs show`, `jobs watch` and `jobs cancel`."""
-    jobs = verbs.group("jobs", "what a daemon does; without --server, that of the state folder")
-    sub = jobs.add("list", _with_client(_list), "jobs, the newest first")
+    jobs = verbs.group("jobs", "jobs of a daemon; without --server, of the one that serves the state folder")
+    sub = jobs.add("list", _with_client(_list), "list jobs, the newest first")
     sub.add_argument("--most", type=count, default=20, metavar="N")
     for name, verb, text in (
-        ("show", _show, "one job and what its command answered"),
-        ("watch", _watch, "wait for its end; its exit code becomes ours"),
-        ("cancel", _cancel, "have it end; a motion by a controlled stop"),
+        ("show", _show, "show one job and its result"),
+        ("watch", _watch, "wait for a job to end and return its exit code"),
+        ("cancel", _cancel, "cancel a job; a motion ends with a controlled stop"),
     ):
         sub = jobs.add(name, _with_client(verb), text)
         sub.add_argument("job", metavar="ID")
@@ -66,12 +72,12 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
     verbs, carried = table()
     verb = verbs.get(arguments.word)
     if verb is None:
-        why = LOCAL_ONLY.get(arguments.word, "no daemon does this")
+        why = LOCAL_ONLY.get(arguments.word, "not available on a daemon")
         raise UsageError(f"{arguments.word}: {why}; --server is for {', '.join(sorted(verbs))}")
     given = {name for name, value in vars(arguments).items() if value != arguments.words.get_default(name)}
     if lost := sorted(given - carried[arguments.word] - _OURS):
         options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
-        raise UsageError(f"{arguments.word} --server: {options} would be lost; a daemon is not told of it")
+        raise UsageError(f"{arguments.word} --server: {options} cannot be sent to a daemon")
     return _with_client(verb)(arguments)
 
 
@@ -164,10 +170,11 @@ def _design(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any
 
 def _check(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     motion = motion_id(client, arguments.arm, arguments.motion)
-    return {"arm": arguments.arm, "motion": motion, "home": arguments.home}
+    return {"kind": "check", "arm": arguments.arm, "motion": motion, "home": arguments.home}
 
 
-def _run(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+def run_job(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the request of a run without a key; upload its motion first if it is a file."""
     return {
         "arm": arguments.arm,
         "motion": motion_id(client, arguments.arm, arguments.motion),
@@ -179,7 +186,7 @@ def _run(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 def _until(arguments: argparse.Namespace) -> dict[str, Any] | None:
     if arguments.until is None:
         if arguments.chosen:
-            raise UsageError("--parameter is what --until SHARE is about; give both")
+            raise UsageError("--parameter needs --until SHARE")
         return None
     return {"share": arguments.until, "parameters": arguments.chosen or []}
 
@@ -188,9 +195,7 @@ def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if not arguments.zero:
         return {"arm": arguments.arm}
     posture = client.get(f"/api/v1/arms/{word_of_address(arguments.arm)}/home")
-    tell(
-        arguments, f"{arguments.arm}: nothing will move. From now on the arm stands, by what you say, in this posture:"
-    )
+    tell(arguments, f"{arguments.arm}: nothing will move. The arm's present posture will count as its home:")
     for joint in posture:
         tell(arguments, f"  {joint['joint']} at {joint['position']:g} {joint['unit']}")
     return {"kind": "zero", "arm": arguments.arm}
@@ -203,11 +208,11 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     if arm is not None and not names and not _known(client, arm):
         return (
             USAGE,
-            f"{arm}: the daemon knows no arm of this name; `ident stop --server {client.url}` stops all\n",
+            f"{arm}: the daemon has no arm of this name; `ident stop --server {client.url}` stops all\n",
             answer,
         )
-    nobody = "nobody moves an arm there" if arm is None else f"nobody moves an arm {arm} there"
-    return DONE, f"stop asked of {names}\n" if names else f"{nobody}\n", answer
+    nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
+    return DONE, f"stop requested of {names}\n" if names else f"{nobody}\n", answer
 
 
 def _known(client: IdentClient, arm: str) -> bool:
@@ -224,16 +229,16 @@ def _known(client: IdentClient, arm: str) -> bool:
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     if not answer["reached"]:  # the same exit code as for this verb on the daemon's machine
-        raise UsageError(f"{arguments.arm}: nobody moves an arm of this name there")
-    return DONE, f"{arguments.arm}: {arguments.word} asked\n", answer
+        raise UsageError(f"{arguments.arm}: not moving there")
+    return DONE, f"{arguments.arm}: {arguments.word} requested\n", answer
 
 
 def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     name = typed(arguments)
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
-        raise UsageError(f"{name}: nobody holds an arm of this name there")
-    return DONE, f"{name}: supported asked\n", answer
+        raise UsageError(f"{name}: not held there")
+    return DONE, f"{name}: support confirmed\n", answer
 
 
 def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -267,13 +272,12 @@ REMOTE: dict[str, Verb] = {
     "simulate": job_verb(_simulate),
     "identify": job_verb(_identify),
     "design": job_verb(_design),
-    "check": job_verb(_check),
-    "run": job_verb(_run),
-    "home": job_verb(_home),
+    "preflight": job_verb(_check),
+    **dict.fromkeys(("home", "set-home"), job_verb(_home)),
     "stop": _stop,
     **dict.fromkeys(("pause", "resume", "finish"), _ask),
     "supported": _supported,
-    "ack": _ack,
+    "acknowledge": _ack,
     "jobs list": _list,
     "jobs show": _show,
     "jobs watch": _watch,
@@ -284,6 +288,7 @@ REMOTE: dict[str, Verb] = {
 LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
+    **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
@@ -291,9 +296,9 @@ LOCAL_ONLY: dict[str, str] = {
         ("bus import", "bus store", "bus restore"), "it changes what drives keep; it is an act at the arm's computer"
     ),
     "bus report": "it writes a file beside you; log in where the daemon runs",
-    **dict.fromkeys(("backup", "restore"), "it is an act at the daemon's state folder"),
+    **dict.fromkeys(("backup", "restore"), "it is done at the daemon's machine, in its state folder"),
     "token add": "whoever got hold of an operator's token could make others that outlive it; "
-    "it is an act at the daemon's state folder",
+    "it is done at the daemon's machine, in its state folder",
 }
 """Verbs that no daemon does, each with the reason."""
 
@@ -304,12 +309,12 @@ _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
     "identify": frozenset({"arm", "recordings", "validate", "columns", "method", "feasible_set", "prior"}),
     "design": frozenset({"arm", "search_time", "starts", "seed", "criterion", "chosen", "motion", "after"}),
-    "check": _MOTION | {"home"},
-    "run": _MOTION | {"speed", "until", "chosen"},
+    "preflight": _MOTION | {"home"},
     "home": frozenset({"arm", "confirm", "zero"}),
+    "set-home": frozenset({"arm", "confirm"}),
     **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
     "supported": frozenset({"arm", "confirm"}),
-    "ack": frozenset({"arm", "fault"}),
+    "acknowledge": frozenset({"arm", "fault"}),
     "jobs list": frozenset({"most"}),
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
 }
@@ -356,7 +361,8 @@ def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
     lines += [job["detail"]] if job["detail"] else []
     lines += [f"run {job['run']}"] if job["run"] else []
-    code = _CODES.get(job["state"], FAILED) if code is None else code
+    if code is None:  # bad input has the code that it has at the machine
+        code = USAGE if (job["state"], job["exit_code"]) == ("failed", USAGE) else _CODES.get(job["state"], FAILED)
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 
@@ -368,11 +374,11 @@ def typed(arguments: argparse.Namespace) -> str:
     """
     name = arguments.confirm
     if name is None and sys.stdin.isatty() and not arguments.json:
-        what = "is zeroed" if getattr(arguments, "zero", False) else "will move"
-        what = "is let down" if getattr(arguments, "word", "") == "supported" else what
+        what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
+        what = "is lowered" if getattr(arguments, "word", "") == "supported" else what
         name = input(f"{arguments.arm} {what} where you may not see it. Type its name to confirm: ").strip()
     if name != arguments.arm:
-        raise UsageError(f"this is confirmed by the arm's name, typed: --confirm {arguments.arm}")
+        raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
     return str(name)
 
 

@@ -58,7 +58,7 @@ def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
     due = client.get(_of(arguments, "due"))
-    text = f"{arguments.arm}: entered: {row['what']}\n" + "".join(map(due_line, due))
+    text = f"{arguments.arm}: recorded: {row['what']}\n" + "".join(map(due_line, due))
     return DONE, text, {**row, "due": due}
 
 
@@ -118,7 +118,7 @@ VERBS: dict[str, Callable[[IdentClient, argparse.Namespace], Answer]] = {
     "due list": _due,
     "due dismiss": _dismiss,
     "alarm list": _alarms,
-    "alarm ack": _ack,
+    "alarm acknowledge": _ack,
     "reidentify": _reidentify,
 }
 _NUMBER = frozenset({"number"})
@@ -127,7 +127,7 @@ CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("schedule list", "due list", "alarm list"), frozenset({"arm"})),
     **dict.fromkeys(("schedule remove", "schedule enable", "schedule disable"), _NUMBER),
     "maintenance": frozenset({"arm", "what", "note"}),
-    **dict.fromkeys(("due dismiss", "alarm ack"), _NUMBER | {"note"}),
+    **dict.fromkeys(("due dismiss", "alarm acknowledge"), _NUMBER | {"note"}),
     "reidentify": frozenset({"arm", "motion", "confirm"}),
 }
 """Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

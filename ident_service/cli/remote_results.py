@@ -42,9 +42,13 @@ def _of_file(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"run": word_of_address(str(arguments.file)), **given}
 
 
+def _correct(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"kind": "correct", **_of_file(client, arguments)}
+
+
 def _compare(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if len(arguments.others) != 1:
-        raise UsageError("compare --server: one run is compared with one other; ask again for the rest")
+        raise UsageError("compare --server: compares one run with one other")
     run, other = arguments.reference, arguments.others[0]
     return {"run": word_of_address(str(run)), "other": word_of_address(str(other))}
 
@@ -149,7 +153,7 @@ VERBS: dict[str, Verb] = {
     "compare": job_verb(_compare, with_answer_lines),
     "verify": job_verb(_of_file, with_answer_lines),
     "feasible": job_verb(_of_file, with_answer_lines),
-    "correct": job_verb(_of_file, _corrected),
+    "project": job_verb(_correct, _corrected),
     "accept": _accept,
     "rollback": _rollback,
     "prune": _prune,
@@ -165,7 +169,7 @@ CARRIED: dict[str, frozenset[str]] = {
     "compare": frozenset({"reference", "others"}),
     "verify": frozenset({"file", "arm"}),
     "feasible": _FILE,
-    "correct": _FILE | {"metric", "out"},
+    "project": _FILE | {"metric", "out"},
     "accept": frozenset({"run", "note"}),
     "rollback": frozenset({"arm", "note", "to"}),
     "prune": frozenset({"keep", "yes"}),

@@ -14,7 +14,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.motion_commands import RELEASED, HeldKey, require_terminal
+from ident_service.cli.motion_commands import RELEASED, SLOW, HeldKey, require_no_target, require_terminal
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.remote import (
     LIVE,
@@ -24,6 +24,7 @@ from ident_service.cli.remote import (
     job_verb,
     motion_id,
     renew,
+    run_job,
     typed,
     word_of_address,
 )
@@ -38,8 +39,8 @@ _LOOK = 0.4  # s between looks at the job
 _MOST_FILE = 8 * 2**20  # bytes of all files that a daemon takes
 
 
-def _arm(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"arm": arguments.arm}
+def _base(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    return {"kind": "base", "arm": arguments.arm}
 
 
 def _watch(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -123,18 +124,28 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return VERDICT_NO if found["stable"] is False else DONE, found["text"], found
 
 
+def _run(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    if not arguments.hold_to_run:
+        return job_verb(run_job)(client, arguments)
+    require_no_target(arguments)
+    return _hold_to_run(client, arguments, require_terminal(arguments))
+
+
 def _rehearse(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    terminal = None if arguments.no_key else require_terminal(arguments)
+    return _hold_to_run(client, arguments, None if arguments.no_key else require_terminal(arguments))
+
+
+def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: int | None) -> Answer:
     name, motion = typed(arguments), motion_id(client, arguments.arm, arguments.motion)
-    job = {"kind": "rehearse", "arm": arguments.arm, "speed": arguments.speed}
+    job = {"kind": "rehearse", "arm": arguments.arm, "speed": SLOW if arguments.speed is None else arguments.speed}
     job |= {} if motion is None else {"motion": motion}
     stopping = StopOnSignal()
     with stopping, nullcontext() if terminal is None else HeldKey(terminal) as key:
         if key is not None:
             tell(arguments, f"{arguments.arm}: hold the space bar: the arm begins to move some seconds later")
-            tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the rehearsal is over")
+            tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
             if not key.wait(stopping.requested):
-                raise MotionRefused("nobody held the key; nothing has moved")
+                raise MotionRefused("the space bar was not held; nothing has moved")
         # Asked for only now, so that the challenge is fresh however long it took until the key was held.
         body = {"job": job, "confirm": confirmation(client, arguments, name)}
         made = client.post(f"{_API}/jobs", body)
@@ -174,23 +185,25 @@ def keep_rehearsal_lease(
 VERBS: dict[str, Verb] = {
     "watch": job_verb(_watch, with_answer_lines),
     "recover": job_verb(_recover, _recovered),
-    "base": job_verb(_arm, with_answer_lines),
+    "base-parameters": job_verb(_base, with_answer_lines),
     "preview": job_verb(_preview, with_answer_lines),
     "bus load": job_verb(_bus_load, with_answer_lines),
     "bus scan": job_verb(_bus_scan, with_answer_lines),
     "bus probe": job_verb(_bus_probe, with_answer_lines),
     "config check": _config_check,
+    "run": _run,
     "rehearse": _rehearse,
 }
 CARRIED: dict[str, frozenset[str]] = {
     "watch": frozenset({"arm", "seconds"}),
     "recover": frozenset({"arm", "leave_limit", "confirm"}),
-    "base": frozenset({"arm"}),
+    "base-parameters": frozenset({"arm"}),
     "preview": frozenset({"arm", "motion"}),
     "bus load": frozenset({"arm", "rate"}),
     "bus scan": frozenset({"arm"}),
     "bus probe": frozenset({"arm"}),
     "config check": frozenset({"file"}),
+    "run": frozenset({"arm", "motion", "confirm", "speed", "until", "chosen", "hold_to_run"}),
     "rehearse": frozenset({"arm", "motion", "confirm", "speed", "no_key"}),
 }
 """Arguments that are sent to a daemon, by verb."""

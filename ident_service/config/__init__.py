@@ -1,1 +1,1 @@
-"""Describe an arm in configuration files, and report each mistake in them with its place."""
+"""Read arm descriptions from YAML, and report each mistake with file, line and column."""

@@ -13,6 +13,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from ident_service.config.can_bus import CanBus
 from ident_service.config.drive_family import Family, family_from
 from ident_service.config.eds import DataSheet, data_sheet
 from ident_service.config.quantities import (
@@ -91,38 +92,12 @@ class NodeGuarding(Section):
 
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
 _SLOTS = 4  # torques of 16 bits in a frame of eight bytes
-_KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
 _DUMMIES = frozenset({2, 3, 5, 6})  # data types of 8 or 16 bits, which fill the 16 bits of a torque
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 EmergencyCode = Annotated[int, Field(strict=True, ge=1, le=0xFFFF)]
 # CiA 301, table 26: CAN controller in error passive; no heartbeat, or no torque frame, of the host.
 BUS_EMERGENCIES = frozenset({0x8120, 0x8130, 0x8250})
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
-
-
-class CanBus(Section):
-    """One CAN bus, and the interface that gives access to it.
-
-    `interface` is python-can's name of an interface, or `raw` for a CAN socket of the kernel without python-can, or
-    `lock_step` for emulated drives in this process and in virtual time. `options` go to python-can as they are.
-    """
-
-    interface: Annotated[str, Field(min_length=1)] = "socketcan"
-    channel: str = "can0"
-    bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
-    data_bitrate: Count | None = None
-    options: dict[str, str | int | float | bool] = Field(default_factory=dict)
-
-    @property
-    def medium(self) -> str:
-        """Return the namespace of `channel`: `kernel` for CAN interfaces of the kernel, else the interface."""
-        return "kernel" if self.interface in _KERNELS else self.interface
-
-    @model_validator(mode="after")
-    def _data_not_slower(self) -> CanBus:
-        if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
-            raise ValueError(f"data_bitrate {self.data_bitrate} is below bitrate {self.bitrate}; CAN FD only speeds up")
-        return self
 
 
 class DriveIdentity(Section):
@@ -251,7 +226,7 @@ class CanopenDriver(ExtendedSection):
     without its position a joint counts as gone: 3 to 5 (FIELDBUS.md), or what takes 10 ms, as long as a stall may last.
     `bring_up` [s] is how long all drives together may take for one step to `operation enabled`. `zero` says whether
     encoders know where they stand (`absolute`), or count from where they were when power came; then a person leads
-    the arm to the joints' `home` and says so, `ident home ARM --zero`, after every loss of power. `measured_torque`
+    the arm to the joints' `home` and says so, `ident set-home ARM`, after every loss of power. `measured_torque`
     says whether drives report the torque that they measure (6077h): with their positions, in every cycle
     (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
     object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the

@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from ident_service.config import control, motion_design, recording, simulation
+from ident_service.config import barrett, control, motion_design, recording, simulation
 from ident_service.config.arm import ArmConfig, FourierMotion
+from ident_service.config.barrett import BarrettDriver
 from ident_service.config.canopen import ABORTING, CanopenDriver, joint_torques, motor_speeds
 from ident_service.config.eds import data_sheet
 from ident_service.config.kinematics import DHTable
@@ -345,8 +346,10 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             if names and isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names, config.control.rate)
+    homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
+    if isinstance(config.driver, BarrettDriver):
+        yield from barrett.disagreements(config.driver, config.transmission, names, config.control.rate, homeless)
     if isinstance(config.driver, CanopenDriver):
-        homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
         velocities = [joint.velocity if (joint := config.joints.get(name)) else None for name in names]
         torques = [joint.torque if (joint := config.joints.get(name)) else None for name in names]
         limits = velocities, torques

@@ -70,7 +70,7 @@ FAULT_RULES: dict[FaultKind, FaultRule] = {
     # Faults of what the host reads; the plant is not affected.
     FaultKind.LOST_FEEDBACK: FaultRule("no answer: invalid, ageing, the last position repeated, counted as lost"),
     FaultKind.DELAYED_FEEDBACK: FaultRule("old positions, invalid and of that age", "delay [s]", stays=True),
-    FaultKind.HIDDEN_DELAY: FaultRule("old positions, as if they were fresh", "delay [s]", stays=True),
+    FaultKind.HIDDEN_DELAY: FaultRule("old positions are sent as new", "delay [s]", stays=True),
     FaultKind.ENCODER_JUMP: FaultRule("size added to the position", "[rad or m]"),
     FaultKind.ENCODER_OFFSET: FaultRule("size added to the position for good", "[rad or m]", stays=True),
     FaultKind.FROZEN_ENCODER: FaultRule("the last position repeated, as if it were fresh"),

@@ -1,1 +1,1 @@
-"""Serve: the HTTP API, jobs, schedules and pages of one daemon per state folder."""
+"""Run the daemon: HTTP API, jobs, schedules and web pages, one process per state folder."""

@@ -62,7 +62,7 @@ FAILURES: Final[dict[int, tuple[str, str]]] = {
     400: ("UsageError", "a description comes with 16 files at most"),
     401: ("Unauthorized", "give a token that counts: Authorization: Bearer TOKEN"),
     403: ("Forbidden", "the token 'screen' may look only; this needs the role operator"),
-    404: ("UnknownId", "no run 'x' is known; the list of runs names them"),
+    404: ("UnknownId", "no run 'x' is known; see the list of runs"),
     409: ("MotionRefused", "wam7_sim: a motion needs a fresh challenge of this arm"),
     413: ("TooLarge", "a request has 65536 bytes at most"),
     421: ("WrongHost", "this service is not called that; use the address or name that it was started with"),

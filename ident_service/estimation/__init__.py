@@ -1,1 +1,1 @@
-"""Estimate parameters that a real body could have from equations, with their uncertainty."""
+"""Estimate physically feasible parameters from recordings, with uncertainty, certificate and verdicts."""

@@ -52,7 +52,7 @@ class CustomFunction:
 
         Args:
             link: link parameters in SI units by their names (`m7`).
-            base: base parameters in SI units by their expressions, as `ident base` prints them.
+            base: base parameters in SI units by their expressions, as `ident base-parameters` prints them.
 
         Returns:
             Convex constraints, and the penalty or None.

@@ -121,7 +121,7 @@ def instrumental_variables(
         SolverError: the solver stopped without an optimum.
     """
     if fit.rank < base.size:
-        raise ModelError(f"the data see {fit.rank} of {base.size} directions; instruments need all of them")
+        raise ModelError(f"the data excite {fit.rank} of {base.size} directions; instruments need all of them")
     follow = recordings if references is None else references
     if not recordings or len(follow) != len(recordings):
         raise ModelError(f"{len(recordings)} recordings and {len(follow)} references; each recording needs its own")
@@ -232,7 +232,7 @@ def _solve(sums: Sequence[_Sums]) -> _Solved:
     A = total.ZW / left[:, None] / right
     singular = np.linalg.svd(A, compute_uv=False)
     if singular[-1] < _RANK_TOLERANCE * singular[0]:
-        raise ModelError("the simulated motion says nothing about some direction that the data see")
+        raise ModelError("the simulated motion does not excite some direction that the data excite")
     scaled = np.linalg.solve(A, total.Zomega / left)
     covariance = np.zeros_like(A)
     for block in sums:
@@ -356,7 +356,7 @@ class _Loop:
                 # Eq. 76 sees velocity as encoder differences through a low-pass; the other loop sees it as it is.
                 rate = rate + gain * (change / h - rate) if self._known else v
             if not bool(np.abs(v).max() < _RUNAWAY):
-                raise ModelError(f"the simulated loop runs away after {sample * self._period:.3g} s")
+                raise ModelError(f"the simulated loop is unstable after {sample * self._period:.3g} s")
             result[sample] = q
         return result
 

@@ -68,7 +68,7 @@ def weighted_least_squares(information: Information) -> LeastSquares:
         fit = ordinary_least_squares(information, weights)
         if settled:
             return fit
-    raise ModelError(f"the weights of the joints do not settle in {_MOST_ROUNDS} rounds: {fit.weights}")
+    raise ModelError(f"the weights of the joints do not converge in {_MOST_ROUNDS} rounds: {fit.weights}")
 
 
 def ordinary_least_squares(information: Information, weights: Array | None = None) -> LeastSquares:

@@ -70,7 +70,7 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
         return ()
     if unknown <= UNKNOWN_OF_LITTLE_MOTION * size and not unseen:
         return ()
-    what = f"{unknown} of its {size} base parameters are unidentified" + (", some not seen at all" if unseen else "")
+    what = f"{unknown} of its {size} base parameters are unidentified" + (", some not excited at all" if unseen else "")
     return (
         f"it was fitted to {moved:.1f} s of motion, and {what}: it predicts that motion and perhaps no other; record at"
         f" least {ENOUGH_MOTION:g} s, or validate it on another motion (--validate)",
@@ -139,8 +139,8 @@ def _errors(own: Candidate) -> Iterator[str]:
         )
     elif own.validation and error > WORSE_FROM and error > MUCH_WORSE * fitted:
         yield (
-            f"its torque error is {error:.0f} % where joints move on {name} but {fitted:.1f} % on what it was fitted"
-            " to: compare load, tool and columns of the two recordings, and fit to a motion that excites more"
+            f"its torque error is {error:.0f} % where joints move on {name} but {fitted:.1f} % on the fitted"
+            " recordings: compare load, tool and columns of the two recordings, and fit to a motion that excites more"
         )
 
 
@@ -152,12 +152,12 @@ def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
     much = held and after > CONSTRAINED_FROM and after > CONSTRAINED_WORSE * before
     worse = held and after > CONSTRAINED_WORSE_WITH_SIGN * before
     wrong = _driving_friction(estimate, PERHAPS_WRONG_SIGN if worse else WRONG_SIGN)
-    words = f"its torque error is {after:.1f} %, and {before:.1f} % without the conditions of a real body"
+    words = f"its torque error is {after:.1f} %, and {before:.1f} % without feasibility constraints"
     if wrong:
         which = ", ".join(name for name, _, _ in wrong)
         name, torque, deviation = min(wrong, key=lambda one: one[1] / one[2])
         yield (
-            f"the torque, or the position, may have the wrong sign at {which}: without conditions, the friction of"
+            f"the torque, or the position, may have the wrong sign at {which}: without constraints, the friction of"
             f" {name} drives it ({torque:.3g} +- {deviation:.2g} at its usual speed)" + (f"; {words}" if much else "")
         )
     elif mirrored := _mirrored(estimate) if held else "":
@@ -250,7 +250,7 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     if speed is not None and seen.speed > _TOO_FAST * speed:
         yield (
             f"{name} moves {seen.largest_step:.3g} {unit} between two samples, {seen.speed / speed:.0f} times its"
-            f" largest velocity: cut or mend the samples {seen.where:.4g} s after the first"
+            f" largest velocity: cut or correct the samples {seen.where:.4g} s after the first"
         )
     elif seen.largest_step > max(_LEAST_JUMP, _JUMP * seen.usual_step) and seen.steps > _SAMPLES_OF_A_JUMP:
         yield (

@@ -112,7 +112,7 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
             found.append(
                 f"{recording.path.name}: noise of the positions is more than 3 % of the accelerations from"
                 f" {noise:.2g} Hz on, and the filter passes up to {cutoff:.2g} Hz: least squares is then biased by more"
-                " than its deviations say; identification.method: iv is not, and a lower"
+                " than its standard deviations show; identification.method: iv is not, and a lower"
                 " identification.smoothing.cutoff lets less of it pass"
             )
     return tuple(found)

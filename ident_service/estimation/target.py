@@ -32,7 +32,7 @@ class Target:
 
     Attributes:
         share: largest deviation as a share of the parameter, between 0 and 1.
-        parameters: expressions as `ident base` prints them; all base parameters if empty.
+        parameters: expressions as `ident base-parameters` prints them; all base parameters if empty.
     """
 
     share: float
@@ -46,7 +46,9 @@ class Target:
         """
         known = {expression.replace(" ", ""): place for place, expression in enumerate(base.expressions)}
         if unknown := [name for name in self.parameters if name.replace(" ", "") not in known]:
-            raise UsageError(f"{', '.join(unknown)}: not among the base parameters of {arm}; `ident base` prints them")
+            raise UsageError(
+                f"{', '.join(unknown)}: not among the base parameters of {arm}; `ident base-parameters` prints them"
+            )
         chosen = [known[name.replace(" ", "")] for name in self.parameters] or list(range(base.size))
         return np.array(chosen, dtype=np.intp)
 

@@ -1,1 +1,1 @@
-"""Design excitation motions, and prove what they demand of the arm."""
+"""Design excitation motions, and prove that they keep the arm's limits."""

@@ -135,19 +135,21 @@ def binding_words(
         if one.joint is None:
             what = "the supply's power" if one.limit == "power" else "clearance"
             # Clearance is scaled by a depth, so that the gain for twice the limit has no meaning.
-            lines.append(f"{what} holds it back" + (f"; twice as much {gain}" if one.limit == "power" else ""))
+            lines.append(f"{what} restricts it" + (f"; twice as much {gain}" if one.limit == "power" else ""))
             continue
         name, k = names[one.joint], one.joint
         if one.limit == "following error":
             share, allowed = velocity[k] / limits.velocity[k], 2.0 * limits.following_error[k]
-            line = f"{name} is held to {share:.0%} of its velocity by following_error; {allowed:g} {lengths[k]} {gain}"
+            line = (
+                f"{name} is limited to {share:.0%} of its velocity by following_error; {allowed:g} {lengths[k]} {gain}"
+            )
         elif one.limit == "position":
-            line = f"{name} is held by its position range; twice the range {gain}"
+            line = f"{name} is limited by its position range; twice the range {gain}"
         else:
-            line = f"{name} is held by its {one.limit}; {2.0 * getattr(limits, one.limit)[k]:g} {gain}"
+            line = f"{name} is limited by its {one.limit}; {2.0 * getattr(limits, one.limit)[k]:g} {gain}"
         stiffer = left.pop(k, "") if one.by_gain > 0.0 else ""
         lines.append(line + (f"; {stiffer}" if stiffer else ""))
-    return [*lines, *(f"{names[k]} falls behind; {stiffer}" for k, stiffer in left.items())]
+    return [*lines, *(f"{names[k]} lags; {stiffer}" for k, stiffer in left.items())]
 
 
 def stiffer_gains(

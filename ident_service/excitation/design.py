@@ -109,7 +109,8 @@ def complete_task(
     places = {expression.replace(" ", ""): place for place, expression in enumerate(base.expressions)}
     if unknown := [name for name in design.parameters if name.replace(" ", "") not in places]:
         raise UsageError(
-            f"{', '.join(unknown)}: not among the base parameters of {model.config.name}; `ident base` prints them"
+            f"{', '.join(unknown)}: not among the base parameters of {model.config.name}; "
+            "`ident base-parameters` prints them"
         )
     chosen = np.array([places[name.replace(" ", "")] for name in design.parameters], dtype=np.intp)
     plain = design.criterion == "condition_number"
@@ -148,7 +149,7 @@ def _require_torque(model: ArmModel, limits: MotionLimits) -> None:
             if f >= limit
         ]
     if weak:
-        raise MotionRefused("dry friction alone takes all the torque that the margin leaves: " + "; ".join(weak))
+        raise MotionRefused("dry friction alone exceeds the torque limit less the margin: " + "; ".join(weak))
     supply = model.config.supply
     if supply is not None and supply.standby >= supply.budget:
         raise MotionRefused(
@@ -219,12 +220,12 @@ def design_motion(
         gains = _gains(best, (), limits, stable)
         proposed = "".join(f"{model.chain.names[k]}: {words}. " for k, words in gains.items())
         raise MotionRefused(
-            f"{model.config.name}: of {found.finished} motions found none is one that the arm can follow for certain, "
+            f"{model.config.name}: of {found.finished} motions found the arm is certain to follow none, "
             f"however small: {best.refused}. {proposed}Stiffer gains, a wider following_error, or friction and "
             "drive_inertia as they are would help"
         )
     if best.result is None:
-        raise MotionRefused(f"not even standing still keeps the limits: {best.refused}")
+        raise MotionRefused(f"not even the posture at rest keeps the limits: {best.refused}")
     coefficients, proof = best.result
     path = basis.path(coefficients)
     kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))
@@ -310,7 +311,7 @@ def _shrunk_words(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     """Say what it costs that a motion was made smaller until it could be proven."""
     lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
     gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
-    return f"made smaller until everything could be proven; whole, it would give about {gain}: {attempt.why}"
+    return f"scaled down until all limits could be proven; at full size it would give about {gain}: {attempt.why}"
 
 
 def require_storable(basis: Basis) -> None:
@@ -360,7 +361,7 @@ def _require_free_home(model: ArmModel, limits: MotionLimits, collision: Collisi
         what = "in collision" if distances[nearest] < 0.0 else f"nearer than the clearance of {least:g} m"
         raise MotionRefused(
             f"{model.config.name}: home, where motions begin, is {what}: {distances[nearest]:.3f} m at "
-            f"{collision.pairs[nearest]}; give another home, or mend geometry and workspace"
+            f"{collision.pairs[nearest]}; give another home, or correct geometry and workspace"
         )
 
 

@@ -368,7 +368,7 @@ def _certified(
         return Clearance(clearance, float("inf"), float("inf"), None, None)
     reach = np.array(collision.reach)
     if not np.isfinite(reach).all():
-        raise ModelError("a sliding joint without position limits: how far it carries the arm has no bound")
+        raise ModelError("a sliding joint without position limits: its reach has no bound")
     time, half = _cells(stretches)
     settled, sampled, pair, when = np.inf, np.inf, 0, 0.0
     while time.size:

@@ -162,5 +162,5 @@ def _array(content: dict[str, Any], key: str, dimensions: int) -> Array:
     if array.ndim != dimensions or not array.size or not np.isfinite(array).all():
         raise UsageError(f"{key} must be {'rows' if dimensions == 2 else 'a list'} of finite numbers, none left out")
     if np.abs(array).max() > _LARGEST:
-        raise UsageError(f"{key} holds a number beyond {_LARGEST:g}, which no arm can mean")
+        raise UsageError(f"{key} holds a number beyond {_LARGEST:g}, too large for any arm")
     return array

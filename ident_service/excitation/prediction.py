@@ -61,7 +61,7 @@ def described_noise(model: ArmModel, limits: MotionLimits) -> NoiseModel:
         noise = np.broadcast_to(np.asarray(driver.torque_noise, dtype=float), fallback.shape)
         if (noise > 0.0).any():
             return NoiseModel(np.where(noise > 0.0, noise, fallback), 1.0, "the driver's torque noise")
-    return NoiseModel(fallback, 1.0, f"{_NOISE_SHARE:.0%} of the torque limits, nothing better being known")
+    return NoiseModel(fallback, 1.0, f"{_NOISE_SHARE:.0%} of the torque limits, assumed")
 
 
 def information(path: FourierPath | PosturePath, model: ArmModel, base: BaseParameters, noise: Array) -> Array:

@@ -607,8 +607,8 @@ def read_found(file: Path, task: Task, seed: int) -> SearchResult:
             raise UsageError(f"{file}: not a search that this software wrote")
         if content["task_sha256"] != fingerprint(task, seed):
             raise UsageError(
-                f"{file}: a search with another arm, criterion, margin, seed or motion; give the same ones, or leave "
-                "--resume out"
+                f"{file}: a search with another arm, criterion, margin, seed or motion; give the same ones, or omit "
+                "--resume"
             )
         candidates = tuple(
             Candidate(int(one["start"]), float(one["value"]), np.array(one["coefficients"], dtype=float))
@@ -622,7 +622,7 @@ def read_found(file: Path, task: Task, seed: int) -> SearchResult:
             raise
         raise UsageError(f"{file}: not a search: {error}") from None
     if any(not (np.abs(one.coefficients) < 1e6).all() or not np.isfinite(one.value) for one in candidates):
-        raise UsageError(f"{file}: not a search: a number that no arm can mean")
+        raise UsageError(f"{file}: not a search: a number too large for any arm")
     if finished < 0 or any(one.coefficients.shape != shape for one in candidates):
         raise UsageError(f"{file}: not a search for motions of {shape[0]} joints with {shape[1]} coefficients")
     return SearchResult(seed, finished, seconds, candidates)

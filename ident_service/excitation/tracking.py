@@ -93,7 +93,7 @@ class Tracking:
         for k, name in enumerate(names):
             if late[k]:
                 found.append(
-                    f"{name}: falls behind by {self.error[k]:.3f}, with {self.worst}; of its following_error of "
+                    f"{name}: lags by {self.error[k]:.3f}, with {self.worst}; of its following_error of "
                     f"{limits.following_error[k]:g} a simulated arm may use {_ERROR_USED:.0%}"
                 )
             if not self.velocity[k] <= _VELOCITY_USED * limits.velocity[k]:

@@ -1,1 +1,1 @@
-"""Move arms: reference trajectories, control law, safety guard, state machine and the control loop."""
+"""Move arms: reference trajectories, control law, safety monitor, state machine and the control loop."""

@@ -104,7 +104,7 @@ class ClearanceChecker:
             pair = int(steps.argmin())
             if not steps[pair] > _SHORTEST:
                 raise MotionRefused(
-                    f"the way comes within {distances[pair]:.4f} m at {self._collision.pairs[pair]}, {time:.2f} s; "
+                    f"the path comes within {distances[pair]:.4f} m at {self._collision.pairs[pair]}, {time:.2f} s; "
                     f"{least:.4f} m must remain"
                 )
             time, looked = time + float(steps[pair]), looked + 1
@@ -186,7 +186,7 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
         return
     least = model.config.workspace.clearance
     _require_proven("the motion", certified_clearance(collision, path, least), least)
-    require_ways_clear(model, [("a way to or from the motion", way) for way in ways], limits)
+    require_ways_clear(model, [("the path to or from the motion", way) for way in ways], limits)
     if touching := touching_stop(path, limits, model):
         raise MotionRefused(touching)
 

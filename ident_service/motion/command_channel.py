@@ -19,7 +19,7 @@ Stop needs no lease. Hold-to-run is nothing but a short lease.
 | 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
 | 32 | int64 | how long it lasts [ns]; 0 for none |
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
-| 48 | int64 | when the lease of a way home was renewed last [ns of the same] |
+| 48 | int64 | when the lease of the path home was renewed last [ns of the same] |
 
 A motion takes seconds to begin, in which no loop can be reached yet. So a stop leaves its time behind, and a motion
 that was asked for before it takes the controls with the stop in them.
@@ -54,8 +54,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
+from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisStatus
+from drivers.can.bus_load import Budget
 from ident_service.errors import DriverError, UsageError
 
 LEASE_SECONDS = 2.0  # ARCHITECTURE.md: renewed every 0.5 s
@@ -258,14 +259,14 @@ class ControlFile:
         try:
             fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except OSError:
-            raise UsageError(f"nobody moves the arm ({path} does not exist)") from None
+            raise UsageError(f"the arm is not moving ({path} does not exist)") from None
         try:
             fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except OSError:
             if os.fstat(fd).st_size == _SIZE and os.pread(fd, 8, 0) == _MAGIC:
                 return cls(fd, mmap.mmap(fd, _SIZE), now_ns)
         os.close(fd)
-        raise UsageError(f"nobody moves the arm ({path} is left from a run that has ended)")
+        raise UsageError(f"the arm is not moving ({path} is left from a run that has ended)")
 
     @classmethod
     def stop_all(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
@@ -297,7 +298,7 @@ class ControlFile:
                 return controls.pid
         except UsageError:
             if refusal is not None:
-                raise UsageError(f"{path}: cannot be written: {refusal.strerror}; nobody moves the arm now") from None
+                raise UsageError(f"{path}: cannot be written: {refusal.strerror}; the arm is not moving now") from None
             return None
 
     @property
@@ -354,7 +355,7 @@ class ControlFile:
             UsageError: the arm does not wait for it; confirmed beforehand, it would release an arm that still moves.
         """
         if not self.waiting:
-            raise UsageError("the arm is not held after a stop; there is nothing to confirm")
+            raise UsageError("the arm is not held after a stop; nothing to confirm")
         self._memory[_SUPPORTED] = 1
 
     @property
@@ -375,7 +376,7 @@ class ControlFile:
             UsageError: the arm is not held; one that moves is stopped before it is led elsewhere.
         """
         if not self.waiting:
-            raise UsageError("the arm is not held after a stop; `ident stop` comes first, or its run is waited for")
+            raise UsageError("the arm is not held after a stop; stop it first (`ident stop`), or wait for its run")
         begun = self._now_ns()
         self.renew_home()
         self._memory[_STOP] = self._memory[_PAUSE] = 0
@@ -543,6 +544,7 @@ class InterruptibleArm(Arm):
         """Wrap the given arm; `asked` returns whether it is to stop."""
         self._arm, self._asked = arm, asked
         self.clock = arm.clock
+        arm.still_wanted = lambda: not asked()
 
     def open(self) -> None:
         """Open the wrapped arm and use its clock."""
@@ -581,6 +583,19 @@ class InterruptibleArm(Arm):
         """Withhold what watchdogs of one kind watch from the wrapped arm's drives."""
         self._arm.withhold(kind)
 
+    def bus_budget(self, rate: float | None = None) -> Budget | None:
+        """Return the wrapped arm's bus budget."""
+        return self._arm.bus_budget(rate)
+
+    def setup_checks(self) -> tuple[SetupCheck, ...]:
+        """Return what the wrapped arm's drives say of their set-up."""
+        return self._arm.setup_checks()
+
+    @property
+    def operator_action(self) -> str:
+        """Return what a person must do to enable the wrapped arm."""
+        return self._arm.operator_action
+
     def drive_status(self) -> tuple[AxisStatus, ...]:
         """Return the wrapped arm's drive status."""
         return self._arm.drive_status()
@@ -595,4 +610,4 @@ class InterruptibleArm(Arm):
 
     def _require_not_asked(self) -> None:
         if self._asked():
-            raise DriverError("somebody asked for a stop")
+            raise DriverError("a stop was requested")

@@ -57,7 +57,7 @@ REST_SPEED: Final = 0.05  # of the velocity limit, below which a joint counts as
 REST_CYCLES: Final = 20  # of rest in a row
 HOLD_SPEED: Final = 0.25  # of the velocity limit, above which an arm that is held has come loose
 WAITS: Final = "held until a person confirms, by `ident supported`, that the arm is supported or home"
-LEADS: Final = "led home, slowly, by a person's word; held again at its end"
+LEADS: Final = "moving home slowly, as a person asked; held again at the end"
 LOWERS: Final = "lowered under damped control until it rests"
 
 
@@ -282,7 +282,7 @@ class Loop:
             refusal = self.course.look_for_way_back()
         if refusal is not None:
             self._leading = False
-            self.tell(Severity.WARNING, stamp_ns, f"not led home: {refusal}")
+            self.tell(Severity.WARNING, stamp_ns, f"not moved home: {refusal}")
             self._tell_homing(Homing.REFUSED, stamp_ns)
         elif self.course.leads_home(stamp_ns):
             self._leading = self._waiting = False
@@ -355,7 +355,7 @@ class Loop:
         why = self.course.not_finished
         if why and "finish" not in self._told:
             self._told.add("finish")
-            self.tell(Severity.WARNING, stamp_ns, f"not finished early, goes on to its end: {why}")
+            self.tell(Severity.WARNING, stamp_ns, f"not finished early, continues to its end: {why}")
 
     def _lapse(self, stamp_ns: int) -> None:
         """React to a lost lease; a stop that is under way already does not become a fault by it."""

@@ -219,10 +219,10 @@ class Deadlines:
             self._recently -= self._recent.popleft()[1]
         found = self._findings.found("late_cycle", f"a cycle came {late_ns * 1e-6:g} ms late")
         if late_ns > self._stall_ns:
-            what = f"this computer stalled for {late_ns * 1e-6:.3g} ms, {self._stall_ns * 1e-6:g} ms are survived"
+            what = f"this computer stalled for {late_ns * 1e-6:.3g} ms, {self._stall_ns * 1e-6:g} ms are tolerated"
             return self._findings.found("late_cycles", what)
         if self._recently > self._most_lost:
             within = f"{self._recently} of the {1e9 / self._period_ns:.0f} cycles of a second"
-            what = f"this computer kept {within} waiting or lost them, {self._most_lost:.0f} are survived"
+            what = f"this computer delayed or lost {within}, {self._most_lost:.0f} are tolerated"
             return self._findings.found("late_cycles", what)
         return found

@@ -23,7 +23,7 @@ from drivers.can.bus_state import BusError
 from drivers.can.socketcan_link import check_interface
 from drivers.clock import Clock, RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.can_bus import CanBus
 from ident_service.config.control import Realtime
 from ident_service.motion.cycle_timing import LATE, SUCCESS, longest_stall
 from ident_service.motion.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, asked, capable, core_numbers
@@ -132,9 +132,7 @@ def kernel_findings(settings: Realtime, root: Path = Path("/")) -> list[Finding]
 
 def bus_findings(config: ArmConfig, root: Path = Path("/")) -> list[Finding]:
     """Look at the CAN interfaces of the kernel that an arm names; none where it names none."""
-    if not isinstance(config.driver, CanopenDriver):
-        return []
-    return [_interface(bus, root) for bus in config.driver.buses if bus.medium == "kernel"]
+    return [_interface(bus, root) for bus in config.can_buses if bus.medium == "kernel"]
 
 
 def measure_wake_up(
@@ -230,7 +228,7 @@ def _throttling(root: Path) -> Finding:
     share = runtime / period
     found = f"real-time processes get {share:.0%} of {period / 1e6:g} s"
     if share >= _RUNTIME:
-        return Finding(what, State.GOOD, f"{found}, which is more than a loop takes")
+        return Finding(what, State.GOOD, f"{found}, more than a loop takes")
     return Finding(what, State.POOR, found, "`sysctl kernel.sched_rt_runtime_us=-1`, or 0.95 of the period")
 
 
@@ -273,7 +271,7 @@ def _wake_up(root: Path) -> Finding:
     if not file.exists():
         return Finding(what, State.UNKNOWN, "no /dev/cpu_dma_latency in this container, or kernel")
     if os.access(file, os.W_OK):
-        return Finding(what, State.GOOD, "kept away while a motion runs (/dev/cpu_dma_latency)")
+        return Finding(what, State.GOOD, "prevented while a motion runs (/dev/cpu_dma_latency)")
     rule = 'KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
     remedy = f"`{rule}` in /etc/udev/rules.d/70-cpu-dma-latency.rules, then `udevadm trigger`"
     return Finding(what, State.POOR, "/dev/cpu_dma_latency is not writable for this user", remedy)
@@ -295,10 +293,10 @@ def _cores(settings: Realtime, root: Path) -> Finding:
         )
     wanted = settings.cores or tuple(isolated)
     if wanted and set(wanted) <= set(isolated):
-        return Finding(what, State.GOOD, f"{', '.join(map(str, wanted))} isolated from all else")
-    remedy = "`isolcpus=3 nohz_full=3 rcu_nocbs=3` on the kernel's command line sets core 3 apart"
+        return Finding(what, State.GOOD, f"{', '.join(map(str, wanted))} isolated")
+    remedy = "`isolcpus=3 nohz_full=3 rcu_nocbs=3` on the kernel's command line isolates core 3"
     if len(here) < 3:
-        return Finding(what, State.POOR, f"{len(here)}: none can be set apart beside the kernel's work", "more cores")
+        return Finding(what, State.POOR, f"{len(here)}: no core can be isolated", "more cores")
     return Finding(what, State.POOR, f"of {len(here)}, the motion's is not isolated", remedy)
 
 
@@ -310,7 +308,10 @@ def _machine(root: Path) -> Finding:
     flags = next((line for line in text.splitlines() if line.startswith("flags")), "")
     if " hypervisor" in flags:
         return Finding(
-            what, State.POOR, "a virtual machine, whose host stalls it as it likes", "run motions on a real computer"
+            what,
+            State.POOR,
+            "a virtual machine, which its host may stall at any time",
+            "run motions on a real computer",
         )
     return Finding(what, State.GOOD, "no virtual machine")
 

@@ -94,56 +94,58 @@ _WARN, _STOP, _LOWER, _QUICK, _OFF = Reaction
 FAULTS: dict[str, Rule] = {
     # Counted and bridged.
     "lost_feedback": Rule(_WARN, "a frame was lost or came too late"),
-    "encoder_jump": Rule(_WARN, "a reading was disturbed, and is not used"),
+    "encoder_jump": Rule(_WARN, "a reading was disturbed, and was not used"),
     "torque_saturated": Rule(_WARN, "the motion asks for more than the arm may give; the torque was limited"),
     "torque_rate": Rule(_WARN, "the torque jumped, from noise or a gain that is too high; its change was limited"),
     # Of drives that are given positions, which alone limit their torque.
     "torque_exceeded": Rule(_WARN, "it pushes against something, or is heavier than described", often=5),
-    "position_rate": Rule(_WARN, "cycles were late or lost; where the joint shall be was brought up with limits kept"),
-    "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores what it is told"),
-    "drive_notice": Rule(_WARN, "the drive informs of it, and goes on; its manual says more about the code", each=True),
+    "position_rate": Rule(_WARN, "cycles were late or lost; the target position caught up within the limits"),
+    "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores its target"),
+    "drive_notice": Rule(_WARN, "information from the drive, which goes on; see the code in its manual", each=True),
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
     "strange_frame": Rule(_WARN, "a bus that is too full, a wrong node number, or another device on it"),
     # `cycle_timing.py` decides when a cycle is too late, or too many are; fewer in a second are tolerated.
-    "late_cycle": Rule(_WARN, "the machine was busy with something else", often=WINDOW - 1),
+    "late_cycle": Rule(_WARN, "this computer was busy with something else", often=WINDOW - 1),
     # The loop can still be trusted to stop the arm.
-    "repeated_warnings": Rule(_STOP, "what is bridged once must not go on"),
-    "late_cycles": Rule(_STOP, "this machine does not keep the rate; look for other load and at its scheduling"),
+    "repeated_warnings": Rule(_STOP, "a warning is tolerated once, not repeatedly"),
+    "late_cycles": Rule(_STOP, "this computer does not keep the rate; check its load and scheduling"),
     "encoder_jumps": Rule(_STOP, "the encoder or its cable is disturbed"),
     "position_envelope": Rule(_STOP, "it could hardly be stopped before its position limit"),
     "position_limit": Rule(_STOP, "it overshot, or was pushed"),
     "over_velocity": Rule(_STOP, "it was pushed, or model or gains are wrong"),
     "following_error": Rule(_STOP, "something blocks or pushes it, or model or gains are wrong"),
     "workspace": Rule(_STOP, "the arm touches itself or something, or left the space it may move in"),
-    "lease_lost": Rule(_STOP, "whoever asked for motion has gone silent"),
-    "controls_failed": Rule(_STOP, "nobody could stop the arm any more"),
-    "no_way_back": Rule(_STOP, "the pause cannot be ended by going on"),
-    "status_stale": Rule(_STOP, "nobody would hear of it if the drive let go; its report is lost, or the bus too full"),
+    "lease_lost": Rule(_STOP, "the program that started the motion no longer renews its lease"),
+    "controls_failed": Rule(_STOP, "stop requests would no longer arrive"),
+    "no_way_back": Rule(_STOP, "the motion cannot be resumed"),
+    "status_stale": Rule(
+        _STOP, "a drive that switches off would go unnoticed; its report is lost, or the bus too full"
+    ),
     "bus_degraded": Rule(_STOP, "a bad cable, connector or termination, or a wrong bit rate"),
-    "recorder_behind": Rule(_STOP, "a motion that is not recorded is worth nothing"),
+    "recorder_behind": Rule(_STOP, "the motion would not be recorded"),
     # The arm can be measured, but does not follow.
     "following_lost": Rule(_LOWER, "it is blocked, loaded, or a drive does not give its torque"),
     # The host, the bus or single axes; the other drives can brake.
     "feedback_gone": Rule(_QUICK, "an axis, its encoder or cable failed; if all: the bus, or this machine stalled"),
     "drive_fault": Rule(_QUICK, "the drive gives no torque; read its own fault code before anything else"),
-    "drive_emergency": Rule(_QUICK, "the drive has found an error; its manual says more about the code"),
-    "drive_silent": Rule(_QUICK, "it has lost its power or its cable, or its program hangs"),
-    "drive_restarted": Rule(_QUICK, "its power failed for a moment, or its program did"),
-    "drive_left": Rule(_QUICK, "it takes no torque any more; somebody else commands it, or it lost us"),
-    "torque_ignored": Rule(_QUICK, "it is at a limit of its own, of speed or position, or its encoder is wrong"),
+    "drive_emergency": Rule(_QUICK, "the drive reports an error; see the code in its manual"),
+    "drive_silent": Rule(_QUICK, "it lost its power or its cable, or its firmware hangs"),
+    "drive_restarted": Rule(_QUICK, "its power failed for a moment, or its firmware restarted"),
+    "drive_left": Rule(_QUICK, "it accepts no torque any more; another host commands it, or it lost this host"),
+    "torque_ignored": Rule(_QUICK, "it is at its own speed or position limit, or its encoder is wrong"),
     "second_host": Rule(_QUICK, "another program or device drives the same arm"),
     "bus_off": Rule(_QUICK, "a short circuit, a wrong bit rate, or no other node on the bus"),
-    "drive_watchdog": Rule(_QUICK, "the drive heard nothing from us in time"),
-    "not_at_rest": Rule(_QUICK, "something moves the arm that we do not control"),
-    "hold_lost": Rule(_QUICK, "gravity is not what the model says, or somebody pushes"),
-    "bus_silent": Rule(_QUICK, "nobody guarded the arm in between"),
-    "clock_jump": Rule(_QUICK, "nothing timed can be trusted"),
-    "torque_not_finite": Rule(_QUICK, "a mistake in the program or the model"),
-    # A stop under control would go on pushing.
+    "drive_watchdog": Rule(_QUICK, "the drive received nothing from the host in time"),
+    "not_at_rest": Rule(_QUICK, "an external force moves the arm"),
+    "hold_lost": Rule(_QUICK, "the model's gravity is wrong, or somebody pushes"),
+    "bus_silent": Rule(_QUICK, "the arm was not monitored in between"),
+    "clock_jump": Rule(_QUICK, "time stamps cannot be trusted"),
+    "torque_not_finite": Rule(_QUICK, "an error in the program or the model"),
+    # A controlled stop would go on pushing.
     "torque_unexplained": Rule(_QUICK, "it pushes against something or somebody, or its encoder or model is wrong"),
-    "position_not_finite": Rule(_QUICK, "a mistake in the program or the model"),
-    "position_outside": Rule(_QUICK, "a mistake in the program or the motion"),
+    "position_not_finite": Rule(_QUICK, "an error in the program or the model"),
+    "position_outside": Rule(_QUICK, "an error in the program or the motion"),
     "torque_absurd": Rule(_QUICK, "the arm is overloaded, or program or model are wrong"),
     "driver": Rule(_QUICK, "the bus or its adapter failed"),
     "program": Rule(_QUICK, "the program failed or was interrupted"),
@@ -151,8 +153,10 @@ FAULTS: dict[str, Rule] = {
     "emergency_stop": Rule(_OFF, "somebody pressed it, or its circuit is open"),
     "feedback_not_finite": Rule(_OFF, "the driver does not know where the axis is"),
     # A controlled stop would turn against a position that never comes (decision 0008).
-    "frozen_encoder": Rule(_OFF, "the encoder stands still, the joint is jammed, or drier than design.friction_guess"),
-    "far_outside": Rule(_OFF, "no controller can have brought it there: a wrong zero, or it was dragged"),
+    "frozen_encoder": Rule(
+        _OFF, "the encoder stands still, the joint is jammed, or its friction is above design.friction_guess"
+    ),
+    "far_outside": Rule(_OFF, "no controller can have moved it there: a wrong zero, or it was pushed"),
     "runaway": Rule(_OFF, "a sign may be wrong"),
 }
 
@@ -247,5 +251,5 @@ class ActiveFaults:
         """
         if code not in self._faults:
             known = ", ".join(self._faults) or "none"
-            raise UsageError(f"no fault {code!r} is latched (latched: {known})")
+            raise UsageError(f"no active fault {code!r} (active: {known})")
         return self._faults.pop(code)

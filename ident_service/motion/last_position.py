@@ -29,7 +29,7 @@ TURN: Final = 0.03  # of a motor turn by which one that is lost may differ from 
 STILL: Final = 0.01  # rad/s or m/s, at most, where a position is worth keeping
 LOOK_AT_IT: Final = (
     "Look at the arm: if it does not stand as `ident watch` says, an encoder has lost turns, which the maker's tool or "
-    "`ident home --zero` sets; if it does, move that joint a little by hand, and check again."
+    "`ident set-home` sets; if it does, move that joint a little by hand, and check again."
 )
 _LOOK = 0.5  # s
 
@@ -106,7 +106,7 @@ class PositionFile:
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise UsageError(f"{self._path}: cannot be read ({error}); look at the arm, then remove the file") from None
+            raise UsageError(f"{self._path}: cannot be read ({error}); check the arm, then remove the file") from None
 
 
 def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:

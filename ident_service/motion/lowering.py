@@ -21,7 +21,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.kinematics import link_poses
 from ident_service.motion.faults import LOWER
 
-SPEED: Final = 0.1  # of the velocity limit, at which the arm sinks; a way home is as slow
+SPEED: Final = 0.1  # of the velocity limit, at which the arm sinks; the path home is as slow
 _RISES: Final = 3.0  # times as fast, at most, as it is taken away
 RESTING: Final = 0.5  # s in which no joint may have moved by more than STILL of its velocity limit would move it
 STILL: Final = 0.002

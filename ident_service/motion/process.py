@@ -36,7 +36,7 @@ from ident_service.motion.fault_store import CONTROLS, FaultStore
 from ident_service.motion.faults import ActiveFaults, Severity
 from ident_service.motion.last_position import PositionFile
 from ident_service.motion.realtime import ask
-from ident_service.motion.run import RunReport, follow
+from ident_service.motion.run import WAITS_FOR, RunReport, follow
 from ident_service.motion.run_plan import Destination, ExcitationPlan, Plan, PointToPointPlan
 from ident_service.motion.state_machine import State
 from ident_service.motion.ticket import subject_of, ticket_from_json
@@ -80,6 +80,8 @@ class TimedSink:
             send_line({"state": message})
         elif message in (WAITS, LOWERS):
             send_line({"held": message})
+        elif message.startswith(WAITS_FOR):
+            send_line({"state": message})
         return self._sink.event(stamp_ns, level, message)
 
 
@@ -141,7 +143,7 @@ def _run_with_fault_store(request: dict[str, Any], controls: ControlFile) -> dic
         try:
             _remember(faults, latch)
         except UsageError as second:  # the mark stays, so that the arm is not taken for a sound one
-            error.add_note(f"it could not be latched: {second}")
+            error.add_note(f"it could not be stored: {second}")
         raise
     _remember(faults, latch)
     return report
@@ -181,7 +183,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) 
             if not sink.event(arm.clock.now_ns(), 20, sentence):
                 raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
             if lifeline.cut:
-                raise MotionRefused("whoever asked for the motion is gone")
+                raise MotionRefused("the program that started the motion has ended")
             positions.require_not_turned(arm)
             positions.forget()
             moves = True

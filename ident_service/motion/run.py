@@ -129,6 +129,9 @@ def unhurried() -> Iterator[None]:
             os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
+WAITS_FOR: Final = "waiting for a person:"  # begins the line of the story that names what is waited for
+MOVED: Final = 0.01  # rad or m that an arm may have been moved by while a person is waited for
+_ENABLINGS: Final = 3  # times that a person is asked again because the arm was moved meanwhile
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 
 
@@ -237,15 +240,20 @@ class _Run:
     def run(self) -> RunReport:
         if self.latch.faults:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
-            raise MotionRefused(f"faults that nobody has acknowledged: {waiting}")
-        loop, torque = self._prepared()
-        if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
-            raise MotionRefused("a stop was asked for before the arm was energised; nothing has moved")
-        if not self.controls.lease_ok(self.arm.clock.now_ns()):
-            raise MotionRefused("whoever asked for the motion is gone, or is silent; nothing has moved")
+            raise MotionRefused(f"unacknowledged faults: {waiting}")
+        for _ in range(_ENABLINGS):
+            loop, torque = self._prepared()
+            if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
+                raise MotionRefused("a stop was requested before the arm was energised; nothing has moved")
+            if not self.controls.lease_ok(self.arm.clock.now_ns()):
+                raise MotionRefused(
+                    "the program that started the motion has ended or does not renew its lease; nothing has moved"
+                )
+            if self._enabled_where_planned(loop, torque):
+                break
+        else:
+            raise MotionRefused("the arm was moved each time while a person enabled it; it is without torque")
         try:
-            self.states.enter(State.CHECKED)
-            self.arm.enable()
             self.states.enter(State.ARMED)
             self.states.enter(loop.course.first)
             loop.run(torque)
@@ -274,6 +282,39 @@ class _Run:
             loop.deadlines.lost,
         )
 
+    def _enabled_where_planned(self, loop: Loop, torque: Vector) -> bool:
+        """Enable the arm; return whether it still stands where was planned from.
+
+        Only where a person enables it can it have been moved meanwhile; then it is without torque again.
+        """
+        try:
+            self.states.enter(State.CHECKED)
+            action = self.arm.operator_action
+            if action:
+                loop.tell(_INFO, self._stamp_ns, f"{WAITS_FOR} {action}")
+                self.arm.still_wanted = self._still_wanted
+            try:
+                self.arm.enable()
+            except DriverError:
+                if not action or self._still_wanted():
+                    raise
+                self.arm.stop(StopKind.QUICK_STOP)  # who looks next finds the stop, and refuses
+                return False
+            if not action or self.controls.stop:
+                return True
+            moved = np.abs(self.arm.exchange(torque).position - self._home)
+            if bool((moved <= MOVED).all()):
+                return True
+            self.arm.stop(StopKind.QUICK_STOP)
+            loop.tell(_INFO, self._stamp_ns, "the arm was moved while a person was waited for; planned again")
+        except BaseException as error:
+            self._halt(error, loop)
+            raise
+        return False
+
+    def _still_wanted(self) -> bool:
+        return not self.controls.stop and self.controls.lease_ok(self.arm.clock.now_ns())
+
     def _prepared(self) -> tuple[Loop, Vector]:
         """Check and assemble the loop; returns it with the target that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
@@ -286,7 +327,7 @@ class _Run:
             raise MotionRefused(f"{model.config.name}: {ONLY_BRAKED}")
         if described.joint_names != chain.names:
             raise MotionRefused(
-                f"the arm on the bus has the joints {', '.join(described.joint_names)}, "
+                f"the drives have the joints {', '.join(described.joint_names)}, "
                 f"the description {', '.join(chain.names)}"
             )
         with keep_host_alive(arm):  # what is worked out takes longer than drives wait for their host
@@ -304,7 +345,7 @@ class _Run:
         self, dynamics: InverseDynamics, sample: Sample, limits: MotionLimits, described: ArmDescription
     ) -> tuple[Loop, Vector]:
         model, chain, period = self.model, self.model.chain, 1.0 / described.rate
-        home = sample.position.copy()
+        home = self._home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
         owed = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
@@ -409,6 +450,6 @@ def _tell_before(error: BaseException, loop: Loop) -> None:
     """Add the first fault and the warnings before a fault to its error, as notes."""
     first, warnings = loop.ended_by, loop.guard.findings.warnings
     if first is not None and first.message not in str(error):
-        error.add_note(f"first came {first.code}: {first.message}")
+        error.add_note(f"the first fault was {first.code}: {first.message}")
     if warnings:
-        error.add_note("warned of before: " + ", ".join(f"{code} {count} times" for code, count in warnings.items()))
+        error.add_note("earlier warnings: " + ", ".join(f"{code} {count} times" for code, count in warnings.items()))

@@ -125,7 +125,7 @@ class PointToPointPlan:
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = plan_reduced_trajectory(rest(start), rest(end), relaxed_limits(start, limits))
         try:
-            require_ways_clear(model, [(f"the way {self.destination.value}", way)], limits)
+            require_ways_clear(model, [(f"the path {self.destination.value}", way)], limits)
         except MotionRefused as error:
-            raise MotionRefused(f"{error}; bring the arm by hand to where the straight way is free") from None
+            raise MotionRefused(f"{error}; move the arm by hand to where the straight path is free") from None
         return [(State.RETURNING, Slowed(way, self.speed))]

@@ -140,7 +140,7 @@ def _what_cannot_be_believed(seen: MonitoredSample, limits: MotionLimits) -> Ite
     yield Check("feedback_not_finite", bad, "position is not a number")
     if sample.velocity is not None:
         yield Check("feedback_not_finite", sample.valid & ~np.isfinite(sample.velocity), "velocity is not a number")
-    yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "torque that acts is not a number")
+    yield Check("feedback_not_finite", ~np.isfinite(sample.torque), "applied torque is not a number")
     yield Check("emergency_stop", _has_status(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
     what = "position unchanged to the last bit although the joint moved or was pushed"
     yield Check("frozen_encoder", seen.frozen, what)
@@ -190,10 +190,10 @@ def _what_can_be_bridged(seen: MonitoredSample, limits: MotionLimits) -> Iterato
         yield Check("torque_exceeded", exceeds, what, (seen.sample.torque, seen.most_torque))
     if seen.sent is not None:
         differs = np.abs(seen.sample.torque - seen.sent) > NOT_APPLIED * limits.torque
-        what = "the drive gives {} of the {} {f} it was told"
+        what = "the drive gives {} of the {} {f} commanded"
         yield Check("torque_not_applied", differs, what, (seen.sample.torque, seen.sent))
     if (more := seen.sample.torque_difference) is not None:
-        what = "the drive measures {} {f} more than it was told, at {} {f}"
+        what = "the drive measures {} {f} more than commanded, at {} {f}"
         yield Check("torque_not_applied", np.abs(more) > NOT_APPLIED * limits.torque, what, (more, seen.sample.torque))
 
 
@@ -405,7 +405,7 @@ class SafetyMonitor:
         finite = np.isfinite(wanted)
         what = f"a torque of {{}} {{f}} was asked for, more than {ABSURD:g} times the limit of {{}}"
         for check in (
-            Check("torque_not_finite", ~finite, "the torque asked for is not a number"),
+            Check("torque_not_finite", ~finite, "the requested torque is not a number"),
             Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),
         ):
             if check.hit.any():
@@ -413,10 +413,10 @@ class SafetyMonitor:
         leaves = np.clip(wanted, -limit, limit)
         over, fault = size > limit, None
         if over.any():
-            what = "a torque of {} {f} was asked for, the limit is {}"
+            what = "a torque of {} {f} was requested, the limit is {}"
             fault = self._found(Check("torque_saturated", over, what, (wanted, limit)))
         if motors is not None and (over := motors.used(leaves) > 1.0).any():
-            what = "a torque of {} N m was asked for, the limit is {}"
+            what = "a torque of {} N m was requested, the limit is {}"
             asked = leaves @ motors.to_motors.T
             fault = self._found(Check("torque_saturated", over, what, (asked, motors.torque), motors.names))
             leaves = motors.limited(leaves)

@@ -96,7 +96,7 @@ class Paused:
                 return Resumed(back, self._motion, time)
             except MotionRefused as error:
                 refusal = error
-        raise MotionRefused(f"no way leads from here back onto the motion: {refusal}") from refusal
+        raise MotionRefused(f"no trajectory leads from here back to the motion: {refusal}") from refusal
 
     def leave_in_slices(
         self, end: Setpoint, limits: MotionLimits, surroundings: ClearanceChecker | None = None

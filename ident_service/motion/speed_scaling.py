@@ -152,7 +152,7 @@ def require_factor(factor: float) -> float:
 
 def _change_length(before: float, after: float, peaks: Peaks, limits: MotionLimits) -> float:
     if not _keeps(_LONGEST, before, after, peaks, limits):
-        raise MotionRefused("the motion leaves the limits at the speed asked for, so no change can lead to it")
+        raise MotionRefused("the motion leaves the limits at the speed asked for, so the speed cannot be changed to it")
     low, high = np.log(_SHORTEST), np.log(_LONGEST)
     for _ in range(24):
         middle = 0.5 * (low + high)

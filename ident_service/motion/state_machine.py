@@ -76,9 +76,9 @@ class StateMachine:
             ArmError: no lawful way leads there, a mistake of the program; or a latched fault stands in it.
         """
         if wanted not in TRANSITIONS[self.state]:
-            raise ArmError(f"no way from {self.state.value} to {wanted.value}")
+            raise ArmError(f"no transition from {self.state.value} to {wanted.value}")
         waits = wanted is State.ARMED or (self.state is State.FAULTED and wanted is State.IDLE)
         if waits and self._latch.faults:
-            raise ArmError(f"no way to {wanted.value} before {self._latch.faults[0].code} is acknowledged")
+            raise ArmError(f"no transition to {wanted.value} before {self._latch.faults[0].code} is acknowledged")
         self.state = wanted
         self._told(wanted)

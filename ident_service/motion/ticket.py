@@ -181,7 +181,7 @@ _HASHES = {
     "arm_sha256": "the arm's description",
     "excitation_sha256": "the motion",
     "model_sha256": "the model's parameters",
-    "bus_sha256": "what the arm on the bus says of itself",
+    "bus_sha256": "what the drives report of the arm",
 }
 
 
@@ -257,9 +257,9 @@ class Ticket:
             if check.verdict in (Verdict.FAILED, Verdict.NEEDS_PERSON)
             and not (no_motion and check.code in ABOUT_THE_MOTION)
         ]:
-            found.append(f"the check did not pass: {', '.join(codes)}")
+            found.append(f"checks failed: {', '.join(codes)}")
         elif codes := [code for code in INDISPENSABLE if Verdict.PASSED not in self._verdicts(code)]:
-            found.append(f"the check was not made: {', '.join(codes)}")
+            found.append(f"checks were not made: {', '.join(codes)}")
         if now < self.created:
             found.append("it was made in the future: a clock has been set")
         elif now >= self.expires:
@@ -271,7 +271,7 @@ class Ticket:
             if getattr(mine, key) != getattr(theirs, key) and not (no_motion and key == "excitation_sha256"):
                 found.append(f"{what} has changed since")
         if mine.identities != theirs.identities:
-            found.append("the drives are others than those that were checked")
+            found.append("the drives are not those that were checked")
         for was, now_is in ((mine.driver, theirs.driver), (mine.software, theirs.software)):
             found += [f"it was made with {was or 'no driver'}, not with {now_is or 'none'}"] if was != now_is else []
         return found
@@ -280,7 +280,7 @@ class Ticket:
         """Raise MotionRefused, which says why, unless this ticket is `valid_for` the motion."""
         if why := self.valid_for(subject, now):
             raise MotionRefused(
-                f"the preflight ticket does not allow this: {'; '.join(why)}; `ident check` makes a new one"
+                f"the preflight ticket is not valid for this: {'; '.join(why)}; `ident preflight` makes a new one"
             )
 
     def with_arm(self, subject: Subject) -> Subject:
@@ -298,7 +298,7 @@ def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDes
 
     Args:
         model: of the arm.
-        excitation: to be run; None for a way home.
+        excitation: to be run; None for the path home.
         described: by the open arm, None where it could not be opened.
     """
     bus = driver = ""
@@ -368,9 +368,9 @@ def read_ticket(path: Path) -> Ticket:
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise UsageError(f"{path}: not UTF-8 text, so not a ticket; `ident check` makes a new one") from None
+        raise UsageError(f"{path}: not UTF-8 text, so not a ticket; `ident preflight` makes a new one") from None
     except UsageError as error:
-        raise UsageError(f"{path}: {error}; `ident check` makes a new one") from None
+        raise UsageError(f"{path}: {error}; `ident preflight` makes a new one") from None
 
 
 def ticket_from_json(text: str) -> Ticket:

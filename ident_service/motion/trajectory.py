@@ -91,9 +91,9 @@ class RuckigReference:
         try:
             result = self._calculated(parameters)
         except (ruckig.RuckigError, ValueError) as error:  # ValueError: a result that its own enumeration lacks
-            raise MotionRefused(f"no jerk-limited way exists within the limits: {str(error).strip()}") from error
+            raise MotionRefused(f"no jerk-limited trajectory exists within the limits: {str(error).strip()}") from error
         if result not in (ruckig.Result.Working, ruckig.Result.Finished):
-            raise MotionRefused(f"no jerk-limited way exists within the limits: {result}")
+            raise MotionRefused(f"no jerk-limited trajectory exists within the limits: {result}")
         self.duration = float(self._trajectory.duration)
 
     def _calculated(self, parameters: ruckig.InputParameter) -> ruckig.Result:
@@ -194,8 +194,9 @@ def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Gener
     if bool(np.any(lowest < limits.lower) or np.any(highest > limits.upper)):
         joint = int(np.argmax(np.maximum(limits.lower - lowest, highest - limits.upper)))
         raise MotionRefused(
-            f"the way to or from the motion swings joint {joint + 1} to {lowest[joint]:.3f}..{highest[joint]:.3f}, "
-            f"outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; begin nearer to it or slower"
+            f"the trajectory to or from the motion moves joint {joint + 1} to "
+            f"{lowest[joint]:.3f}..{highest[joint]:.3f}, outside {limits.lower[joint]:g}..{limits.upper[joint]:g}; "
+            "start closer to it or slower"
         )
     return reference
 

@@ -1,1 +1,1 @@
-"""Carry out the jobs that the command line and the daemon share."""
+"""Use cases that the command line and the daemon share."""

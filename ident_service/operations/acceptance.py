@@ -80,7 +80,7 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
     note, who = _noted(note), _named(who)
     results = read_results(folder)
     if results.parameters.content.get("feasibility", {}).get("feasible") is not True:
-        raise ParameterError(f"{folder}: no body can have these parameters, so no arm has them; accept a feasible set")
+        raise ParameterError(f"{folder}: these parameters are not feasible; accept a feasible set")
     if unusable := results.parameters.content.get("unusable"):
         raise ParameterError(f"{folder}: must not be used: {'; '.join(unusable)}; identify again and accept that")
     if arm not in (None, results.config.name):
@@ -149,7 +149,7 @@ def acceptances(state: Path, arm: str) -> list[Acceptance]:
         try:
             acts.append(Acceptance(**json.loads((folder / ACT).read_text(encoding="utf-8"))))
         except (OSError, ValueError, TypeError) as error:
-            raise ParameterError(f"{folder / ACT}: cannot be read ({error}); put a copy of it back") from None
+            raise ParameterError(f"{folder / ACT}: cannot be read ({error}); restore it from a copy") from None
     return acts
 
 
@@ -162,7 +162,7 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
     """
     acts = acceptances(state, arm)
     if not acts:
-        raise UsageError(f"{arm}: nothing has been accepted yet; `ident accept RUN` makes a run's parameters its own")
+        raise UsageError(f"{arm}: nothing has been accepted yet; `ident accept RUN` accepts those of a run")
     if number is not None and not 1 <= number <= len(acts):
         raise UsageError(f"{arm}: no acceptance {number}; they are numbered from 1 to {len(acts)}")
     act = acts[-1 if number is None else number - 1]
@@ -207,7 +207,7 @@ def accepted_recordings(state: Path) -> set[str]:
 def _noted(note: str) -> str:
     note = note.strip()
     if not note:
-        raise UsageError("say why, in a note; it is what people read years later")
+        raise UsageError("give the reason in a note; people read it years later")
     if len(note) > LONGEST_NOTE:
         raise UsageError(f"a note has {LONGEST_NOTE} characters at most")
     return note
@@ -216,14 +216,14 @@ def _noted(note: str) -> str:
 def _named(who: str) -> str:
     who = who.strip()
     if not who or len(who) > _LONGEST_NAME:
-        raise UsageError(f"say who accepts, by a name of 1 to {_LONGEST_NAME} characters")
+        raise UsageError(f"give the name of who accepts, 1 to {_LONGEST_NAME} characters")
     return who
 
 
 def _require_as_accepted(folder: Path, act: Acceptance) -> None:
     path = folder / PARAMETERS
     if not path.is_file() or file_sha256(path) != act.parameters_sha256:
-        raise ParameterError(f"{path}: was changed since it was accepted; put a copy of it back")
+        raise ParameterError(f"{path}: was changed since it was accepted; restore it from a copy")
 
 
 def _folder(state: Path, arm: str, number: int) -> Path:

@@ -30,16 +30,16 @@ from ident_service.results.manifest import write_atomically
 _TITLES = {
     "configuration": "the description is complete",
     "motion_fits": "the motion was made for it",
-    "motion_proven": "the motion is proven to keep all limits",
+    "motion_proven": "the motion keeps all limits (proof)",
     "stability": "gains are stable at this rate and delay",
     "identities": "every axis answers and is the one expected",
     "at_rest": "the arm is at rest, inside its limits",
-    "ways_clear": "ways to the motion and back are clear",
-    "rate": "this machine keeps the rate",
+    "ways_clear": "paths to the motion and back are clear",
+    "rate": "this computer keeps the rate",
     "noise": "feedback is quiet",
-    "gravity": "gravity torque is the model's",
+    "gravity": "gravity torque agrees with the model",
     "direction": "direction and scale of every joint",
-    "watchdog": "drives stop when we fall silent",
+    "watchdog": "drives stop when the host is silent",
 }
 _WORDS = {
     Verdict.PASSED: "ok",
@@ -71,13 +71,13 @@ def ticket_text(ticket: Ticket, *, every_measure: bool = False) -> str:
         every_measure: every number of every check, and not only the one nearest to its limit.
     """
     motion = ticket.subject.excitation
-    lines = [f"preflight of {ticket.subject.arm} for {f'the {motion} motion' if motion else 'a way home'}", ""]
+    lines = [f"preflight of {ticket.subject.arm} for {f'the {motion} motion' if motion else 'the path home'}", ""]
     for check in ticket.checks:
         lines += _check_lines(check, every_measure)
     lines.append("")
     until = ticket.expires.isoformat(sep=" ", timespec="seconds").removesuffix("+00:00")
     if ticket.verdict is Verdict.PASSED:
-        lines.append(f"the arm may move until {until} UTC, if nothing is changed")
+        lines.append(f"the arm may move until {until} UTC, unless something is changed")
     elif ticket.verdict is Verdict.NEEDS_PERSON:
         lines.append("NOT YET ALLOWED TO MOVE: a check needs a person")
     else:
@@ -227,7 +227,7 @@ def _turned(name: str, answer: str, scale: float, revolute: bool, measured: floa
     try:
         typed = float(answer) * scale
     except ValueError:
-        raise UsageError(f"{name}: {answer!r} is no number; nothing of this joint was kept") from None
+        raise UsageError(f"{name}: {answer!r} is no number; this joint was skipped") from None
     least = LEAST if revolute else 0.1 * LEAST
     if not math.isfinite(typed) or abs(typed) < least:
         raise UsageError(

@@ -77,14 +77,14 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
     """
     row = db.row("SELECT * FROM arms WHERE name = ?", arm)
     if row is None:
-        raise UnknownId(f"no arm {arm!r} is known; the list of arms names them")
+        raise UnknownId(f"no arm {arm!r} is known; see the list of arms")
     if row["source"] == "shipped":
         raise UsageError(f"{arm} comes with this software; it cannot be deleted")
     live = db.rows(f"SELECT id FROM jobs WHERE arm = ? AND state IN {LIVE}", arm)  # noqa: S608 - ours
     live += db.rows("SELECT id FROM reidentifications WHERE arm = ? AND state = 'running'", arm)
     _require_idle(db, f"the arm {arm}", [one["id"] for one in live])
     if faults := fault_file(state, arm).latched():
-        raise InUse(f"the arm {arm} has faults that nobody has acknowledged: {', '.join(faults)}")
+        raise InUse(f"the arm {arm} has unacknowledged faults: {', '.join(faults)}")
     runs = db.rows("SELECT * FROM runs WHERE arm = ? ORDER BY id", arm)
     motions = db.rows("SELECT * FROM motions WHERE arm = ? ORDER BY id", arm)
     found = [
@@ -180,9 +180,7 @@ def _require_idle(db: Database, what: str, busy: list[str]) -> None:
 def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
     if found and not anyway:
         names = ", ".join(f"{one.kind} {one.id}" for one in found[:10]) + (", ..." if len(found) > 10 else "")
-        raise InUse(
-            f"{what} is referred to by {names}; to delete it all the same, say so (`--anyway`, `?anyway=true`)", found
-        )
+        raise InUse(f"{what} is referred to by {names}; to delete it anyway, use `--anyway` or `?anyway=true`", found)
 
 
 def forget_run(db: Database, state: Path, run: str, who: str) -> None:

@@ -89,11 +89,11 @@ def acknowledge_alarm(db: Database, number: int, remark: str, by: str, now: floa
     """
     remark = remark.strip()
     if not remark or len(remark) > LONGEST_NOTE:
-        raise UsageError(f"say what was found, in a note of 1 to {LONGEST_NOTE} characters")
+        raise UsageError(f"describe what was found in a note of 1 to {LONGEST_NOTE} characters")
     with db.transaction():
         row = db.row("SELECT * FROM alarms WHERE id = ? AND closed IS NULL", number)
         if row is None:
-            raise UnknownId(f"no alarm {number} stands; the list of alarms names them")
+            raise UnknownId(f"no open alarm {number}; see the list of alarms")
         db.write("UPDATE alarms SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, remark, number)
         note(db, by, "alarm acknowledged", row["arm"], alarm=number, note=remark)
     return db.rows("SELECT * FROM alarms WHERE id = ?", number)[0]

@@ -20,10 +20,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from zipfile import ZIP_DEFLATED, ZipFile
 
+from drivers.can.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line
 from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links
-from drivers.canopen.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line, budget
+from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
 from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, entry_of, named, where
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
@@ -31,11 +32,13 @@ from drivers.canopen.drive_setup import IDENTITY, differences
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
+from ident_service.config.can_bus import CanBus
+from ident_service.config.canopen import CanopenDrive, CanopenDriver
 from ident_service.config.eds import data_sheet
 from ident_service.config.load import config_error
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
+from ident_service.motion.arm_factory import make_arm
 from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
 from ident_service.recordings.files import write_atomically
 
@@ -53,14 +56,15 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
     Raises:
         UsageError: the arm's driver has no bus that frames could be counted on.
     """
-    if not isinstance(config.driver, CanopenDriver):
+    found = make_arm(config).bus_budget(rate) if config.can_buses else None
+    if found is None:
         kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
-        raise UsageError(f"{config.name} has {kind}; a bus load is that of CANopen drives (driver.kind: canopen)")
-    return budget(config.driver, config.control.rate if rate is None else rate)
+        raise UsageError(f"{config.name} has {kind}; a bus load is that of drives on CAN (canopen, barrett)")
+    return found
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """Return the bus budget of an arm with CANopen drives, which must fit; None for other arms.
+    """Return the bus budget of an arm with drives on CAN, which must fit; None for other arms.
 
     Args:
         arm: its file, or its name if it is shipped.
@@ -69,7 +73,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
     Raises:
         ConfigError: over budget; the mistake has the place of the driver, and the remedies.
     """
-    if not isinstance(config.driver, CanopenDriver):
+    if not config.can_buses:
         return None
     found = bus_load(config)
     if not found.fits:
@@ -80,7 +84,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
 def bus_lines(found: Budget) -> str:
     """Format the verdict as one line per bus."""
     return "".join(
-        f"bus {bus.profile.number} ({bus.profile.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
+        f"bus {bus.number} ({bus.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
         f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
         for bus in found.buses
     )
@@ -111,7 +115,7 @@ def bus_document(name: str, found: Budget) -> dict[str, Any]:
 
 def _bus_lines(bus: BusLoad) -> list[str]:
     cycle, load = bus.cycle, bus.load
-    lines = [f"bus {bus.profile.number}: {_described(bus.profile.bus)}", _HEAD, _UNDER]
+    lines = [f"bus {bus.number}: {_described(bus.bus)}", _HEAD, _UNDER]
     lines += [_row(line.name, _ids(line), f"{line.length}", f"{line.per_second:.4g}", line) for line in bus.lines]
     return [
         *lines,
@@ -142,13 +146,12 @@ def _ids(line: Line) -> str:
 
 
 def _bus_document(bus: BusLoad) -> dict[str, Any]:
-    profile = bus.profile
     return {
-        "number": profile.number,
-        "interface": profile.bus.interface,
-        "channel": profile.bus.channel,
-        "bitrate": profile.bus.bitrate,
-        "data_bitrate": profile.bus.data_bitrate,
+        "number": bus.number,
+        "interface": bus.bus.interface,
+        "channel": bus.bus.channel,
+        "bitrate": bus.bus.bitrate,
+        "data_bitrate": bus.bus.data_bitrate,
         "fits": bus.fits,
         "highest_rate": bus.highest_rate,
         "cycle_us": _values(bus.cycle, 1e6),
@@ -253,9 +256,9 @@ def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = op
 
 def _judged(node: FoundNode | None, drive: CanopenDrive) -> tuple[Match, str]:
     if node is None:
-        return Match.MISSING, "neither heard nor answering"
+        return Match.MISSING, "silent"
     if not node.answers:
-        return Match.SILENT, "heard, but answers no SDO request"
+        return Match.SILENT, "sends frames, but answers no SDO request"
     if not node.is_drive:
         kind = "not told" if node.device_type is None else f"{node.device_type:08X}h"
         return Match.OTHER, f"no drive of CiA 402 (1000h is {kind})"
@@ -464,7 +467,7 @@ def _foretold(driver: CanopenDriver, number: int, file: TextFile) -> Capabilitie
 def probe_text(config: ArmConfig, found: Probe) -> str:
     """Format a probe as text, with a last line break."""
     bad = [one for one in found.probed if not one.drivable]
-    verdict = f"{len(bad)} of {len(found.probed)} NOT AS IT IS" if bad else "every drive can be driven"
+    verdict = f"{len(bad)} of {len(found.probed)} NOT as described" if bad else "every drive can be driven"
     lines = [f"{config.name}: {verdict}; nothing was written"]
     for one in found.probed:
         lines += ["", *_lines(one, found)]
@@ -483,7 +486,7 @@ def _lines(one: Probed, found: Probe) -> Iterator[str]:
         yield f"{one.title}, node {one.node}: {one.silent}"
         return
     verdict = "CANNOT BE DRIVEN" if can.problems else "not as described" if can.changes else "can be driven"
-    by = "" if can.found.asked else ", foretold by its data sheet"
+    by = "" if can.found.asked else ", predicted from its EDS"
     yield f"{one.title}, node {one.node}: {can.family.name}: {verdict}{by}"
     if one.silent:
         yield f"  {one.silent}"
@@ -514,7 +517,7 @@ def _facts(one: Probed, found: Probe) -> dict[str, str]:
     mode = f"mode {can.torque.mode}" + (f" ({named(can.torque.by.entry)})" if can.torque.by else "")
     facts["torque"] = f"{mode}, {named(can.torque.target)}; a count is {count}{of}"
     facts["torque_limit"] = "none" if can.limit is None else named(can.limit.entry)
-    facts["speed_limit"] = "the host's alone" if can.speed is None else where(can.speed)
+    facts["speed_limit"] = "set by the host" if can.speed is None else where(can.speed)
     facts["watchdogs"] = ", ".join(can.watchdogs) or "none"
     dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"

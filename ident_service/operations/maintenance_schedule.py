@@ -44,7 +44,7 @@ class Cron:
         """
         found = next(CronSim(self.text, datetime.fromtimestamp(at, UTC)), None)
         if found is None:
-            raise UsageError(f"{self.text!r}: no such day ever comes")
+            raise UsageError(f"{self.text!r}: there is no such day")
         return found.timestamp()
 
 
@@ -144,7 +144,7 @@ def known_schedule(db: Database, number: int) -> Row:
     """
     found = [row for row in schedules(db) if row["id"] == number]
     if not found:
-        raise UnknownId(f"no schedule {number} is known; the list of schedules names them")
+        raise UnknownId(f"no schedule {number} is known; see the list of schedules")
     return found[0]
 
 
@@ -194,7 +194,7 @@ def add_event(db: Database, arm: str, what: str, remark: str, by: str, now: floa
     """
     what, remark = what.strip(), remark.strip()
     if not what or len(what) > LONGEST_WHAT or len(remark) > LONGEST_NOTE:
-        raise UsageError(f"say what was done in 1 to {LONGEST_WHAT} characters; a note has {LONGEST_NOTE} at most")
+        raise UsageError(f"describe what was done in 1 to {LONGEST_WHAT} characters; a note has {LONGEST_NOTE} at most")
     with db.transaction():
         db.write(
             "INSERT INTO maintenance_events (arm, what, note, at, who) VALUES (?, ?, ?, ?, ?)",
@@ -271,11 +271,11 @@ def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
     """
     why = why.strip()
     if not why or len(why) > LONGEST_NOTE:
-        raise UsageError(f"say why it is not to be done, in 1 to {LONGEST_NOTE} characters")
+        raise UsageError(f"give the reason, in 1 to {LONGEST_NOTE} characters")
     with db.transaction():
         row = db.row("SELECT arm FROM dues WHERE id = ? AND closed IS NULL", number)
         if row is None:
-            raise UnknownId(f"nothing of number {number} is due; the list of what is due names it")
+            raise UnknownId(f"nothing of number {number} is due; see the list of due entries")
         db.write("UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE id = ?", now, by, why, number)
         note(db, by, "due dismissed", row["arm"], due=number, note=why)
 

@@ -283,7 +283,7 @@ def known_information(model: ArmModel, base: BaseParameters, knowledge: PriorDat
     opened = open_together(knowledge.recordings, model).recordings
     for index, recording in enumerate(opened):
         if any(overlap(recording, other) for other in opened[:index]):
-            raise UsageError(f"{recording.path}: the same recording twice would count as twice as much")
+            raise UsageError(f"{recording.path}: the same recording was given twice")
     parts = [equations(recording, model, base).total for recording in opened]
     R = Information.sum(parts).stacked(1.0 / noise)[:-1, :-1]
     return np.asarray(R.T @ R)

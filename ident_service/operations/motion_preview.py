@@ -166,12 +166,12 @@ def _warnings(model: ArmModel, limits: MotionLimits, forecast_error: Array | Non
     ahead = np.zeros_like(limits.following_error) if forecast_error is None else forecast_error
     if late := [name for k, name in enumerate(names) if ahead[k] > limits.following_error[k]]:
         found.append(
-            f"{', '.join(late)} may fall behind by more than the following error allows, if friction is as guessed "
-            "(design.friction_guess); the guard would stop the motion"
+            f"{', '.join(late)} may exceed its following error, if friction is as guessed "
+            "(design.friction_guess); the safety monitor would stop the motion"
         )
     owners = {body.owner for body in scene(model).bodies}
     if bare := [name for name in names if name not in owners]:
-        found.append(f"no body is known of {', '.join(bare)}: nothing keeps it clear of anything; see geometry")
+        found.append(f"no body is known of {', '.join(bare)}: its clearance cannot be checked; see geometry")
     return found
 
 
@@ -205,7 +205,7 @@ def recorded_noise(file: Path, model: ArmModel) -> NoiseModel:
             "give the parameters.json of an identification of this arm"
         ) from None
     if not ratios or not (deviation > 0.0).all():
-        raise UsageError(f"{file}: its residuals or standard deviations are zero, so nothing can be foretold from it")
+        raise UsageError(f"{file}: its residuals or standard deviations are zero, so nothing can be predicted from it")
     return NoiseModel(deviation, float(np.exp(np.mean(np.log(ratios)))), f"the residuals in {file.name}")
 
 
@@ -272,10 +272,10 @@ def preview_text(seen: Preview) -> str:
     )
     lines = [
         f"{seen.excitation.name} motion for {seen.model.config.name}: {path.duration:g} s ({kind})",
-        f"way there {seen.approach[0]:.1f} s and back {seen.approach[1]:.1f} s, from and to home",
+        f"path to the motion {seen.approach[0]:.1f} s and back {seen.approach[1]:.1f} s, from and to home",
         *([] if (load := seen.model.config.payload) is None else [f"payload: {load.words}"]),
         "",
-        "peaks at every instant, not only at samples; in brackets the share of the limit",
+        "peaks at every instant, not only at samples; in brackets: share of the limit",
         f"  {'joint':<{width}} {'position':>17} {'(range)':>8} {'velocity':>14} {'acceleration':>14} {'jerk':>14} "
         f"{'torque':>15} {'following error':>17} {'stops reach':>17}",
     ]
@@ -294,7 +294,7 @@ def preview_text(seen: Preview) -> str:
     if asked.power is not None and seen.model.config.supply is not None:
         budget = seen.model.config.supply.budget
         lines.append(f"supply: {asked.power:.1f} W {_percent(asked.power / budget)} of {budget:g} W")
-    for what, clearance in (("motion", seen.proof.clearance), ("way there and back", seen.proof.approach)):
+    for what, clearance in (("motion", seen.proof.clearance), ("path to the motion and back", seen.proof.approach)):
         if clearance is not None and clearance.pair is not None:
             lines.append(
                 f"smallest clearance of the {what}: {clearance.sampled:.4f} m at {clearance.pair}, "

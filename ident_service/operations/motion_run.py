@@ -107,15 +107,16 @@ class ProcessResult:
         else:
             error = _KINDS.get(kind, ArmError)(message)
         for code, cause in latched.items():
-            error.add_note(f"latched, too: {code}: {cause}")
+            error.add_note(f"also active: {code}: {cause}")
         raise error
 
     def _died(self, latched: dict[str, str]) -> ArmError:
-        died = f"the motion process died without a word ({self._how()})"
+        died = f"the motion process died without a message ({self._how()})"
         if UNFINISHED not in latched:
-            return ArmError(f"{died} before it took the arm; nothing has moved")
+            return ArmError(f"{died} before it opened the arm; nothing has moved")
         return ArmFault(
-            UNFINISHED, f"{died}; drives that hear nothing stop by themselves: look at the arm before `ident ack`"
+            UNFINISHED,
+            f"{died}; drives without commands stop by themselves: check the arm before `ident acknowledge`",
         )
 
     def _how(self) -> str:
@@ -366,10 +367,10 @@ class TargetMonitor:
             said = json.loads(self._heard)
             share, seconds = float(said["share"]), float(said["seconds"])
         except (ValueError, KeyError, TypeError):
-            self._tell("nobody looks any more whether the target is reached; the motion goes on to its end")
+            self._tell("the target is no longer monitored; the motion continues to its end")
         else:
             self.said = {"share": share, "seconds": seconds}
-            self._tell(f"target reached: known to {share:.2%} at worst after {seconds:.1f} s of the motion")
+            self._tell(f"target reached: largest deviation {share:.2%} after {seconds:.1f} s of the motion")
 
 
 @dataclass(frozen=True)
@@ -512,7 +513,7 @@ def _missed(folder: Path, until: Target, period: float, tell: Callable[[str], No
     try:
         return missed(folder, until, period)
     except IdentError as error:
-        tell(f"which parameters missed the target is not known: {error}")
+        tell(f"parameters that missed the target are unknown: {error}")
         return None
 
 

@@ -30,7 +30,7 @@ from ident_service.model.base_parameters import base_parameters, remarks_on_angl
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
 from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_urdf_bodies
-from ident_service.model.mechanism import count_mechanism, read_mechanism
+from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
 from ident_service.model.outline import mesh_capsules
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
@@ -89,7 +89,7 @@ def arm_part(text: str, file: str, base: str | None, tip: str | None) -> dict[st
         carried.add(child.get("link", ""))
     roots = [link.get("name", "") for link in robot.findall("link") if link.get("name", "") not in carried]
     if base is None and len(roots) != 1:
-        raise ModelError(f"{file}: {len(roots)} links hang on no joint; name the arm's --base")
+        raise ModelError(f"{file}: {len(roots)} links have no parent joint; name the arm's --base")
 
     def depth(link: str) -> int:
         return max((moves + depth(child) for child, _, moves in children.get(link, [])), default=0)
@@ -192,7 +192,7 @@ def in_yaml(draft: Draft) -> str:
     """Return the description as YAML with comments."""
     guessed = "\n".join(f"#   {line}" for line in draft.remarks)
     head = f"""\
-# {draft.name}, begun by `ident new` from {draft.urdf}. Look through it before a real arm moves by it.
+# {draft.name}, begun by `ident new` from {draft.urdf}. Check it before a real arm moves with it.
 # Guessed or chosen:
 {guessed}
 format: ident-arm
@@ -204,22 +204,21 @@ kinematics: {_flow(draft.part)}
 gravity: [0, 0, -9.81] # m/s^2 in the base frame: the arm stands upright
 terms: [drive_inertia, viscous, coulomb, offset]
 """
-    units = (
-        "# rad, rad/s, rad/s^2, rad/s^3, N m; for slides m, m/s, m/s^2, m/s^3, N\n"
-        "# Accelerations, jerks, following errors, gains, home and the drives' inertias are guesses."
-    )
+    units = "# rad, rad/s, rad/s^2, rad/s^3, N m; for slides m, m/s, m/s^2, m/s^3, N"
     parts = [head]
     if draft.joints:
         rows = "".join(f"  {_flow(name)}:\n    {_flow(keys)}\n" for name, keys in draft.joints.items())
         parts.append(f"{units}\njoints:\n{rows}")
     if draft.prior:
-        parts.append(
-            f"prior: # SI units, in the link frames; whose are guessed is said above\n  {_flow(draft.prior)}\n"
-        )
+        parts.append(f"prior: # SI units, in the link frames; guessed ones are listed above\n  {_flow(draft.prior)}\n")
     if draft.total_mass:
         parts.append(f"constraints: {{total_mass: {{upper: {draft.total_mass:g}}}}} # kg, twice what its links have\n")
     cutoff = "" if draft.cutoff == 30.0 else f", velocity_cutoff: {draft.cutoff:g}"
-    parts.append(f"control: {{rate: {RATE:g}{cutoff}}} # Hz\n")
+    parts.append(
+        f"control: {{rate: {RATE:g}{cutoff}, after_stop: brake}} # Hz\n"
+        "# After a stop drives are switched off: simulated ones are taken to have brakes. Of a real arm say in\n"
+        "# the braces of each joint `brake: true` or `brake: false`; one without brakes has `after_stop: hold` above.\n"
+    )
     if draft.geometry:
         rows = "".join(f"  {_flow(name)}: {_flow(each)}\n" for name, each in draft.geometry.items())
         parts.append(f"geometry: # m, in the link frames; around the URDF's meshes\n{rows}")
@@ -228,7 +227,7 @@ terms: [drive_inertia, viscous, coulomb, offset]
         space["may_touch"] = [list(pair) for pair in draft.may_touch]
     parts.append(
         f"workspace: {_flow(space)} # m\n"
-        "# What else must not be touched, in the braces above, with motions that are clear of it (`ident design`):\n"
+        "# Obstacles go into the braces above; then design motions that avoid them (`ident design`):\n"
         "#   obstacles: {table: {half_space: {normal: [0, 0, 1], offset: -0.1}}}\n"
     )
     parts.append(
@@ -325,6 +324,7 @@ def new_description(
         raise UsageError(f"{urdf}: cannot be read: {error}") from None
     file = TextFile(name=urdf.name, text=text)
     count_mechanism(file, "urdf")
+    require_urdf(file)
     draft = Draft(called, urdf.name, arm_part(text, file.name, base, tip))
     with tempfile.TemporaryDirectory() as staging:
         trial = Path(staging) / "arm.yaml"
@@ -345,12 +345,31 @@ def new_description(
         _gains(draft, loaded)
         _motions(draft, loaded)
         loaded()
-    draft.remarks.append("workspace: nothing but the arm itself is kept clear of; add what stands around it")
+    draft.remarks += _always_guessed(draft)
     path.parent.mkdir(parents=True, exist_ok=True)
     if not beside.exists():
         write_atomically(beside, text)
     write_atomically(path, in_yaml(draft))
     return path, tuple(draft.remarks)
+
+
+def _always_guessed(draft: Draft) -> list[str]:
+    """Return remarks on what no URDF says."""
+    kp, kd = next(((joint["kp"], joint["kd"]) for joint in draft.joints.values()), _GAINS[0])
+    mass = f"constraints.total_mass: at most {draft.total_mass:g} kg, twice what the links have"
+    return [
+        "gravity: the base stands upright",
+        "terms: each joint has drive inertia, viscous and Coulomb friction, and an offset",
+        "joints: acceleration, jerk and following_error from the velocity and torque limits; drive_inertia from them, "
+        f"too; gains, kp {kp:g} and kd {kd:g}, for the simulated arm; home, where the arm is clear of itself",
+        *([mass] if draft.total_mass else []),
+        f"control: {RATE:g} Hz; after_stop: brakes hold the arm, because simulated drives are assumed to have brakes; "
+        "enter what the real ones have",
+        f"design.friction_guess: friction is {FRICTION_GUESS:.0%} of the torque limits",
+        f"motions: {draft.use:.0%} of the limits, {draft.frequency:g} Hz, about home",
+        "driver: a simulated arm; its links, drives and friction are drawn at random about the prior's",
+        f"workspace: clearance {CLEARANCE:g} m; only the arm itself is avoided; add the obstacles around it",
+    ]
 
 
 def _plain(name: str) -> str:
@@ -366,7 +385,7 @@ def _which(model: ArmModel, draft: Draft) -> list[str]:
     held = read_mechanism(file, "urdf", model.config.kinematics).held
     ends = f"from {draft.part.get('base', 'the root')} to {draft.part['tip']}, {model.chain.joints} joints"
     more = f"; held: {', '.join(list(held)[:8])}{' ...' if len(held) > 8 else ''}" if held else ""
-    return [f"the arm: {ends}{more} (--base and --tip say otherwise)"]
+    return [f"the arm: {ends}{more} (change it with --base and --tip)"]
 
 
 def _joints(draft: Draft, model: ArmModel, said: Mapping[str, UrdfLimits]) -> None:
@@ -376,7 +395,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, UrdfLimits]) -> No
     if likely.guessed:
         draft.prior = _table(model, likely.delta)
         draft.remarks.append(
-            f"bodies of {', '.join(likely.guessed)}: rods; the URDF's have no mass, or an inertia that no body has"
+            f"bodies of {', '.join(likely.guessed)}: rods; the URDF's have no mass, or an unphysical inertia"
         )
     model = replace(model, prior=likely.delta)
     masses = [float(likely.delta[model.layout.inertial(link)][-1]) for link in range(chain.joints)]
@@ -384,7 +403,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, UrdfLimits]) -> No
     if remarks_on_angles(base_parameters(model.chain, model.layout)):
         draft.part["snap"] = True
         draft.remarks.append(
-            "kinematics: the URDF's angles are rounded multiples of 15 degrees; they are taken for exact"
+            "kinematics: the URDF's angles are rounded multiples of 15 degrees; they are taken as exact"
         )
     ranges = [
         (said[name].position if name in said else None) or ((-_TURN, _TURN) if turns else (-_SLIDE, _SLIDE))
@@ -402,7 +421,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, UrdfLimits]) -> No
         if torque < _HEAVY * gravity[k]:
             holds = "cannot hold" if torque < gravity[k] else "hardly holds"
             draft.remarks.append(
-                f"{name}: its effort limit of {torque:g} {holds} the arm, which asks for {gravity[k]:.3g}"
+                f"{name}: its effort limit of {torque:g} {holds} the arm, which needs {gravity[k]:.3g}"
             )
         drive = _DRIVE * torque / velocity
         acceleration = min(acceleration, max(0.3 * torque / (inertia[k] + drive), 0.1 * velocity / _SECONDS))
@@ -414,7 +433,9 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, UrdfLimits]) -> No
             if value is None
         ]
         if missing:
-            draft.remarks.append(f"{name}: {', '.join(missing)} limit guessed; the URDF has none that could be meant")
+            draft.remarks.append(
+                f"{name}: {', '.join(missing)} limit guessed; the URDF has none, or an implausible one"
+            )
         draft.joints[name] = {
             # The URDF's exact values: a rounded limit may be wider than the arm's.
             "position": list(ranges[k]),
@@ -578,7 +599,7 @@ def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
     # Half of the time each joint is faster than the median of its speeds.
     draft.standstill = short(0.5 * float(np.median(_paces(loaded()), axis=1).min()), 2)
     draft.remarks.append(
-        f"identification.reversal.speed: {draft.standstill:g} rad/s or m/s; a joint with little room is never fast"
+        f"identification.reversal.speed: {draft.standstill:g} rad/s or m/s; a joint with a small range is never fast"
     )
 
 

@@ -270,7 +270,7 @@ def payload_files(run: Path, recordings: Sequence[Path], out: Path, *, refit_off
     if not run.is_dir():
         raise UsageError(f"{run}: not a folder; give the folder of results of the arm without the load")
     if out.exists() and out.samefile(run):
-        raise UsageError(f"{out}: would replace the arm's own parameters; give another folder")
+        raise UsageError(f"{out}: would replace the arm's parameters; give another folder")
     require_replaceable(out)
     side = read_side(run)
     arm = known_arm(side)
@@ -330,7 +330,7 @@ def _require_new(side: ComparedSet, recordings: Sequence[Recording]) -> None:
         if recording.sha256 in fitted:
             raise UsageError(f"{recording.path}: the arm was identified from it; give a recording with the load")
         if any(overlap(recording, other) for other in recordings[:index]):
-            raise UsageError(f"{recording.path}: the same recording twice would make the doubt too small")
+            raise UsageError(f"{recording.path}: the same recording twice would make the uncertainty too small")
 
 
 def _compared(side: ComparedSet, staging: Path, out: Path) -> Comparison:

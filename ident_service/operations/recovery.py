@@ -19,7 +19,6 @@ import numpy as np
 from drivers.arm import Arm, StopKind
 from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDriver
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import DriverError, MotionRefused, PositionUnknown, UsageError
 from ident_service.model.arm_model import arm_model
@@ -35,8 +34,8 @@ from ident_service.registry.state_folder import control_path, fault_file, ticket
 
 LOOK = 0.3  # s
 AT_HOME = 0.05  # rad or m
-_SUPPORT = "Support the arm, or see that it rests on something: nothing holds it up now."
-_HELD = "Support the arm, then `ident supported {}`: its drives hold it in quick stop, and let it go by that."
+_SUPPORT = "Support the arm, or make sure that it rests on something: nothing holds it now."
+_HELD = "Support the arm, then `ident supported {}`: its drives hold it in quick stop, and release it then."
 _SEEN = 20  # cycles until the drives' status has arrived
 
 
@@ -55,7 +54,7 @@ class Recovery:
         tripped: what drives still have latched, by axis.
         outside: joints outside their position limits, in words.
         steps: what to do next, one sentence each, in order; the last one is what a usable arm needs as well.
-        usable: whether `ident check` can be run.
+        usable: whether `ident preflight` can be run.
     """
 
     arm: str
@@ -90,8 +89,8 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     pid = controlling_pid(control_path(state, config.name))
     if pid is not None:
         stop_first = (
-            f"`ident stop {called}` brings it to rest; process {pid} moves it.",
-            f"`ident recover {called}` again, when it stands.",
+            f"`ident stop {called}` stops it; process {pid} is moving it.",
+            f"`ident recover {called}` again, when it is at rest.",
         )
         return Recovery(config.name, faults, pid, None, "", "", (), {}, (), stop_first, False)
     arm = make_arm(config) if arm is None else arm
@@ -110,7 +109,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     tripped = {} if seen is None else _tripped(seen)
     out = [] if seen is None else position_limit_violations(seen.position, limits, seen.joint_names)
     support = _SUPPORT
-    if seen is not None and isinstance(config.driver, CanopenDriver) and any(w & AxisStatus.IDLE for w in seen.status):
+    if seen is not None and config.idle_drives_hold and any(w & AxisStatus.IDLE for w in seen.status):
         support = _HELD.format(called)
     before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits, support)
     usable = not before
@@ -140,7 +139,7 @@ def release_held_drives(config: ArmConfig, state: Path, arm: Arm | None = None) 
         names = arm.describe().joint_names
         held = tuple(name for name, word in zip(names, status, strict=True) if word & AxisStatus.IDLE)
         if not held:
-            raise UsageError(f"{config.name}: nobody moves the arm, and its drives do not hold it")
+            raise UsageError(f"{config.name}: the arm is not moving, and its drives do not hold it")
         arm.stop(StopKind.TORQUE_OFF)
     return held
 
@@ -179,18 +178,18 @@ def _before(
     support: str,
 ) -> list[str]:
     """Return what must be done before the arm is usable, in order."""
-    steps = [f"`ident ack {name} {one.code}`, when you know why it came: {one.cause}." for one in faults]
+    steps = [f"`ident acknowledge {name} {one.code}`, when you know the cause: {one.cause}." for one in faults]
     if unreachable:
-        steps.append(f"Check power, cables, emergency stop, and that no other program has the arm: {unreachable}.")
+        steps.append(f"Check power, cables, emergency stop, and that no other program uses the arm: {unreachable}.")
     if zero_lost:
-        steps.append(f"Zero it: {zero_lost}.")
+        steps.append(f"Set its home: {zero_lost}.")
     if seen is None:
         return [support, *steps, f"`ident recover {name}` again."]
     silent = [joint for joint, q in zip(seen.joint_names, seen.position, strict=True) if not np.isfinite(q)]
     if silent:
         steps.append(f"Check power and cables of the axes that do not answer: {', '.join(silent)}.")
     if bool((np.abs(seen.velocity) > REST_SPEED * limits.velocity).any()):
-        steps.append("Keep out of its reach until it rests: the arm moves, though nobody moves it.")
+        steps.append("Keep out of its reach until it rests: the arm moves without a command.")
     if tripped and refusal:
         steps.append(f"Release the emergency stop, or read the drive's own fault code and mend its cause: {refusal}.")
     if tripped or (faults and steps):
@@ -199,8 +198,8 @@ def _before(
         try:
             require_near(seen.position, limits, seen.joint_names)
             steps.append(
-                f"`ident check {name} --home`, then `ident recover {name} --leave-limit` leads it back inside, slowly; "
-                f"or push it by hand: {'; '.join(out)}."
+                f"`ident preflight {name} --home`, then `ident recover {name} --leave-limit` moves it back inside, "
+                f"slowly; or push it by hand: {'; '.join(out)}."
             )
         except MotionRefused as error:
             steps.append(f"Bring it back by hand: {error}.")
@@ -209,8 +208,8 @@ def _before(
 
 def _at_last(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:
     away = seen is None or out or bool((np.abs(seen.position - limits.home) > AT_HOME).any())
-    home = f"`ident check {name} --home`, then `ident home {name}` leads it home; then " if away else ""
-    return f"{home}`ident check {name}` for the next motion."
+    home = f"`ident preflight {name} --home`, then `ident home {name}` moves it home; then " if away else ""
+    return f"{home}`ident preflight {name}` for the next motion."
 
 
 @dataclass(frozen=True)
@@ -252,9 +251,9 @@ def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
     Raises:
         UsageError: its description does not say `zero: at_home`, or has no home of every joint.
     """
-    if not isinstance(config.driver, CanopenDriver) or config.driver.zero != "at_home":
+    if not config.zeroed_at_home:
         raise UsageError(
-            f"{config.name}: has no zero to be set: only drives with `driver: {{zero: at_home}}`, whose encoders count "
+            f"{config.name}: needs no home: only drives with `driver: {{zero: at_home}}`, whose encoders count "
             "from where they were when power came, need one"
         )
     chain = arm_model(config).chain
@@ -287,7 +286,7 @@ def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm:
     with ControlFile.take(control_path(state, config.name), None):
         typed = confirm(f"type the arm's name, {config.name}, if it stands in this posture and at rest:")
         if typed.strip() != config.name:
-            raise MotionRefused(f"{config.name}: not zeroed: the arm's name was not typed; nothing has changed")
+            raise MotionRefused(f"{config.name}: home not set: the arm's name was not typed; nothing has changed")
         # Removed before zeroing: a ticket that outlived it would be for another zero.
         existed = ticket.exists()
         ticket.unlink(missing_ok=True)

@@ -1,1 +1,1 @@
-"""Check an arm that stands on its support before it may move; the findings are a ticket."""
+"""Check a supported arm before it may move; the result is a ticket."""

@@ -41,9 +41,11 @@ LEAST_ANSWER = 1.0 / (2.0 * INERTIA[1])  # and how much less, where the model kn
 # Rotors by data sheet are the least that is there: of the shipped WAM's wrist, a fifth of what is.
 LEAST_DESCRIBED = 0.1
 ODD_ANSWER = 0.5  # below which an answer is reported, although a joint with an unknown inertia may give it
-_NEAREST = "answer to torque, the nearest within its doubt"
+_NEAREST = "response to torque, closest value within its uncertainty"
 # Behind an inertia that is missing in the model even a healthy joint answers with next to nothing.
-_NEAREST_LOOSELY = "answer to torque (too low a scale cannot be judged until the prior has the drive inertia)"
+_NEAREST_LOOSELY = (
+    "response to torque (a scale that is too low cannot be detected until the prior has the drive inertia)"
+)
 _DOUBT = 3.0  # standard deviations
 _EXPLAINS = 0.5  # of what is unexplained must remain at most when a wrong sign is put right
 _LEAST_CYCLES = 8
@@ -117,7 +119,7 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
         if only not in (None, joint):
             continue
         if (free := _free_stroke(session.home, joint, collision, slow, model.config.workspace.clearance)) is None:
-            raise MotionRefused(f"{name}: no room to move by {min(np.abs(AMPLITUDES)):g} either way")
+            raise MotionRefused(f"{name}: no room to move by at least {min(np.abs(AMPLITUDES)):g} either way")
         found.append(free)
     return found
 
@@ -269,7 +271,7 @@ def direction_check(
         *measures("displacement, measured against commanded", follows, ones, names,
                   least=np.where(known > 0.0, FOLLOWS[0], FOLLOWS_LOOSELY[0]),
                   most=np.where(known > 0.0, FOLLOWS[1], FOLLOWS_LOOSELY[1])),
-        *measures("answer to torque, measured against the model", response, ones, names),
+        *measures("response to torque, measured over predicted", response, ones, names),
         *(replace(one, what=_NEAREST if drive > 0.0 else _NEAREST_LOOSELY) for one, drive in zip(
             measures(_NEAREST, judged_at, ones, names, least=least, most=most), known + said, strict=True)),
     ]  # fmt: skip
@@ -277,7 +279,7 @@ def direction_check(
     found = [one for one in found if one.value is not None or one.what.startswith("displacement")]
     found += delay_measures(delays, model, session.period)
     told = [
-        f"{name} answers torque {value:.2g} times as the model expects: a gear ratio configured twice too large gives "
+        f"{name} responds to torque {value:.2g} times as the model expects: a gear ratio twice too large gives "
         f"0.25, half of the torque 0.5, rotors heavier than described less than 1"
         for name, value, sure in zip(names, response, np.abs(response) + _DOUBT * doubt, strict=True)
         if sure < ODD_ANSWER
@@ -286,11 +288,11 @@ def direction_check(
         "direction",
         found,
         "Check this joint's gear ratio, encoder steps per turn and torque constant in the driver's configuration, and "
-        "that no brake and nothing else holds it; a joint that answers too little may lack drive inertia in the prior. "
-        "A hidden delay is in the drive's filters or its interpolation, or belongs into identification.delay.",
+        "that no brake and nothing else holds it; a joint that responds too little may lack drive inertia in the prior."
+        " A hidden delay is in the drive's filters or its interpolation, or belongs into identification.delay.",
     )
     if told and check.verdict is Verdict.PASSED:
-        return replace(check, reason="; ".join([*told, "`ident check ARM --scale` tells which"]))
+        return replace(check, reason="; ".join([*told, "`ident preflight ARM --scale` tells which"]))
     return check
 
 

@@ -44,7 +44,7 @@ def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | 
         return None
     return failed(
         "gravity",
-        "holding takes more than the drives have to spare: " + "; ".join(str(one) for one in found if not one.kept),
+        "holding the arm takes too much of the torque limits: " + "; ".join(str(one) for one in found if not one.kept),
         "Support the arm in a posture that takes less torque, then check again.",
         found,
     )
@@ -83,7 +83,7 @@ def gravity_check(
     force = joint_units(model.chain.revolute, "N m", "N")
     difference, most = differences(held, gravity, limits, friction)
     found = [
-        *measures("torque that holds", held, force, names),
+        *measures("holding torque", held, force, names),
         *measures("gravity torque of the model", gravity, force, names),
         *measures("difference", difference, force, names, most=most),
     ]
@@ -132,7 +132,7 @@ def diagnose_holding(
             )
             if abs(more) > most_more
         )
-        return failed("gravity", f"{weight}: {joints}; the guard let it go ({error.code})", REMEDY)
+        return failed("gravity", f"{weight}: {joints}; the safety monitor released it ({error.code})", REMEDY)
     if remedy is not None:
         return failed("gravity", str(error), remedy)
     return failed("gravity", f"the arm could not be held where it stands: {error}", f"{REMEDY} {_SIGNS}")

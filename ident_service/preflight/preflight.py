@@ -98,14 +98,15 @@ def preflight(
     look_seconds: float = LOOK,
     rate_seconds: float = 0.0,
     closed: LastPosition | None = None,
+    announce: Callable[[str], None] = lambda action: None,
 ) -> Ticket:
     """Check an arm and a motion.
 
     Args:
         arm: not open; it stands on its support, without torque.
         model: of the arm.
-        excitation: to be run; None to check the arm for a way home or out of a limit, which may begin a little outside
-            the position limits.
+        excitation: to be run; None for the path home or out of a limit, which may begin a little outside the
+            position limits.
         confirm: shows a question and returns what a person typed; asked once, before anything is energised.
         clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
         identities: of the drives, as an earlier ticket has them; None accepts whatever answers.
@@ -114,12 +115,13 @@ def preflight(
         look_seconds: how long rate and noise are measured.
         rate_seconds: how long the rate is measured with the torque that holds the arm, at least for `HOLD`.
         closed: where the arm stood when it was closed last, where that is known.
+        announce: called with what a person has to do before the arm can be enabled, and is waited for.
 
     Returns:
         The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
     """
     clock = RealClock() if clock is None else clock
-    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds, closed)
+    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds, closed, announce)
     flight.run()
     subject = subject_of(model, excitation, flight.described)
     return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
@@ -158,7 +160,9 @@ class _Preflight:
         look_seconds: float,
         rate_seconds: float,
         closed: LastPosition | None,
+        announce: Callable[[str], None],
     ) -> None:
+        self.announce = announce
         self.arm, self.model, self.excitation = arm, model, excitation
         self.confirm, self.identities, self.tell = confirm, identities, tell
         self.look_seconds, self.rate_seconds, self.closed = look_seconds, rate_seconds, closed
@@ -168,7 +172,7 @@ class _Preflight:
 
     def run(self) -> None:
         """Make every check that can be made safely."""
-        if not self._passed(configuration_check(self.model)):
+        if not self._passed(configuration_check(self.model, self.arm.bus_budget())):
             return
         limits = motion_limits(self.model.config)
         motion = self.excitation
@@ -197,10 +201,10 @@ class _Preflight:
     def all_checks(self) -> list[Check]:
         """Return every check; those that were not made name the one that failed."""
         because = next((code for code, check in self.checks.items() if check.verdict is Verdict.FAILED), None)
-        why = "nothing before it failed, but it was not reached" if because is None else f"because {because} failed"
+        why = "not reached, although nothing failed before" if because is None else f"because {because} failed"
         made = dict(self.checks)
         if self.excitation is None:
-            made |= {code: skipped(code, "no motion is asked about") for code in ("motion_fits", "motion_proven")}
+            made |= {code: skipped(code, "no motion was given") for code in ("motion_fits", "motion_proven")}
         return [made.get(code) or skipped(code, why) for code in CODES]
 
     def _opened(self, limits: MotionLimits) -> None:
@@ -228,13 +232,13 @@ class _Preflight:
         self._touched(session, planned, _Gravity(session.gravity, limits, friction), try_watchdog=agreed.given)
 
     def _bounds(self, limits: MotionLimits) -> MotionLimits:
-        """Return where the run may begin: inside the limits, or for a way home as far outside as `reachable` allows."""
+        """Return where the run may begin: inside the limits; for the path home as far outside as `reachable` allows."""
         return limits if self.excitation is not None else recoverable_limits(limits)
 
     def _agreed(self, looked: IdleRecording, limits: MotionLimits) -> Consent | None:
         """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
         if self.described is None or not self._passed(
-            identities_check(self.described, self.model, limits, self.identities, looked)
+            identities_check(self.described, self.model, limits, self.identities, looked, self.arm.setup_checks())
         ):
             return None
         if not self._passed(at_rest_check(looked, self.model, self._bounds(limits), self.closed)):
@@ -280,7 +284,7 @@ class _Preflight:
         moved: list[tuple[Rows, Rows]] = []
         silent: Check | None = None
         try:
-            session.energise()
+            self._energise(session)
             held = session.follow(hold(session.home), weight.SETTLE + max(weight.HOLD, self.rate_seconds))
             if planned and gravity.carried_by(weight.holding_torque(held, session.period)):
                 moved += (follow_stroke(session, one) for one in planned)
@@ -302,6 +306,12 @@ class _Preflight:
             silent = self._silent_in_motion(silent)
         if silent is not None:
             self._passed(silent)
+
+    def _energise(self, session: Session) -> None:
+        """Enable the arm; where a person does it, say so, and see that the arm still stands where it stood."""
+        if action := self.arm.operator_action:
+            self.announce(action)
+        session.energise()
 
     def _silent_in_motion(self, at_rest: Check) -> Check:
         """Fall silent again, in the middle of a small motion of one joint; returns both watchdog checks in one."""
@@ -325,7 +335,7 @@ class _Preflight:
                 session = Session(self.arm, self.model, limits, described, home, friction)
                 room = relaxed_limits(home, motion_limits(self.model.config), 0.0)
                 stroke = strokes(session, self.model, room, only=0)[0]
-            session.energise()
+            self._energise(session)
             session.follow(hold(home), weight.SETTLE)
             half = DWELL + 0.5 * stroke.there.duration
             session.follow(stroke, half)
@@ -395,14 +405,14 @@ class _Preflight:
             self._passed(sign_failure([astray], self.model, str(error)))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
-            self._passed(failed("direction", f"{name} went astray: {error}", remedy))
+            self._passed(failed("direction", f"{name} left the path: {error}", remedy))
 
     def _broken(self, error: ArmError) -> None:
         """Record a failed check for an arm that could not be opened, recorded or energised, or that fell silent."""
         if self.described is None or "identities" not in self.checks:
             self._passed(unreachable(error))
         else:
-            # None about the motion: a way home may begin although one of them failed. The last where all are made.
+            # None about the motion: the path home may begin although one of them failed. The last where all are made.
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
             code = next(left, CODES[-1])
             remedy = "Check power, cables, bus and the drives' own fault codes."

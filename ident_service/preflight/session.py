@@ -31,6 +31,7 @@ from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Elapsed
+from ident_service.motion.run import MOVED
 from ident_service.motion.safety_monitor import Reaction, SafetyMonitor
 from ident_service.motion.trajectory import Reference, Setpoint
 from ident_service.preflight.stability import INERTIA, known_drives
@@ -95,6 +96,7 @@ BAND = 0.25  # of the torque limit, beside the model's gravity torque and expect
 _CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
 MISSING = 2  # cycles in a row without its position, after which a joint's drive may have left on purpose
 RELEASE = 0.5  # s over which torque is led to zero
+MOVED_CODE = "moved_before_enabled"
 SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and torque is taken off at once
 
 Rows = Sequence[tuple[Sample, Setpoint]]
@@ -228,10 +230,17 @@ class Session:
         """Enable the arm; the first cycle of `follow` sends the target that holds it.
 
         Raises:
+            ArmFault: a person enabled the arm, and it had been moved meanwhile; it is without torque again.
             DriverError: the drives refuse.
         """
+        waits = bool(self._arm.operator_action)
         self._arm.enable()
         self._target = self._passed(self.home) if self.gives_positions else self._limited(self.gravity)
+        if waits:
+            sample = self.exchange()
+            if not bool((np.abs(sample.position - self.home) <= MOVED).all()):
+                self._arm.stop(StopKind.TORQUE_OFF)
+                raise ArmFault(MOVED_CODE, "the arm was moved while a person was waited for; check again", [sample])
 
     def follow(
         self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None

@@ -30,7 +30,9 @@ _WORDS = {
     "rpdo_timer": "torque frames",
     "torque_frames": "torque frames",
     "sync_loss": "SYNC",
+    "bus_silence": "requests and torques",
 }
+_BLIND = ("sync_loss", "bus_silence")  # without these no position comes
 _ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
 _LATER = 2.0  # times the configured time, plus some cycles and the report's delay, until a drive must have reported
 _CYCLES = 10
@@ -64,8 +66,8 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
         confirm: shows a question and returns what the person typed.
     """
     if not sample.status:
-        why = "the driver does not tell what the drives do, so their watchdog cannot be seen to act"
-        return Consent(False, skipped(CODE, why, "Prove it by hand: pull the bus cable while the arm is supported."))
+        why = "the driver does not report drive states, so the watchdogs cannot be tested"
+        return Consent(False, skipped(CODE, why, "Test it by hand: pull the bus cable while the arm is supported."))
     name = model.config.name
     typed = confirm(
         f"The drives' own watchdog is tried at the end, at rest and in a small motion: they hear no more of what "
@@ -82,9 +84,8 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
 
 def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
     """Return the signal that each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
-    seconds = getattr(model.config.driver, "watchdog", None)
-    most = float(seconds) if isinstance(seconds, int | float) else None
-    return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", most) for name in model.chain.names)
+    seconds = arm.describe().watchdog
+    return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", seconds) for name in model.chain.names)
 
 
 def watchdog_check(
@@ -98,7 +99,7 @@ def watchdog_check(
 
     Args:
         arm: enabled, held by `session`.
-        model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
+        model: for names.
         session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
         setpoint_at: where the joints that are held should be, by the time since the silence began [s].
         moving: number of the joint that moves, whose travel is measured; None at standstill.
@@ -108,7 +109,7 @@ def watchdog_check(
     """
     period = session.period
     dogs = watchdogs_of(arm, model)
-    told = float(getattr(model.config.driver, "report_delay", 0.0))
+    told = arm.describe().report_delay
     where = "at rest" if moving is None else "in motion"
     gave_up: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
@@ -139,10 +140,12 @@ def watchdog_check(
                         continue
                     gave_up[number] = silent, word
                     if number not in watched:
-                        strange.append(f"{dogs[number].drive} stopped when {_WORDS[kind]} stayed away, not by its own")
+                        strange.append(
+                            f"{dogs[number].drive} stopped when {_WORDS[kind]} was missing, not because of its own"
+                        )
                 if strange:
                     break
-                if kind == "sync_loss":
+                if kind in _BLIND:
                     session.wait_in_silence()
                 else:
                     setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)
@@ -154,7 +157,7 @@ def watchdog_check(
         travel = _travel(arm, at, moving) if moving is not None else None
     except ArmFault as ended:
         why = f"{where}, while drives missed {_WORDS[kind]} and before all had said that they stopped: {ended}"
-        return failed(CODE, f"{why}; the arm was let go", REMEDY)
+        return failed(CODE, f"{why}; the arm was released", REMEDY)
     finally:
         arm.stop(StopKind.TORQUE_OFF)
     found = []
@@ -165,10 +168,10 @@ def watchdog_check(
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
         if fault:
-            strange.append(f"{dog.drive} gave up for another reason ({word!r})")
+            strange.append(f"{dog.drive} stopped for another reason ({word!r})")
     if moving is not None and travel is not None:
         unit = "rad" if model.chain.revolute[moving] else "m"
-        found.append(measure("in motion, way until it rests", travel, unit, joint=model.chain.names[moving]))
+        found.append(measure("in motion, distance until at rest", travel, unit, joint=model.chain.names[moving]))
     return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
 
 

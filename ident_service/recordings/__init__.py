@@ -1,1 +1,1 @@
-"""Write recordings while the arm moves, and read them back one block at a time, whatever file they lie in."""
+"""Record runs through a ring in shared memory to MCAP, and read MCAP and CSV recordings block by block."""

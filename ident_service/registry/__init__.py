@@ -1,4 +1,5 @@
 """Store arms, jobs, runs, acceptances, tokens and the audit trail of the service in one SQLite file.
 
-Folders stay the truth about results: `runs.index_runs` and `acceptances` can rebuild their tables from them.
+Folders remain the primary store of results; `registry.runs` and `operations.acceptance` can rebuild their tables
+from them.
 """

@@ -83,7 +83,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
     """
     row = db.row("SELECT * FROM arms WHERE name = ?", name)
     if row is None:
-        raise UnknownId(f"no arm {name!r} is known; the list of arms names them")
+        raise UnknownId(f"no arm {name!r} is known; see the list of arms")
     path = shipped_arms().get(name) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
     if path is None:
         raise UsageError(f"the arm {name!r} was shipped with other software than this; upload its description")
@@ -91,7 +91,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
         config = load_arm(path)
     except (ConfigError, UsageError):
         if db.row("SELECT 1 FROM arms WHERE name = ?", name) is None:  # deleted meanwhile
-            raise UnknownId(f"no arm {name!r} is known; the list of arms names them") from None
+            raise UnknownId(f"no arm {name!r} is known; see the list of arms") from None
         raise
     if row["sha256"] != config.sha256:
         db.write(

@@ -283,14 +283,14 @@ def shortage(path: Path, error: BaseException) -> RegistryBusy | DiskFull | None
     """
     code = _primary(error)
     if code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
-        return RegistryBusy(f"{path}: another process keeps the registry; nothing is lost, ask again when it is done")
+        return RegistryBusy(f"{path}: another process has locked the registry; nothing is lost, try again later")
     full = code == sqlite3.SQLITE_FULL or getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT)
     if code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN) and not full:
         with suppress(OSError):
             disk = os.statvfs(path.parent)
             full = disk.f_bavail * disk.f_frsize < _WANTED or 0 == disk.f_favail < disk.f_files
     if full:
-        return DiskFull(f"{path.parent}: its disk is full; make room, then ask again")
+        return DiskFull(f"{path.parent}: its disk is full; free disk space, then try again")
     return None
 
 

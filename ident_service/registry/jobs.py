@@ -55,7 +55,7 @@ def known_job(db: Database, job: str) -> Row:
     """
     row = db.row("SELECT * FROM jobs WHERE id = ?", job)
     if row is None:
-        raise UnknownId(f"no job {job!r} is known; the list of jobs names them")
+        raise UnknownId(f"no job {job!r} is known; see the list of jobs")
     return _read(row)
 
 

@@ -71,7 +71,7 @@ def known_motion(db: Database, motion: str) -> Row:
     """
     row = db.row("SELECT * FROM motions WHERE id = ?", motion)
     if row is None:
-        raise UnknownId(f"no motion {motion!r} is known; the list of motions names them")
+        raise UnknownId(f"no motion {motion!r} is known; see the list of motions")
     return row
 
 

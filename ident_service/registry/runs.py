@@ -103,7 +103,7 @@ def known_run(db: Database, run: str) -> Row:
     """
     row = db.row("SELECT * FROM runs WHERE id = ?", run)
     if row is None:
-        raise UnknownId(f"no run {run!r} is known; the list of runs names them")
+        raise UnknownId(f"no run {run!r} is known; see the list of runs")
     return row
 
 

@@ -1,4 +1,4 @@
-"""Read and write results: parameter file, exports, report and run folder."""
+"""Read and write results: parameter file, manifest, report, comparison and exports."""
 
 from __future__ import annotations
 

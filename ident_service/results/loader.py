@@ -20,8 +20,8 @@ def dynamic_model(path: Path, arm: str | Path | None) -> DynamicModel:
     found = _identified(path, arm)
     if found.delta is None:
         raise ModelError(
-            f"{path}: no body has these parameters, so there is no model; `ident correct` gives the nearest ones that "
-            "a body has"
+            f"{path}: these parameters are not feasible, so there is no model; `ident project` gives the nearest "
+            "feasible ones"
         )
     return DynamicModel(found.model, found.delta)
 
@@ -34,7 +34,7 @@ def _identified(path: Path, arm: str | Path | None) -> IdentifiedArm:
     named = parameters.content.get("arm", {})
     beside = file.parent / ARM
     if arm is None and not beside.is_file():
-        raise UsageError(f"{file}: there is no {ARM} beside it; say which arm it is for")
+        raise UsageError(f"{file}: there is no {ARM} beside it; name its arm")
     config = arm_from_json(beside) if arm is None else load_arm(arm)
     if arm is None and named and named["sha256"] != config.sha256:
         raise ParameterError(f"{file}: was identified for another arm than {beside} describes")

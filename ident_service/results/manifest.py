@@ -209,8 +209,8 @@ def require_replaceable(folder: Path) -> None:
         return
     told = ", ".join(others[:_TOLD]) + (f" and {len(others) - _TOLD} more" if len(others) > _TOLD else "")
     raise UsageError(
-        f"{folder}: holds what is not of an earlier result: {told}; give a folder that does not exist, or move that"
-        " elsewhere"
+        f"{folder}: holds files that are not of an earlier result: {told}; give a folder that does not exist, or move "
+        "them elsewhere"
     )
 
 

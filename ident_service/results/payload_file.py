@@ -29,11 +29,11 @@ from ident_service.results.summary import rows_and_filter, wrapped
 
 _WORDS: Mapping[Word, tuple[str, str]] = {
     "none": ("NO PAYLOAD", "the arm moves as it was identified"),
-    "added": ("ADDED", "a body moves with the last link that the arm was identified without"),
-    "removed": ("REMOVED", "a body has gone from the last link that the arm was identified with"),
+    "added": ("ADDED", "a body was added to the last link"),
+    "removed": ("REMOVED", "a body was removed from the last link"),
     "infeasible": (
         "INFEASIBLE",
-        "no single body, put on or taken off, explains the recording; after a change of tools identify the arm again, "
+        "no single added or removed body explains the recording; after a change of tools identify the arm again, "
         "or compare: friction or the arm itself may have changed (`ident compare`)",
     ),
 }
@@ -130,13 +130,13 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
         f"{word}: {meaning}",
         f"against no payload: {test.sigma:.3g} sigma in {test.directions} directions, p = {test.p:.2g}",
         f"torque error on all rows of the recording: {payload.without.relative_percent:.3f} % with the arm as "
-        f"identified, {payload.fitted.relative_percent:.3f} % with what was found (eq. 84)",
+        f"identified, {payload.fitted.relative_percent:.3f} % with the payload (eq. 84)",
     ]
     if payload.excess is not None and (far := payload.far()):
         worst = max(far, key=lambda joint: payload.excess[joint])  # type: ignore[index]
         lines.append(
-            f"what is left is {payload.excess[worst]:.0f} times as large at joint {names[worst]} as when the arm was "
-            "identified: friction, the arm or the recording has changed in what no body explains"
+            f"the residual is {payload.excess[worst]:.0f} times as large at joint {names[worst]} as when the arm was "
+            "identified: friction, the arm or the recording has changed in a way that no body explains"
         )
     lines += [
         f"  joint {name}: {share:.2%} of its torque" for name, share in zip(names, payload.torque_share, strict=True)
@@ -155,7 +155,7 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
     ]
     shown = {name for row in payload.base.K for name, value in zip(payload.base.names, row, strict=True) if value}
     if hidden := [name for name in payload.base.names if name not in shown]:
-        lines.append(f"  no motion of this arm shows: {' '.join(hidden)}")
+        lines.append(f"  not excited by any motion of this arm: {' '.join(hidden)}")
     if (center := center_of_mass(payload)) is not None and payload.verdict in ("added", "removed"):
         point = ", ".join(f"{value:.4g} +- {sigma:.2g}" for value, sigma in zip(*center, strict=True))
         lines.append(f"  centre of mass [m]: {point}")
@@ -163,8 +163,8 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
         worst = int(np.argmax(payload.body.torque_share))
         lines += [
             "",
-            f"the nearest real body (values that no motion shows: the smallest), p = {payload.body.p:.2g}, at most "
-            f"{payload.body.torque_share[worst]:.2%} of the torque of joint {names[worst]} away",
+            f"the nearest physical body (values that no motion determines: the smallest), p = {payload.body.p:.2g}, at "
+            f"most {payload.body.torque_share[worst]:.2%} of the torque of joint {names[worst]} away",
         ]
         body = zip(payload.base.names, rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
         lines.append("  " + "  ".join(f"{name} {value:.4g}" for name, value in body))

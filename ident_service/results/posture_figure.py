@@ -288,7 +288,7 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
         )  # fmt: skip
         canvas.text("ink strong", left, _TOP - 8, name, size=12.5)
         _view(canvas, axes, view, postures, shown)
-    about = f"Side and top view of an arm in {len(shown)} postures of its motion, with its tool's way."
+    about = f"Side and top view of an arm in {len(shown)} postures of its motion, with the path of its tool."
     names = ", ".join(obstacle.name for obstacle in postures.obstacles)
     about += f" Obstacles: {names}." if names else ""
     return canvas.svg(title, about + (f" {words}." if words else ""))

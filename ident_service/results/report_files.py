@@ -70,7 +70,7 @@ def read_reported(folder: Path) -> Results:
     if folder.is_file():
         raise UsageError(f"{folder}: is a file; give its folder")
     if (folder / _PAYLOAD).is_file() and not (folder / EVIDENCE).is_file():
-        found = f"{_COMPARISON} shows it" if (folder / _COMPARISON).is_file() else "payload.txt tells of it"
+        found = f"{_COMPARISON} shows it" if (folder / _COMPARISON).is_file() else "see payload.txt"
         raise UsageError(f"{folder}: holds a payload, which has no report; {found}")
     return read_results(folder)
 

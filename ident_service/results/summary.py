@@ -70,13 +70,13 @@ def how_fitted(estimate: Estimate) -> tuple[str, ...]:
 def _noise_and_model(estimate: Estimate) -> str:
     """Describe how much of the deviations is noise and how much error of the model, as far as repetitions tell."""
     if estimate.noise_deviations is None:
-        return "Most of the motion is not repeated, so that noise and error of the model cannot be told apart."
+        return "Most of the motion is not repeated, so noise and model error cannot be separated."
     variances = np.diag(estimate.covariance)
     known = np.isfinite(variances) & (variances > 0.0)
     share = np.clip(estimate.noise_deviations[known] ** 2 / variances[known], 0.0, 1.0)
     return (
         f"The motion is repeated: {np.median(share):.0%} of a parameter's variance is noise (median; "
-        f"{share.min():.0%} to {share.max():.0%}), the rest is error of the model, which more periods do not diminish."
+        f"{share.min():.0%} to {share.max():.0%}), the rest is model error, which more periods do not reduce."
     )
 
 
@@ -94,8 +94,8 @@ _REACH = 1.0 / 3.0  # of the arm's, from a likely centre, or the link's own leng
 _SIZE, _TIMES = 0.5, 3.0  # of the arm's reach, and times a likely size
 
 WHAT_THEN = (
-    "Link values are chosen among bodies that move alike: torques are right all the same, but do not take these for the"
-    " arm's. Bounds in joints.*.body and constraints.total_mass, or a prior, tell more."
+    "Link values are one choice of many with the same torques, and these are not the arm's. Bounds in joints.*.body and"
+    " constraints.total_mass, or a prior, improve the choice."
 )
 
 
@@ -176,7 +176,7 @@ def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "com
         ", ".join(f"{count} {word}" for word, count in counts.items())
         + f" (standard deviation below {IDENTIFIED_BELOW:.0%} of the parameter, below {WEAK_BELOW:.0%}, above;",
         f"  or below {NEGLIGIBLE_TORQUE * IDENTIFIED_BELOW:.0%}, {NEGLIGIBLE_TORQUE * WEAK_BELOW:.0%} of the torque of"
-        " every joint that feels it; widened by Student's t where few stretches of motion tell it)",
+        " every joint concerned; widened by Student's t where few stretches of motion determine it)",
     ]
     doubtful = [i for i, verdict in enumerate(estimate.verdicts) if verdict != "identified"]
     for i in doubtful:
@@ -210,7 +210,7 @@ def _found_before(estimate: Estimate) -> list[str]:
         lines.append(f"torque is stamped {seconds:.3f} +- {deviation:.3f} ms later than the position")
     presliding = np.atleast_1d(np.asarray(model.config.identification.friction.presliding, dtype=float))
     if presliding.any():
-        lines.append("pre-sliding way [rad or m]: " + " ".join(f"{value:.2g}" for value in presliding))
+        lines.append("pre-sliding distance [rad or m]: " + " ".join(f"{value:.2g}" for value in presliding))
     if model.layout.stribeck_velocity:
         velocities = " ".join(
             f"{value:.2g}" if value > NO_STRIBECK else "none" for value in model.layout.stribeck_velocity
@@ -219,7 +219,7 @@ def _found_before(estimate: Estimate) -> list[str]:
     if (prepared.torque_scales != 1.0).any():
         lines.append("measured torques multiplied by: " + " ".join(f"{value:.4g}" for value in prepared.torque_scales))
     if estimate.prior is not None:
-        lines.append(f"drawn to the {estimate.prior.kind} prior with weight {estimate.prior.weight:g}")
+        lines.append(f"regularised towards the {estimate.prior.kind} prior with weight {estimate.prior.weight:g}")
     return ["", *lines] if lines else []
 
 
@@ -241,15 +241,15 @@ def parameter_table(estimate: Estimate) -> str:
 def _feasibility(estimate: Estimate) -> str:
     kind = estimate.conditions.kind
     if estimate.feasible:
-        text = f"feasible ({kind}): margin {estimate.margin:.3g}, a real body could have these parameters\n"
+        text = f"feasible ({kind}): margin {estimate.margin:.3g}, physically feasible\n"
         of_many = "" if estimate.nearest_to is None else f", the nearest to {IN_WORDS[estimate.nearest_to]}"
         text += f"(motion shows base parameters only; the link values behind them are one body of many{of_many})"
         if strange := implausible_links(estimate):
             text += "\n" + "\n".join(wrapped([f"implausible, {line}" for line in strange] + [WHAT_THEN]))
         if estimate.tight:
-            text += "\nthe data pull against:\n" + "\n".join(f"  {name}" for name in estimate.tight)
+            text += "\nactive constraints:\n" + "\n".join(f"  {name}" for name in estimate.tight)
         return text
-    text = f"INFEASIBLE ({kind}): margin {estimate.margin:.3g}; no body has these parameters\ncontradicted by:\n"
+    text = f"INFEASIBLE ({kind}): margin {estimate.margin:.3g}; not physically feasible\nviolated constraints:\n"
     return text + "\n".join(f"  {name}" for name in estimate.tight)
 
 
@@ -262,7 +262,7 @@ def _convex(estimate: Estimate) -> list[str]:
             "",
             f"with {function.name} ({function.file}) by {known.solver}: torque error {known.error:.4f} % where joints "
             f"move, {known.error_without:.4f} % without it",
-            "(verdict, margin and certificate are about the other conditions of the description alone)",
+            "(verdict, margin and certificate are about the other constraints of the description alone)",
         ]
     if (second := estimate.second) is not None:
         one, other = second.objectives
@@ -270,9 +270,9 @@ def _convex(estimate: Estimate) -> list[str]:
         if second.agrees:
             word = "the two agree"
         elif second.conclusive:
-            word = "THE TWO DIFFER, use neither before you know why"
+            word = "THE TWO DIFFER: use neither before the reason is known"
         else:
-            word = f"it stopped early, which says little; try another --solver than {second_by}"
+            word = f"it stopped early; try another --solver than {second_by}"
         lines += [
             "",
             f"second opinion, {second_by} through cvxpy ({second.status}): " + word,

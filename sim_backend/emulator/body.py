@@ -51,12 +51,17 @@ class Gears:
         self.ratios: Vector = np.array(transmission.ratios)
         self.matrix: Vector = self.ratios[:, None] * coupling
         self._offsets: Vector = np.zeros(joints) if transmission.offsets is None else np.array(transmission.offsets)
+        self._inverse = np.linalg.inv(self.matrix)
         self.ratios.setflags(write=False)
         self.matrix.setflags(write=False)
 
     def motor_position(self, position: Vector) -> Vector:
         """Return the motor angles [rad] of joint positions [rad or m], shape (motors,)."""
         return np.asarray(self.matrix @ (position - self._offsets))
+
+    def joint_position(self, angle: Vector) -> Vector:
+        """Return the joint positions [rad or m] of motor angles [rad], shape (joints,)."""
+        return np.asarray(self._inverse @ angle + self._offsets)
 
     def motor_velocity(self, velocity: Vector) -> Vector:
         """Return the motor speeds [rad/s] of joint velocities [rad/s or m/s], shape (motors,)."""

@@ -21,16 +21,16 @@ from sim_backend.emulator.motor import Defects
 PUCK_FAULTS: dict[str, FaultRule] = {
     "lost_feedback": FaultRule("position frames do not come"),
     "delayed_feedback": FaultRule("position frames come late", "delay [s]", stays=True),
-    "hidden_delay": FaultRule("old positions, as if they were fresh", "delay [s]", stays=True),
+    "hidden_delay": FaultRule("old positions are sent as new", "delay [s]", stays=True),
     "encoder_jump": FaultRule("size added to the position", "[rad or m at the joint]"),
     "encoder_offset": FaultRule("size added to the position for good", "[rad or m at the joint]", stays=True),
-    "frozen_encoder": FaultRule("the last position again, as if it were fresh"),
+    "frozen_encoder": FaultRule("the last position is sent again as new"),
     "position_sign": FaultRule("the encoder counts the wrong way", stays=True),
     "stuck_torque": FaultRule("the power stage goes on with what it does"),
     "torque_sign": FaultRule("the opposite torque acts, and the drive does not say so", stays=True),
     "torque_saturation": FaultRule("torque held below the limit; the drive says so", "share of the limit", stays=True),
     "torque_fraction": FaultRule(
-        "this share of what it is told; only the torque that it measures says so", "share of the torque", stays=True
+        "this share of the commanded torque acts; only the measured torque shows it", "share of the torque", stays=True
     ),
     "drive_fault": FaultRule("the power stage fails: emergency message, fault, the motor coasts", stays=True),
     "node_silent": FaultRule("no frames, and no power for the motor; the node boots when the fault ends", stays=True),
@@ -40,13 +40,13 @@ PUCK_FAULTS: dict[str, FaultRule] = {
     # Only drives on a bus can have these.
     "emergency": FaultRule("emergency message and the drive's own fault reaction", "error code, such as 0x4310"),
     "warning": FaultRule("the warning bit of the status", stays=True),
-    "watchdog_ignored": FaultRule("it goes on, although its host is gone", stays=True),
+    "watchdog_ignored": FaultRule("it goes on although its host is gone", stays=True),
     "heartbeat_lost": FaultRule("no heartbeat, while everything else goes on", stays=True),
     "reboot": FaultRule("the node's firmware starts again"),
     "wrong_node": FaultRule("a second node sends position frames under the same identifier", stays=True),
     "short_frame": FaultRule("position frames lack their last byte"),
-    "bus_off": FaultRule("the host hears of bus-off, no frame gets through", of_joint=False, stays=True),
-    "error_passive": FaultRule("the host's controller tells of error passive", of_joint=False),
+    "bus_off": FaultRule("the host's controller reports bus-off, no frame gets through", of_joint=False, stays=True),
+    "error_passive": FaultRule("the host's controller reports error passive", of_joint=False),
 }
 _NO_COUNTERPART = {
     "nan_position": "an encoder's count is always a number",

@@ -17,6 +17,7 @@ from ident_service.config.load import disagreements, load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.ticket import Verdict
 from ident_service.preflight.static_checks import configuration_check, stability_check
 
@@ -99,9 +100,10 @@ def test_config_check_says_the_load_or_refuses_it(arms: Path, capsys: pytest.Cap
 
 
 def test_preflight_refuses_what_is_over_budget(arms: Path) -> None:
-    good = configuration_check(arm_model(load_arm(arms / "wam7_canopen.yaml")))
+    fits, over = load_arm(arms / "wam7_canopen.yaml"), load_arm(extended(arms, "torque_frames: single"))
+    good = configuration_check(arm_model(fits), make_arm(fits).bus_budget())
     assert good.verdict is Verdict.PASSED
-    bad = configuration_check(arm_model(load_arm(extended(arms, "torque_frames: single"))))
+    bad = configuration_check(arm_model(over), make_arm(over).bus_budget())
     assert bad.verdict is Verdict.FAILED
     assert "over budget" in bad.reason
     assert "500 Hz" in bad.remedy

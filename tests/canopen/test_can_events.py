@@ -38,7 +38,7 @@ def controller(identifier: int, detail: int = 0) -> Frame:
         ([Frame(0x082, bytes.fromhex("20 81 11 00 00 00 00 00"))], AxisEventCode.BUS_DEGRADED, "8120h CAN controller"),
         ([Frame(0x702, b"\x00")], AxisEventCode.DRIVE_RESTARTED, "has booted"),
         ([Frame(0x702, b"\x05"), Frame(0x702, b"\x7f")], AxisEventCode.DRIVE_LEFT, "pre-operational, was operational"),
-        ([status(0x1237), status(0x0237)], AxisEventCode.TORQUE_IGNORED, "does not follow its torque"),
+        ([status(0x1237), status(0x0237)], AxisEventCode.TORQUE_IGNORED, "does not follow its target torque"),
         ([status(0x0237), status(0x0A37)], AxisEventCode.TORQUE_LIMITED, "limits its torque"),
         ([status(0x0237), status(0x02B7)], AxisEventCode.DRIVE_WARNING, "warns"),
         ([Frame(0x182, b"\x00")], AxisEventCode.STRANGE_FRAME, "position frame 182h of 1 bytes instead of 4"),

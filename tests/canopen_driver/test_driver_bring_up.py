@@ -150,7 +150,7 @@ def test_an_arm_that_another_host_drives_is_left_alone(identifier: int) -> None:
         return [tap]
 
     arm = CanopenArm(weightless_config(), busy)
-    with pytest.raises(DriverError, match=f"bus bench: somebody else sends frames {identifier:03X}h.*drives this arm"):
+    with pytest.raises(DriverError, match=f"bus bench: another host sends frames {identifier:03X}h.*drives this arm"):
         arm.open()
     arm.close()
     assert bench.taps[0].sent == []
@@ -303,7 +303,7 @@ def test_a_node_that_reboots_is_told_of_and_is_enabled_only_after_opening_again(
         restarted = [event for event in told if event.code is AxisEventCode.DRIVE_RESTARTED]
         assert [(event.axis, event.words) for event in restarted] == [(1, "node 2: has booted")]
         arm.stop(StopKind.QUICK_STOP)
-        with pytest.raises(DriverError, match="slide: drive 2 has told no status word since it booted"):
+        with pytest.raises(DriverError, match="slide: drive 2 has sent no status word since it booted"):
             arm.enable()
         arm.close()
         arm.open()

@@ -235,7 +235,7 @@ def test_node_guarding_is_in_the_budget_and_heartbeats_of_guarded_drives_are_not
     config = arm_of("node_guarding", "rpdo_timer")
     assert isinstance(config.driver, CanopenDriver)
     lines = {line.name: line for line in budget(config.driver, 500.0).buses[0].lines}
-    assert lines["questions of node guarding"].cob_ids == (0x701,)
+    assert lines["requests of node guarding"].cob_ids == (0x701,)
     assert lines["heartbeats of the drives"].cob_ids == (0x702,)
     assert lines["answers to them"].per_second == pytest.approx(1.0 / 0.014)
     assert Write(Entry(0x100C, 0, Kind.U16, "x", "ms"), 20).data == Write(od.GUARD_TIME, 20).data

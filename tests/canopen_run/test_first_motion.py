@@ -47,7 +47,7 @@ def test_the_pages_pendulum_is_commissioned(tmp_path: Path, capsys: pytest.Captu
     assert main(["bus", "probe", str(arm), "--eds", str(tmp_path / "drive.eds"), *state]) == 0
     assert "can be driven, foretold by its data sheet" in capsys.readouterr().out
     assert main(["config", "check", str(arm)]) == 0
-    assert main(["check", str(arm), "--home", "--confirm", "bench", *state]) == 0, capsys.readouterr().out
-    assert main(["check", str(arm), "--confirm", "bench", *state]) == 0, capsys.readouterr().out
+    assert main(["preflight", str(arm), "--home", "--confirm", "bench", *state]) == 0, capsys.readouterr().out
+    assert main(["preflight", str(arm), "--confirm", "bench", *state]) == 0, capsys.readouterr().out
     assert main(["run", str(arm), "--out", str(run), "--can-log", *state]) == 0
     assert main(["identify", str(run / "run.mcap"), "--arm", str(arm), "--out", str(tmp_path / "result"), *state]) == 0

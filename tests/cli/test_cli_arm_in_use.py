@@ -95,7 +95,7 @@ def test_a_check_comes_after_the_faults(ident: Ident, state: Path) -> None:
     fault_file(state, "planar2").latch("lease_lost", "nobody was there")
     ended = ident("check", "planar2", "--confirm", "planar2")
     assert ended.code == 3
-    assert "`ident ack planar2 lease_lost`" in ended.err
+    assert "`ident acknowledge planar2 lease_lost`" in ended.err
     assert ident("ack", "planar2", "lease_lost").code == 0
     assert ident("check", "planar2", "--confirm", "planar2").code == 0
 
@@ -118,5 +118,5 @@ def test_a_stop_ends_a_preflight(state: Path) -> None:
         arm.exchange(np.zeros(2))
         asked.append(True)
         arm.exchange(None)
-        with pytest.raises(DriverError, match="somebody asked for a stop"):
+        with pytest.raises(DriverError, match="a stop was requested"):
             arm.exchange(np.zeros(2))

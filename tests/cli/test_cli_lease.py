@@ -44,7 +44,7 @@ def test_a_preflight_and_a_run_end_with_their_input(state: Path, tmp_path: Path)
     checks = document["ticket"]["checks"]  # type: ignore[index]
     gravity = next(check for check in checks if check["code"] == "gravity")
     assert gravity["verdict"] == "failed"
-    assert "asked for a stop" in gravity["reason"]
+    assert "a stop was requested" in gravity["reason"]
     # In virtual time silence of a program that is there is no reason to stop.
     code, document = piped(state, None, "check", arm, "--confirm", "planar2", "--lease-from-stdin")
     assert (code, document["ticket"]["verdict"]) == (0, "passed")  # type: ignore[index]
@@ -71,7 +71,10 @@ def test_no_daemon_does_what_is_the_terminals(ident: Ident) -> None:
     assert "larger than a request may be" in ended.err
     for words in (("run", "planar2", "--can-log"), ("home", "planar2", "--can-log"), ("simulate", "--out", "x")):
         ended = ident(*words, "--server", "http://127.0.0.1:1")
-        assert (ended.code, f"{words[-1] if words[-1] != 'x' else '--out'} would be lost" in ended.err) == (2, True)
+        assert (
+            ended.code,
+            f"{words[-1] if words[-1] != 'x' else '--out'} cannot be sent to a daemon" in ended.err,
+        ) == (2, True)
     ended = ident("jobs", "list")
     assert ended.code == 2
     assert "ident serve" in ended.err

@@ -68,7 +68,7 @@ def test_a_design_is_not_written_over(tmp_path: Path, ident: Ident) -> None:
 def test_a_search_without_time_says_so_and_is_no_success(tmp_path: Path, ident: Ident) -> None:
     ended = ident("design", quick_arm(tmp_path), "--seconds", 1e-9, "--workers", 1, "--out", tmp_path / "m", "--json")
     assert ended.code == 3
-    assert "before its first start was finished" in ended.json["warnings"][0]
+    assert "before its first start was complete" in ended.json["warnings"][0]
 
 
 @pytest.mark.slow

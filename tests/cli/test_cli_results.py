@@ -77,14 +77,14 @@ def test_what_is_no_folder_of_an_identification_says_what_it_is(folder: Path, id
         assert ended.code == 2
         assert ended.err == f"ident: {folder}: holds a payload, which has no report; comparison.html shows it\n"
     (folder / "comparison.html").unlink()
-    assert "payload.txt tells of it" in ident("report", folder).err
+    assert "see payload.txt" in ident("report", folder).err
 
 
 def test_a_changed_file_is_refused(folder: Path, ident: Ident) -> None:
     path = folder / "evidence.json"
     path.write_bytes(path.read_bytes()[:-100])
     ended = ident("report", folder)
-    assert ended.code == 1
+    assert ended.code == 2
     assert "evidence.json: not what the manifest names" in ended.err
 
 

@@ -82,7 +82,8 @@ def test_every_group_adds_verbs_of_its_own() -> None:
         alone = VerbList.of(type(top)(prog="ident"))
         group.add(alone)
         assert alone.commands.choices
-        assert set(alone.commands.choices) <= set(_verbs(top.format_help()))
+        listed = {sub.prog.rpartition(" ")[2] for sub in alone.commands.choices.values()} - {"rehearse"}
+        assert listed <= set(_verbs(top.format_help()))
 
 
 def _verbs(text: str) -> list[str]:

@@ -43,7 +43,7 @@ def test_simulate_prints_score_and_files(quick: Commissioned) -> None:
     assert sorted(path.name for path in quick.folder.iterdir()) == RUN_FILES
     assert f"files: {quick.folder}" in quick.out
     assert all(f"  {name}\n" in quick.out for name in RUN_FILES)
-    assert "score against the truth" in quick.out
+    assert "comparison with the true parameters" in quick.out
     assert "planar2: 13 base parameters of 28 link parameters" in quick.out
 
 
@@ -71,7 +71,7 @@ def test_identify_refuses_what_is_torn_before_its_first_sample_in_one_sentence(
     torn = tmp_path / "run.mcap.partial"
     torn.write_bytes((quick.folder / "identification.mcap").read_bytes()[:size])
     ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "found")
-    assert ended.code == 1
+    assert ended.code == 2
     assert ended.err.startswith(f"ident: {torn}: ")
     assert ended.err.count("\n") == 1
     assert not (tmp_path / "found").exists()
@@ -183,7 +183,7 @@ def test_feasible(ident: Ident, tmp_path: Path, content: dict[str, list[object]]
     words = ident("feasible", path)
     assert words.code == code
     assert words.out.startswith(f"{path}: {'feasible' if code == 0 else 'INFEASIBLE'} (pseudo_inertia), margin ")
-    assert ("contradicted by:\n  link 1: a mass distribution exists" in words.out) is (code == 3)
+    assert ("violated constraints:\n  link 1: a mass distribution exists" in words.out) is (code == 3)
     document = ident("feasible", path, "--json", "--feasible-set", "inertia").json
     assert document["feasible"] is (code == 0)
     assert document["feasible_set"] == "inertia"
@@ -317,7 +317,7 @@ def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: 
         if covariance is None:
             del table["covariance"]
         refused = correct("none.json")
-        assert refused.code == 1
+        assert refused.code == 2
         assert reason in refused.err
         assert not (tmp_path / "none.json").exists()
 

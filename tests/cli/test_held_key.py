@@ -183,17 +183,31 @@ def arm(folder: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("words", [(), ("--json",)])
-def test_without_a_terminal_a_rehearsal_needs_a_word(
+@pytest.mark.parametrize("words", [("rehearse",), ("run", "--hold-to-run"), ("run", "--hold-to-run", "--json")])
+def test_without_a_terminal_nothing_can_be_held(
     words: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["rehearse", str(arm(tmp_path)), "--state", str(tmp_path), *words]) == 2
-    assert "--no-key" in capsys.readouterr().err
+    verb, *options = words
+    assert main([verb, str(arm(tmp_path)), "--state", str(tmp_path), *options]) == 2
+    error = capsys.readouterr().err
+    assert "no terminal" in error
+    assert "`ident run --speed 0.2` (or `rehearse --no-key`)" in error
+
+
+def test_a_target_of_accuracy_is_for_a_run_without_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", str(arm(tmp_path)), "--hold-to-run", "--until", "0.05", "--state", str(tmp_path)]
+    assert main(words) == 2
+    assert "without --hold-to-run" in capsys.readouterr().err
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("words", [["run", "--hold-to-run"], ["rehearse"]])
 def test_a_rehearsal_ends_with_the_key(
-    keyboard: Keyboard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str],
+    keyboard: Keyboard,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     path, state = arm(tmp_path), ["--state", str(tmp_path / "state")]
     write_checked_ticket(load_arm(path), tmp_path / "state")
@@ -209,7 +223,7 @@ def test_a_rehearsal_ends_with_the_key(
                 hands.let_go()
 
         monkeypatch.setattr("ident_service.cli.motion_commands.tell", told)
-        assert main(["rehearse", str(path), "--out", str(tmp_path / "run"), *state]) == 1
+        assert main([*words, str(path), "--out", str(tmp_path / "run"), *state]) == 1
     assert "stopped after" in capsys.readouterr().out
     assert said[-2:] == ["stopping", "stopped"]
     assert "exciting" not in said or "returning" not in said

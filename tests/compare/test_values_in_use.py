@@ -87,7 +87,7 @@ def test_unchanged_says_that_values_in_use_predict_other_torques(
     assert code == 0
     (said,) = [line for line in out.splitlines() if line.startswith("BUT the values in use change the torque of joint")]
     assert "joint elbow by " in said
-    assert "the unconstrained values, which are tested, do not; what was made of them does" in said
+    assert "the tested unconstrained values do not: the difference comes from the feasible set" in said
     assert said in words_of(comparison)
     document = json.loads(ident("compare", accepted, path, "--json")[1])["compared"][0]
     assert document["contradiction"] == said

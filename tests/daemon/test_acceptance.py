@@ -91,7 +91,7 @@ def test_what_is_not_whole_or_not_feasible_is_not_accepted(db: Database, state: 
     document["feasibility"]["feasible"] = False
     (folder / "parameters.json").write_text(json.dumps(document))
     write_manifest(folder)
-    with pytest.raises(ParameterError, match="no body can have"):
+    with pytest.raises(ParameterError, match="are not feasible"):
         accept(db, state, folder, "good", "me")
     for note in ("", " \n", "x" * 2001):
         with pytest.raises(UsageError, match="note"):

@@ -152,7 +152,7 @@ def test_check_run_identify(daemon: Asked, arm: str) -> None:
     early = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
     ended = daemon.follow(early["id"], lease=True)
     assert (ended["state"], ended["exit_code"]) == ("refused", 3)
-    assert "`ident check`" in ended["detail"]
+    assert "`ident preflight`" in ended["detail"]
     for kind in ("check", "run"):
         job = daemon.begin({"kind": kind, "arm": ARM}, confirmed=True)
         ended = daemon.follow(job["id"], lease=True)
@@ -169,7 +169,7 @@ def test_check_run_identify(daemon: Asked, arm: str) -> None:
     assert result["feasible"] is True
     assert daemon.get(f"/api/v1/runs/{ended['run']}").json()["parameters"]["sha256"]
     log = daemon.get(f"/api/v1/jobs/{early['id']}/log").text
-    assert "not checked yet" in log
+    assert "no preflight ticket" in log
 
 
 @pytest.mark.parametrize(

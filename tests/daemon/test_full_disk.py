@@ -184,7 +184,7 @@ def test_a_verb_at_a_registry_that_is_kept_says_so(
             capsys.readouterr()
             assert main([*words, "--state", str(state)]) == 1, words
             said = capsys.readouterr().err
-            assert "another process keeps the registry" in said
+            assert "another process has locked the registry" in said
             assert "damaged" not in said
     assert main([*_TOKEN, "--state", str(state)]) == 0
 

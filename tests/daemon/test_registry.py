@@ -194,6 +194,9 @@ def test_a_refusal_says_why_in_the_jobs_own_line() -> None:
     )
     assert detail(feasible=False, unusable=[]) == "no real body can have these parameters"
     assert detail(objections=["too fast"], error=None) == "too fast"
-    assert detail(error={"kind": "MotionRefused", "message": "not checked yet"}, objections=["x"]) == "not checked yet"
+    assert (
+        detail(error={"kind": "MotionRefused", "message": "no preflight ticket"}, objections=["x"])
+        == "no preflight ticket"
+    )
     for odd in ({"ticket": 3}, {"ticket": {"checks": 3}}, {"ticket": {"checks": [3]}}, {"unusable": "x"}):
         assert detail(**odd) == ""

@@ -243,7 +243,7 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     code, _ = door(folder, {"folder": str(folder), "words": words})
     assert code == 3  # it was not checked, in the words of the command
     assert json.loads((folder / ANSWER).read_text())["error"]["kind"] == "MotionRefused"
-    assert "not checked yet" in (folder / LOG).read_text()
+    assert "no preflight ticket" in (folder / LOG).read_text()
     assert not alive((folder / PROCESS).read_text().strip())
     # And it looks at the arm, whose bus is here.
     looks = folder / "looks"

@@ -140,7 +140,7 @@ def test_a_stop_at_a_terminal_reaches_what_waits_in_the_daemon(
         daemon.service.engine.live.free = lambda live, computing: False  # type: ignore[method-assign]
         jobs = [daemon.begin({"kind": "home", "arm": arm}, confirmed=True)["id"] for arm in ("planar2", "sixaxis")]
         assert main(["stop", "planar2", "--state", str(state)]) == 0
-        assert daemon.follow(jobs[0])["detail"] == "somebody asked for a stop"
+        assert daemon.follow(jobs[0])["detail"] == "a stop was requested"
         assert rows.known_job(daemon.service.db, jobs[1])["state"] == "queued"
         assert main(["stop", "--state", str(state)]) == 0
     capsys.readouterr()
@@ -158,7 +158,7 @@ def test_acts_at_a_terminal_are_entered_under_a_name(
             assert mover.stop
     assert "not entered in the audit trail yet" in capsys.readouterr().err
     assert main(["stop", "--state", str(state)]) == 0  # nobody moves: what was wanted is so
-    assert "nobody moves an arm" in capsys.readouterr().out
+    assert "no arm is moving" in capsys.readouterr().out
     fault_file(state, "planar2").latch("late_cycle", "a cycle was late")
     assert main(["ack", "planar2", "late_cycle", "--by", "ann", "--state", str(state)]) == 0
     assert main(["token", "add", "bob", "--role", "viewer", "--by", "ann", "--state", str(state)]) == 0

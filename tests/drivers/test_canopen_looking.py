@@ -230,7 +230,7 @@ def test_it_can_do_nothing_else() -> None:
             looking.open()
         bench.sent.clear()
         for act in (looking.enable, looking.reset, lambda: looking.exchange(np.zeros(2))):
-            with pytest.raises(DriverError, match="only looked at"):
+            with pytest.raises(DriverError, match="read-only arm"):
                 act()
         for kind in StopKind:
             looking.stop(kind)

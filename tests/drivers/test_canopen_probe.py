@@ -105,7 +105,7 @@ def test_a_drive_that_is_silent_is_foretold() -> None:
     found = bus_probe(config, (), bench.links)  # type: ignore[arg-type]
     text = reported(config, found)
     assert not found.good
-    assert "foretold by its data sheet" in text
+    assert "predicted from its EDS" in text
     assert "no proper answer" in text
 
 

@@ -105,7 +105,7 @@ def test_missing_other_and_unknown_nodes() -> None:
     found = scanned(bench, wanted)
     assert [(line.node, line.match, line.why) for line in found.lines] == [
         (2, Match.OTHER, "serial is 00000005h instead of 00000006h"),
-        (3, Match.MISSING, "neither heard nor answering"),
+        (3, Match.MISSING, "silent"),
         (9, Match.UNKNOWN, ""),
     ]
     assert not found.complete

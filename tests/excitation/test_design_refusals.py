@@ -33,7 +33,7 @@ def test_a_torque_limit_below_friction() -> None:
     names, values = [*prior["names"], "fc2"], [*prior["values"], 12.5]
     model = small(prior=dict(zip(names, values, strict=True)))
     assert refusal(model, torque_margin=0.2) == (
-        "dry friction alone takes all the torque that the margin leaves: elbow: friction 12.5 against 12"
+        "dry friction alone exceeds the torque limit less the margin: elbow: friction 12.5 against 12"
     )
 
 

@@ -21,7 +21,7 @@ def test_every_file_with_link_values_says_that_they_are_one_of_many() -> None:
     arm = dataclasses.replace(arm, verdicts=verdicts)
     first, *rest = body_notes(arm)
     assert first.startswith("link values are one feasible body of many with the same torques")
-    assert "option prior of ident identify" in first
+    assert "option --prior of ident identify" in first
     assert first.endswith(f"2 of {arm.base.size} base parameters are unidentified")
     assert rest == []
     for one in export_texts(arm, LINKS):
@@ -37,7 +37,7 @@ def test_a_prior_that_was_used_is_not_recommended() -> None:
     settings = arm.model.config.identification
     settings = settings.model_copy(update={"prior": settings.prior.model_copy(update={"kind": "entropic"})})
     model = dataclasses.replace(arm.model, config=arm.model.config.model_copy(update={"identification": settings}))
-    assert "(drawn to the prior parameters)" in body_notes(dataclasses.replace(arm, model=model))[0]
+    assert "(regularised towards the prior parameters)" in body_notes(dataclasses.replace(arm, model=model))[0]
 
 
 def test_links_that_no_arm_has_are_named() -> None:

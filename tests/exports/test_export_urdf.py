@@ -186,7 +186,7 @@ def test_a_foreign_file_changes_in_inertias_and_friction_only(tmp_path: Path) ->
     text, notes = written(model, delta)
     arm = identified(model, delta)
     assert_same(torque_in_pinocchio(arm, text), torque_of(arm, states_of(model.chain), ()))
-    said = "has the identified body less what is bolted to it, which is as it was: tool, camera"
+    said = "has the identified body less the links fixed to it, which are unchanged: tool, camera"
     assert notes == (f"""link arm <1> 'a' "b" {said}""",)
     # Line by line, in the order of the file, only these differ.
     differences = list(difflib.ndiff(FOREIGN.splitlines(), text.splitlines()))
@@ -222,7 +222,7 @@ def test_bolted_links_give_their_inertia_up_where_the_rest_would_be_no_body(tmp_
     text, notes = written(model, delta)
     arm = identified(model, delta)
     assert_same(torque_in_pinocchio(arm, text), torque_of(arm, states_of(model.chain), ()))
-    assert "has the whole identified body; what is bolted to it has no inertia now: tool, camera" in notes[0]
+    assert "has the whole identified body; links fixed to it have no inertia now: tool, camera" in notes[0]
     bodies = link_bodies(text)
     assert set(bodies) == {"base", """arm <1> 'a' "b\"""", "last"}
     assert all(is_real(body) for body in bodies.values())

@@ -119,7 +119,7 @@ def test_what_no_body_has_goes_into_three_formats(
 ) -> None:
     assert code_of("export", unreal, "--format", "c,csv,json", "--out", tmp_path / "out") == 0
     assert names_in(tmp_path / "out") == ["planar2.csv", "planar2.json", "planar2_dynamics.h"]
-    assert "no body has these parameters: base parameters only" in capsys.readouterr().out
+    assert "not feasible: base parameters only" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["urdf", "mjcf", "sdf"])
@@ -127,7 +127,7 @@ def test_what_no_body_has_goes_into_no_other(
     unreal: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of("export", unreal, "--format", f"csv,{name}", "--out", tmp_path / "out") == 1
-    assert "no body has these parameters" in capsys.readouterr().err
+    assert "these parameters are not feasible" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

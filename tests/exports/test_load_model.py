@@ -83,7 +83,7 @@ def test_what_does_not_belong_together_is_refused(run: Path, tmp_path: Path) -> 
     with pytest.raises(UsageError, match="no such file"):
         load_model(tmp_path / "parameters.json", "planar2")
     shutil.copy(run / "parameters.json", tmp_path)
-    with pytest.raises(UsageError, match=r"there is no arm\.json beside it; say which arm it is for"):
+    with pytest.raises(UsageError, match=r"there is no arm\.json beside it; name its arm"):
         load_model(tmp_path / "parameters.json")
     with pytest.raises(ParameterError, match="wam7"):
         load_model(tmp_path / "parameters.json", "wam7")
@@ -106,7 +106,7 @@ def changed(run: Path, folder: Path, **changes: object) -> Path:
 
 
 def test_parameters_that_no_body_has_are_refused(run: Path, tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="no body has these parameters, so there is no model"):
+    with pytest.raises(ModelError, match="these parameters are not feasible, so there is no model"):
         load_model(changed(run, tmp_path, link_parameters=None))
 
 

@@ -27,7 +27,7 @@ def _on_its_support(config: ArmConfig) -> ArmConfig:
 
 
 def write_checked_ticket(config: ArmConfig, state: Path) -> None:
-    """Write the ticket that `ident check` writes for the identification motion of an arm in virtual time.
+    """Write the ticket that `ident preflight` writes for the identification motion of an arm in virtual time.
 
     Args:
         config: of an arm without a plant that outlives it, so that one preflight speaks for all tests.

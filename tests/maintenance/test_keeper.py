@@ -188,7 +188,7 @@ def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
     assert scene.engine.stop(ARM, "bob") == {"arms": [], "jobs": []}  # nothing moves at this moment
     scene.keeper.look()
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
-    assert "asked for a stop" in scene.only["detail"]
+    assert "a stop was requested" in scene.only["detail"]
     # The next one is not stopped by it.
     scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     assert scene.queued == [("check", False)]
@@ -260,7 +260,7 @@ def test_what_was_stopped_is_no_verdict(scene: Scene) -> None:
     stopped = {"exit_code": 0, "report": {"state": "stopped"}}
     (scene.state / JOBS / scene.only["job"] / "answer.json").write_text(json.dumps(stopped))
     assert outcome(said(scene.state / JOBS / scene.only["job"]), 0, "").state == "cancelled"
-    scene.ended("cancelled", detail="somebody asked for a stop")
+    scene.ended("cancelled", detail="a stop was requested")
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
 
 
@@ -292,11 +292,11 @@ def test_what_is_rolled_back_to_is_the_same_to_the_last_bit(scene: Scene, accept
     document = json.loads((folder / "parameters.json").read_text())
     (folder / "parameters.json").write_text(json.dumps(document | {"method": "huber"}))
     write_manifest(folder)
-    with pytest.raises(UsageError, match="by a name"):
+    with pytest.raises(UsageError, match="the name of who accepts"):
         accept(scene.db, scene.state, folder, "better", " ")
     accept(scene.db, scene.state, folder, "better", "ann")
     assert {path.name: path.read_bytes() for path in current.iterdir()} != before
-    with pytest.raises(UsageError, match="by a name"):
+    with pytest.raises(UsageError, match="the name of who accepts"):
         rollback(scene.db, scene.state, ARM, "worse", "")
     rollback(scene.db, scene.state, ARM, "worse", "bob")
     assert {path.name: path.read_bytes() for path in current.iterdir()} == before

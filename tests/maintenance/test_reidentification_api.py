@@ -138,14 +138,14 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
         assert ident("schedule", "list", ARM)[1].count("\n") == 1
         assert "maintenance: belt" in ident("maintenance", ARM, "--what", "belt")[1]
         assert "maintenance: belt" in ident("due", "list")[1]
-        assert "would be lost" in ident("maintenance", ARM, "--what", "belt", "--by", "ann")[2]
+        assert "cannot be sent to a daemon" in ident("maintenance", ARM, "--what", "belt", "--by", "ann")[2]
         assert ident("reidentify", ARM, "--confirm", "other")[0] == 2
         code, out, _ = ident("reidentify", ARM, "--confirm", ARM)
         assert (code, "unchanged" in out) == (0, True)
         assert ident("due", "list")[1] == "nothing is due\n"
         assert ident("maintenance", ARM, "--what", "belt again")[0] == 0
         assert ident("due", "dismiss", "2", "--note", "the same belt")[0] == 0
-        assert ident("alarm", "list")[:2] == (0, "no alarm stands\n")
+        assert ident("alarm", "list")[:2] == (0, "no open alarms\n")
         assert ident("alarm", "ack", "1", "--note", "x")[0] == 2
 
 

@@ -138,7 +138,7 @@ def test_maintenance_makes_due_what_is_scheduled_after_it(db: Database, clock: C
     assert [one["cause"] for one in pending(db)] == ["maintenance: belt changed"]
     assert [one["what"] for one in events(db, ARM)] == ["and the other", "belt changed", "gear oil changed"]
     for what, note in (("", ""), (" ", ""), ("x" * 201, ""), ("x", "y" * 2001)):
-        with pytest.raises(UsageError, match="say what was done"):
+        with pytest.raises(UsageError, match="describe what was done"):
             add_event(db, ARM, what, note, "me", clock())
 
 
@@ -186,7 +186,7 @@ def test_what_cannot_be_meant_is_refused(db: Database, state: Path, clock: Clock
     for act in (lambda: known_schedule(db, 9), lambda: remove_schedule(db, 9, "me")):
         with pytest.raises(UnknownId):
             act()
-    with pytest.raises(UsageError, match="say why"):
+    with pytest.raises(UsageError, match="the reason"):
         dismiss(db, 1, " ", "me", clock())
 
 

@@ -75,7 +75,7 @@ CANOPEN_PROMISES: dict[str, Promise] = {
         {"status_stale"}, duration=10**6, within=_STATUS + 12, words=("no status report for 0.25 s",)
     ),
     "notice": Promise({"drive_notice"}, warns="drive_notice", words=("FF01h",)),
-    **{kind: Promise({"second_host"}, within=SOON, words=("somebody else",)) for kind in FOREIGN},
+    **{kind: Promise({"second_host"}, within=SOON, words=("another host",)) for kind in FOREIGN},
     "full_queue": Promise({"driver"}, duration=5, within=SOON, words=("the transmit queue is full",)),
 }
 

@@ -115,7 +115,7 @@ def test_a_drive_that_applies_a_share_of_its_torque_is_named() -> None:
     assert outcome.fault is not None
     warned = [words for _, _, words in outcome.story.events if words.startswith("torque_not_applied: shoulder: ")]
     assert warned
-    assert "more than it was told" in warned[0]
+    assert "more than commanded" in warned[0]
 
 
 @pytest.mark.slow

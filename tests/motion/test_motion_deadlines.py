@@ -97,7 +97,7 @@ def test_a_stall_of_ten_milliseconds_is_survived_and_a_longer_one_is_named() -> 
         fault = times.cycle(11 * MS + 1, 11 * MS + 1)
         assert code(fault) == "late_cycles"
         assert fault is not None
-        assert fault.message.startswith("this computer stalled for 10 ms, 10 ms are survived")
+        assert fault.message.startswith("this computer stalled for 10 ms, 10 ms are tolerated")
 
 
 @pytest.mark.parametrize("skipped", [0.9, 1.0, 1.1, 2.95])

@@ -333,12 +333,12 @@ def test_torques_are_told_in_the_unit_of_the_joint(joint: int, unit_of_torque: s
 
     asked = unit(joint) * LIMITS.torque
     guard = Bench(revolute=(True, False)).guard
-    assert f"{2.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was asked for" in told(guard.torque(2.0 * asked)[1])
-    assert f"{4.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was asked for" in told(guard.torque(4.0 * asked)[1])
+    assert f"{2.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was requested" in told(guard.torque(2.0 * asked)[1])
+    assert f"{4.0 * LIMITS.torque[joint]:.4g} {unit_of_torque} was requested" in told(guard.torque(4.0 * asked)[1])
     bench = Bench(revolute=(True, False))
     bench.guard.torque(0.5 * asked)
     words = told(bench.see(HOME, torque=np.zeros(2))[1])
-    assert f"gives 0 of the {0.5 * LIMITS.torque[joint]:.4g} {unit_of_torque} it was told" in words
+    assert f"gives 0 of the {0.5 * LIMITS.torque[joint]:.4g} {unit_of_torque} commanded" in words
     assert f" {unit_of_torque}/s, " in told(bench.guard.torque(0.5 * asked - 1.5 * bench.guard.rate * unit(joint))[1])
 
 

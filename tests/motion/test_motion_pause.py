@@ -112,7 +112,9 @@ def test_when_nothing_leads_back_it_is_said_and_the_arm_stands_on() -> None:
     motion = Awkward(())
     paused = Paused(motion, 5.0, LIMITS)
     motion.barred = ((0.0, 10.0),)
-    with pytest.raises(MotionRefused, match="no way leads from here back onto the motion: no jerk-limited way"):
+    with pytest.raises(
+        MotionRefused, match="no trajectory leads from here back to the motion: no jerk-limited trajectory"
+    ):
         paused.resume()
     close(paused.at(1e6), rest(np.array([0.1, 0.05])))
 

@@ -155,7 +155,7 @@ def test_an_arm_that_nobody_watches_stops(make: Callable[..., Bench], wish: str,
 
 def test_a_lease_lost_while_a_motion_is_planned_energises_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
-    with pytest.raises(MotionRefused, match="whoever asked for the motion is gone"):
+    with pytest.raises(MotionRefused, match="the program that started the motion has ended"):
         played(bench, Hands(gone=-1000))
     assert "armed" not in bench.story.states
 

@@ -101,7 +101,7 @@ def test_a_stop_that_is_asked_for_is_controlled(make: Callable[..., Bench], cycl
 
 def test_a_stop_before_the_first_cycle_energises_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
-    with pytest.raises(MotionRefused, match="a stop was asked for before the arm was energised"):
+    with pytest.raises(MotionRefused, match="a stop was requested before the arm was energised"):
         bench.run(lambda: True)
     assert bench.story.states == []
     assert bench.arm.torques == []

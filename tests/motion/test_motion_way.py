@@ -94,7 +94,7 @@ def test_an_end_beyond_a_limit_is_refused(joint: int, key: str) -> None:
 def test_an_end_that_no_jerk_can_bring_is_refused() -> None:
     # Each is within its limit, but with this acceleration the velocity must have been too large just before.
     end = Setpoint(np.zeros(2), np.array([0.99, 0.0]) * LIMITS.velocity, np.array([-0.9, 0.0]) * LIMITS.acceleration)
-    with pytest.raises(MotionRefused, match="no jerk-limited way"):
+    with pytest.raises(MotionRefused, match="no jerk-limited trajectory"):
         plan_trajectory(rest(np.zeros(2)), end, LIMITS)
 
 

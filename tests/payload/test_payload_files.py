@@ -60,8 +60,8 @@ def test_a_tool_is_found_and_written(arms: Path, ident: Ident, tmp_path: Path) -
     out = tmp_path / "with_tool"
     code, text, _ = ident("payload", arms / "bare", arms / "tooled.mcap", "--out", out)
     assert code == 0
-    assert text.startswith("ADDED: a body moves with the last link that the arm was identified without\n")
-    assert "no motion of this arm shows: Lxx2 Lxy2 Lxz2 Lyy2 Lyz2 lz2" in text
+    assert text.startswith("ADDED: a body was added to the last link\n")
+    assert "not excited by any motion of this arm: Lxx2 Lxy2 Lxz2 Lyy2 Lyz2 lz2" in text
     assert "\nCHANGED\n  body of link 2: " in text
     assert "about +0.2 kg\n    may mean: another tool or payload" in text
     wanted = ["arm.json", "comparison.html", "comparison.json", "comparison.txt", "identified.urdf", "manifest.json"]
@@ -195,5 +195,5 @@ def test_what_cannot_be_meant_is_refused(arms: Path, ident: Ident, tmp_path: Pat
         assert not out.exists()
     code, _, err = ident("payload", bare, tooled, "--out", bare)
     assert code == 2
-    assert "would replace the arm's own parameters" in err
+    assert "would replace the arm's parameters" in err
     read_results(bare)

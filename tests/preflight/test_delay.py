@@ -104,5 +104,5 @@ def test_an_arm_that_is_not_at_home_is_told_so_before_what_is_wrong_there(away: 
     flight.model = replace(flight.model, prior=heavy)
     flight.arm.shown = lambda sample: replace(sample, position=sample.position + np.array([away, 0.0]))
     check = check_of(flight.ticket(), "gravity")
-    assert "holding takes more than the drives have to spare" in check.reason
+    assert "holding the arm takes too much of the torque limits" in check.reason
     assert check.reason.startswith("the arm is not at home (shoulder 0.7 rad away): `ident home`; ") == bool(away)

@@ -170,7 +170,7 @@ def test_a_position_of_other_gears_is_none_and_a_damaged_file_is_said(
     document = json.loads((tmp_path / FILE).read_text())
     for text in ("{", json.dumps(document | {"position": [0.0]}), json.dumps(document | {"when": 3}), "[]"):
         (tmp_path / FILE).write_text(text)
-        with pytest.raises(UsageError, match=f"{FILE}: cannot be read .* look at the arm, then remove the file"):
+        with pytest.raises(UsageError, match=f"{FILE}: cannot be read .* check the arm, then remove the file"):
             kept.read()
 
 

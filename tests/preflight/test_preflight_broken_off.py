@@ -39,7 +39,7 @@ def checked(flight: Flight, arm: Arm, motion: Excitation | None) -> Ticket:
 
 
 def for_a_way_home(ticket: Ticket) -> list[str]:
-    """Why it does not allow a way home on the same arm."""
+    """Why it does not allow the path home on the same arm."""
     return ticket.valid_for(replace(ticket.subject, excitation="", excitation_sha256=""), ticket.created)
 
 
@@ -86,5 +86,5 @@ def test_a_stop_that_is_asked_for_while_a_person_thinks_keeps_the_drives_off() -
     ticket = preflight(arm, flight.model, flight.motion, confirm=confirm, clock=flight.clock, look_seconds=0.2)
     assert "asked" in flight.arm.calls
     assert "enable" not in flight.arm.calls
-    assert check_of(ticket, "gravity").reason == "somebody asked for a stop"
+    assert check_of(ticket, "gravity").reason == "a stop was requested"
     assert ticket.verdict is Verdict.FAILED

@@ -301,7 +301,7 @@ def test_a_wrong_gear_ratio_shows_in_what_the_joint_does(ratio: float, shows: st
     check = only_failure(flight.ticket(), "direction")
     assert {one.joint for one in check.measures if not one.kept and one.what.startswith(shows)} == {"elbow"}
     response = next(
-        one for one in check.measures if one.joint == "elbow" and one.what.startswith("answer to torque, measured")
+        one for one in check.measures if one.joint == "elbow" and one.what.startswith("response to torque, measured")
     )
     assert response.value == pytest.approx(ratio**2, rel=0.05)
     assert "gear ratio" in check.remedy
@@ -443,7 +443,7 @@ def test_an_arm_that_goes_astray_while_drives_miss_a_heartbeat_is_let_go_at_once
     reason = only_failure(flight.ticket(), "watchdog").reason
     assert reason.startswith("at rest, while drives missed heartbeat")
     assert "elbow" in reason
-    assert reason.endswith("the arm was let go")
+    assert reason.endswith("the arm was released")
     assert arm.silent_from is not None
     assert len(arm.torques) - arm.silent_from < 5
 

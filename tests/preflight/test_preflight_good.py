@@ -36,10 +36,10 @@ def test_a_good_arm_passes_all_that_virtual_time_can_tell(good: Flown) -> None:
 
 def test_it_measures_what_is_true(good: Flown) -> None:
     ticket = good.ticket
-    answers = [one for one in check_of(ticket, "direction").measures if one.what.startswith("answer to torque, mea")]
+    answers = [one for one in check_of(ticket, "direction").measures if one.what.startswith("response to torque, mea")]
     # The truth is 5 % heavier at the shoulder.
     assert [one.value for one in answers] == pytest.approx([0.93, 1.0], abs=0.06)
-    held = {one.joint: one.value for one in check_of(ticket, "gravity").measures if one.what == "torque that holds"}
+    held = {one.joint: one.value for one in check_of(ticket, "gravity").measures if one.what == "holding torque"}
     # What holds is the model's torque, within friction: the truth's is 0.3 N m more at the shoulder.
     assert abs((held["shoulder"] or 0.0) - 12.3) < 0.7
 
@@ -58,7 +58,7 @@ def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     check = check_of(flight.ticket(), "direction")
     assert check.verdict is Verdict.PASSED
     judged = {one.joint: one for one in check.measures if one.what.startswith("answer") and one.most is not None}
-    assert "scale cannot be judged until the prior has the drive inertia" in judged["elbow"].what
+    assert "scale that is too low cannot be detected until the prior has the drive inertia" in judged["elbow"].what
     # The elbow alone accelerates, by a; the model expects a (M_22 + Ia)/M_22 of the torque that it takes.
     model = flight.model
     assert model.prior is not None

@@ -1,4 +1,4 @@
-"""Preflight for a way home: no motion is asked about, and the arm may stand a little outside its limits."""
+"""Preflight for the path home: no motion was given, and the arm may stand a little outside its limits."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
     assert ticket.verdict is Verdict.PASSED, [check.reason for check in ticket.checks]
     assert ticket.subject.excitation == ""
     for code in ("motion_fits", "motion_proven"):
-        assert check_of(ticket, code).reason == "no motion is asked about"
+        assert check_of(ticket, code).reason == "no motion was given"
     assert check_of(ticket, "ways_clear").verdict is Verdict.PASSED
     assert check_of(ticket, "direction").verdict is Verdict.PASSED
     assert flight.arm.torques

@@ -63,8 +63,8 @@ def test_a_ticket_counts_for_what_was_checked_for_a_quarter_of_an_hour() -> None
 @pytest.mark.parametrize(
     ("verdict", "reason"),
     [
-        (failed("noise", "too much", "less"), "did not pass: noise"),
-        (Check("watchdog", Verdict.NEEDS_PERSON), "did not pass: watchdog"),
+        (failed("noise", "too much", "less"), "failed: noise"),
+        (Check("watchdog", Verdict.NEEDS_PERSON), "failed: watchdog"),
     ],
 )
 def test_a_ticket_that_did_not_pass_counts_for_nothing(verdict: Check, reason: str) -> None:
@@ -90,12 +90,12 @@ OTHERS: list[tuple[Callable[[], Subject], str]] = [
     (lambda: of_config(name="other"), "it is for bench, not for other"),
     (lambda: subject_of(MODEL, replace(MOTION, name="validation"), ARM), "the motion has changed"),
     (lambda: subject_of(replace(MODEL, prior=1.01 * MODEL.prior), MOTION, ARM), "the model's parameters"),
-    (lambda: subject_of(MODEL, MOTION, replace(ARM, identities=("a 1", "b 3"))), "the drives are others"),
-    (lambda: subject_of(MODEL, MOTION, replace(ARM, rate=500.0)), "the arm on the bus says"),
-    (lambda: subject_of(MODEL, MOTION, replace(ARM, torque_limit=np.array([40.0, 14.0]))), "the arm on the bus says"),
+    (lambda: subject_of(MODEL, MOTION, replace(ARM, identities=("a 1", "b 3"))), "the drives are not those"),
+    (lambda: subject_of(MODEL, MOTION, replace(ARM, rate=500.0)), "the drives report"),
+    (lambda: subject_of(MODEL, MOTION, replace(ARM, torque_limit=np.array([40.0, 14.0]))), "the drives report"),
     (lambda: subject_of(MODEL, MOTION, replace(ARM, software="sim 2")), "it was made with sim 1, not with sim 2"),
     (lambda: replace(SUBJECT, software="ident-service 9"), "not with ident-service 9"),
-    (lambda: subject_of(MODEL, MOTION, None), "the drives are others"),
+    (lambda: subject_of(MODEL, MOTION, None), "the drives are not those"),
 ]
 
 
@@ -115,8 +115,8 @@ def test_a_way_home_asks_for_nothing_that_is_about_the_motion(code: str) -> None
 @pytest.mark.parametrize("check", [failed("direction", "x", "y"), Check("watchdog", Verdict.NEEDS_PERSON)])
 def test_a_way_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
     home = subject_of(MODEL, None, ARM)
-    assert f"did not pass: {check.code}" in ticket(check).valid_for(home, later())[0]
-    assert "the drives are others than those that were checked" in ticket().valid_for(
+    assert f"failed: {check.code}" in ticket(check).valid_for(home, later())[0]
+    assert "the drives are not those that were checked" in ticket().valid_for(
         subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3"))), later()
     )
     assert "expired" in ticket().valid_for(home, later(minutes=15))[0]
@@ -180,7 +180,7 @@ def test_what_is_no_ticket_is_refused_with_one_reason(text: str, complaint: str,
     with pytest.raises(UsageError) as again:
         read_ticket(path)
     assert str(again.value).startswith(f"{path}: ")
-    assert str(again.value).endswith("`ident check` makes a new one")
+    assert str(again.value).endswith("`ident preflight` makes a new one")
     assert complaint in str(again.value)
 
 

@@ -155,7 +155,7 @@ def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
 @pytest.mark.slow
 def test_gravity_upside_down() -> None:
     (reason,) = judged(nothing, kuka(gravity=(0.0, 0.0, 9.81)))
-    assert "without the conditions of a real body: gravity, signs, order or units" in reason
+    assert "without feasibility constraints: gravity, signs, order or units" in reason
 
 
 # The KUKA in Craig's convention: a, alpha and d of each row are those before the joint.

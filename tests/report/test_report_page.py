@@ -145,11 +145,11 @@ def test_a_bound_stands_where_it_binds(good: Made) -> None:
 
 def test_what_is_absent_is_said(bare: Made) -> None:
     found = {name: node.words for name, node in sections(bare.page).items()}
-    assert "No real body has these parameters" in found["verdict"]
-    assert "judged on no recording that it had not seen" in found["verdict"]
+    assert "They are not physically feasible" in found["verdict"]
+    assert "There is no validation recording" in found["verdict"]
     assert "has no CAD values" in found["parameters"]
-    assert "no recording that the fit has not seen" in found["torque"]
-    assert "No body has these parameters" in found["bodies"]
+    assert "There is no validation recording" in found["torque"]
+    assert "These parameters are not feasible" in found["bodies"]
     assert "no account of its cycles" in found["timing"]
 
 
@@ -272,7 +272,7 @@ def test_warnings_are_listed(tmp_path: Path) -> None:
     found = sections(one.page)
     assert [item.words for item in found["warnings"].all("li")] == list(one.evidence.warnings)
     assert "None: no joint is off by more than 15 % of its own torque" in found["warnings"].words
-    assert "mend what the recordings' warnings name" in found["verdict"].words
+    assert "correct what the recordings' warnings name" in found["verdict"].words
 
 
 def test_warnings_name_what_stands_against_the_estimate(good: Made) -> None:
@@ -287,8 +287,8 @@ def test_warnings_name_what_stands_against_the_estimate(good: Made) -> None:
     said = [item.words for item in found.all("li")]
     assert said[0].startswith(f"Off by more than 15 % of their own torque, near standstill only: {name} (84.7 %; ")
     assert said[1:] == [
-        f"1 of {size} base parameters are unidentified: these recordings do not tell them.",
-        "The regressor's condition number is 2500, above 1000: some sums of parameters hardly show.",
+        f"1 of {size} base parameters are unidentified: these recordings do not determine them.",
+        "The regressor's condition number is 2500, above 1000: some combinations of parameters are hardly excited.",
     ]
 
 
@@ -297,7 +297,7 @@ def test_a_simulated_arm_cannot_pass_for_a_real_one(good: Made) -> None:
     for config, told in ((simulated, True), (good.config, False)):
         page = report_html(good.evidence, good.parameters, config, {})
         for part in (parsed(page).one("header"), sections(page)["verdict"]):
-            assert ("not a commissioning of a real arm" in part.words) is told
+            assert ("no commissioning of a real arm" in part.words) is told
 
 
 def test_the_friction_s_shape_is_in_its_section(good: Made) -> None:
@@ -306,7 +306,7 @@ def test_the_friction_s_shape_is_in_its_section(good: Made) -> None:
     table = sections(report_html(good.evidence, replace(good.parameters, content=content), good.config, {}))["friction"]
     rows = [[child.words for child in row.children if isinstance(child, Node)] for row in table.all("tr")]
     assert rows == [
-        ["joint", "pre-sliding way", "Stribeck velocity"],
+        ["joint", "pre-sliding distance", "Stribeck velocity"],
         ["joint_0", "0.0125 rad", "0.25 rad/s"],
         ["joint_1", "0 rad", "0.031 rad/s"],
     ]

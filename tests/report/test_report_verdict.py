@@ -30,26 +30,26 @@ def own(made: Made, **changes: Any) -> Evidence:
 
 def test_a_good_estimate(good: Made) -> None:
     words = said(good)
-    assert "A real body could have these parameters" in words
+    assert "They are physically feasible" in words
     assert CERTIFIED in words
     assert "proven" not in words
-    assert "held in the feasible set pseudo_inertia" in words
+    assert "constrained to the feasible set pseudo_inertia" in words
     chosen = good.estimate.candidates[good.estimate.chosen]
     assert f"{chosen.validation[0].error.relative_percent:.3g} %" in words
-    assert f"({chosen.moving.relative_percent:.3g} % away from standstill) on what it was fitted to" in words
+    assert f"({chosen.moving.relative_percent:.3g} % away from standstill) on the fitted ones" in words
     assert "about as well as its own" in words
 
 
 def test_nothing_stands_against_it_only_where_nothing_does(good: Made) -> None:
     verdicts = {"verdicts": ["identified"] * good.estimate.base.size}
-    assert said(good, base_parameters=verdicts).endswith("Next: nothing stands against using it.")
+    assert said(good, base_parameters=verdicts).endswith("Next: it can be used.")
     warned = replace(good.evidence, warnings=("x",))
     assert "Next: mend what the recordings' warnings name" in said(good, warned, base_parameters=verdicts)
     first = good.estimate.base.expressions[0][:57]
     blind = {"verdicts": ["unidentified", *verdicts["verdicts"][1:]]}
     words = said(good, base_parameters=blind)
-    assert f"1 unidentified, the least sure first (\u03c3 over the larger of size and reference): {first}" in words
-    assert "design a motion that teaches them" in words
+    assert f"1 unidentified, the most uncertain first (\u03c3 over the larger of size and reference): {first}" in words
+    assert "design a motion that excites them" in words
 
 
 def test_feasible_without_a_certificate(good: Made) -> None:
@@ -61,7 +61,7 @@ def test_feasible_without_a_certificate(good: Made) -> None:
 def test_much_worse_on_what_it_never_saw(good: Made) -> None:
     worse = own(good, moving=1.0, moving_validation=(1.6,))
     assert "markedly worse than its own" in said(good, worse)
-    assert "identify from a richer one" in said(good, worse)
+    assert "identify from a richer motion" in said(good, worse)
     # Where the rows of moving joints are not told, all rows decide.
     whole = own(good, identification=1.0, validation=(1.4,), moving=None, moving_validation=())
     assert "about as well as its own" in said(good, whole)
@@ -108,15 +108,15 @@ def test_the_verdict_and_the_warnings_agree(good: Made, alone: Made, bare: Made)
         against = limitations(one.evidence, one.parameters)
         judged = bool(one.evidence.estimates[one.evidence.chosen].validation)
         clean = judged and not against and not one.evidence.warnings
-        assert said(one).endswith("Next: nothing stands against using it.") is clean
+        assert said(one).endswith("Next: it can be used.") is clean
 
 
 def test_active_conditions_are_counted(good: Made) -> None:
     names = [one.name for one in good.evidence.conditions][:2]
     words = said(good, feasibility={"tight": names})
     count = len({one.name for one in good.evidence.conditions})
-    assert f"2 of {count} conditions are active, which the data pull against: {names[0]}; {names[1]}." in words
-    assert "find out why the data pull against the active conditions" in words
+    assert f"2 of {count} constraints are active: {names[0]}; {names[1]}." in words
+    assert "find out why constraints are active" in words
 
 
 def test_unidentified_parameters_come_with_the_least_sure_first(good: Made) -> None:
@@ -143,11 +143,11 @@ def test_the_comparison_says_which_rows_it_is_of(good: Made) -> None:
 
 def test_an_infeasible_estimate(bare: Made) -> None:
     words = said(bare)
-    assert "No real body has these parameters" in words
+    assert "They are not physically feasible" in words
     assert CERTIFIED in words
     assert "proven" not in words
-    assert "not held in any feasible set" in words
-    assert f"What contradicts them: {bare.estimate.tight[0]}" in words
+    assert "estimated without a feasible set" in words
+    assert f"Violated constraints: {bare.estimate.tight[0]}" in words
     assert "record a second motion and give it with --validate" in words
     assert "identify within a feasible set" in words
 
@@ -157,4 +157,4 @@ def test_a_file_that_says_less(good: Made) -> None:
     bare_file = ParameterFile(good.parameters.base, good.parameters.values, None, {"base_parameters": table})
     words = " ".join(verdict(good.evidence, bare_file))
     assert "was not tested" in words
-    assert "How sure its parameters are is not known" in words
+    assert "The uncertainty of its parameters is unknown" in words

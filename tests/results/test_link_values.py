@@ -62,7 +62,7 @@ def test_a_value_that_no_such_link_has_is_named(
 def test_it_is_information_and_no_verdict(feasible_estimate: Estimate) -> None:
     strange = with_body(feasible_estimate, times=20.0)
     assert "implausible, " in summary(strange)
-    assert "torques are right all the same" in summary(strange).replace("\n  ", " ")
+    assert "one choice of many with the same torques" in summary(strange).replace("\n  ", " ")
     document = parameters_document(strange)
     assert document["link_parameters"]["implausible"] == list(implausible_links(strange))
     require_schema(document, "parameters", "here", "parameters")

@@ -87,7 +87,7 @@ def test_a_second_one_who_wants_to_move_the_arm_is_refused_by_name(tmp_path: Pat
 
 
 def test_nobody_is_reached_when_nobody_moves_the_arm(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="nobody moves the arm"):
+    with pytest.raises(UsageError, match="the arm is not moving"):
         ControlFile.reach(loop_path(tmp_path))
     ControlFile.take(loop_path(tmp_path), None).close()
     with pytest.raises(UsageError, match="left from a run that has ended"):

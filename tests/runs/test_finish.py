@@ -97,7 +97,7 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     assert every == sorted(every, reverse=True)
     text = _report_text(report | {"until": {**report["until"], "missed": [missed, {"parameter": "m2", "share": None}]}})
     assert "target of 0.01%: missed by 2 parameters" in text
-    assert f"\n  fv1: known to {missed['share']:.2%}\n  m2: not seen\n" in text
+    assert f"\n  fv1: known to {missed['share']:.2%}\n  m2: not excited\n" in text
     assert report["cycles"] > 2_500  # ten seconds of motion at 250 Hz
 
 
@@ -107,7 +107,7 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     [
         (["--until", "0.1", "--parameter", "nonsense"], "nonsense: not among the base parameters"),
         (["--until", "0"], "a target of 0 of a parameter"),
-        (["--parameter", "fv1"], "--parameter is what --until SHARE is about"),
+        (["--parameter", "fv1"], "--parameter needs --until SHARE"),
     ],
 )
 def test_a_target_that_is_none_is_refused_before_anything_moves(
@@ -122,7 +122,7 @@ def test_a_target_that_is_none_is_refused_before_anything_moves(
 
 def test_finish_is_refused_where_nobody_moves(virtual_arm: Path, tmp_path: Path, capsys: Any) -> None:
     assert main(["finish", str(virtual_arm), "--state", str(tmp_path / "state")]) == 2
-    assert "nobody moves the arm" in capsys.readouterr().err
+    assert "the arm is not moving" in capsys.readouterr().err
 
 
 _AS_ZERO = 0.01
@@ -176,5 +176,5 @@ def test_one_that_looks_may_die_or_hang(tmp_path: Path, how: signal.Signals) -> 
                 time.sleep(0.01)
         assert not reaching.reached()
     assert reaching._process.returncode is not None
-    died = ["nobody looks any more whether the target is reached; the motion goes on to its end"]
+    died = ["the target is no longer monitored; the motion continues to its end"]
     assert told == (died if how is signal.SIGKILL else [])

@@ -98,7 +98,7 @@ def test_a_healthy_arm_at_home_only_needs_a_check(tmp_path: Path, state: Path) -
     config = config_with(tmp_path)
     found = recover(config, state, LookedAt(make_arm(config)))
     assert found.usable
-    numbered(found, "`ident check planar2` for the next motion")
+    numbered(found, "`ident preflight planar2` for the next motion")
     assert found.seen is not None
 
 
@@ -111,8 +111,8 @@ def test_drives_are_reset_only_after_every_fault_is_acknowledged(tmp_path: Path,
     assert not found.usable
     assert found.tripped == {"elbow": "fault"}
     assert "Support the arm" in found.steps[0]
-    assert "`ident ack planar2 drive_fault`" in found.steps[1]
-    assert "`ident ack planar2 lease_lost`" in found.steps[2]
+    assert "`ident acknowledge planar2 drive_fault`" in found.steps[1]
+    assert "`ident acknowledge planar2 lease_lost`" in found.steps[2]
     assert "`ident recover planar2` again" in found.steps[3]
     faults.acknowledge("drive_fault")
     assert not recover(config, state, arm).usable
@@ -134,7 +134,7 @@ def test_a_cause_that_lasts_is_not_reset_away(tmp_path: Path, state: Path) -> No
     assert not found.usable
     assert found.tripped == {"shoulder": "emergency stop", "elbow": "emergency stop"}
     assert found.reset == ()
-    numbered(found, "Support", "Release the emergency stop", "again", "`ident check planar2`")
+    numbered(found, "Support", "Release the emergency stop", "again", "`ident preflight planar2`")
 
 
 def test_a_tripped_watchdog_is_reset(tmp_path: Path, state: Path) -> None:
@@ -222,9 +222,9 @@ def ident(tmp_path: Path, state: Path, capsys: pytest.CaptureFixture[str]) -> It
 def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tmp_path: Path, state: Path) -> None:
     code, said = ident("home")
     assert code == 3
-    assert "not checked yet" in said
+    assert "no preflight ticket" in said
     assert ident("check", "--home", "--confirm", "planar2")[0] == 0
-    # A ticket for a way home is none for a motion.
+    # A ticket for the path home is none for a motion.
     code, said = ident("run", "--out", str(tmp_path / "run"))
     assert code == 3
     assert "the motion has changed since" in said

@@ -130,7 +130,7 @@ def test_a_stop_while_a_run_is_being_prepared_keeps_it_from_beginning(virtual_ar
     motion = excitation(arm_model(config), "identification")
     ticket, asked_ns = read_ticket(ticket_path(state, config.name)), time.monotonic_ns()
     assert main(["stop", str(virtual_arm), "--state", str(state)]) == 0  # nobody moves it yet
-    with pytest.raises(MotionRefused, match="a stop was asked for before the arm was energised"):
+    with pytest.raises(MotionRefused, match="a stop was requested before the arm was energised"):
         run_motion(config, motion, tmp_path / "run", state, ticket, asked_ns=asked_ns)
     assert not (tmp_path / "run").exists()
     assert not fault_file(state, config.name).latched()
@@ -174,7 +174,7 @@ def test_an_arm_that_was_not_checked_does_not_move(
 ) -> None:
     words = ["--out", str(tmp_path / "run"), "--state", str(tmp_path / "state")]
     assert main(["run", str(virtual_arm), *words]) == 3
-    assert "not checked yet" in capsys.readouterr().err
+    assert "no preflight ticket" in capsys.readouterr().err
     checked(virtual_arm, tmp_path / "state")
     virtual_arm.write_text(virtual_arm.read_text() + "description: another\n")
     assert main(["run", str(virtual_arm), *words]) == 3

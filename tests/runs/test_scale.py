@@ -1,4 +1,4 @@
-"""`ident check --scale`: positions against angles by which a person has turned each joint."""
+"""`ident preflight --scale`: positions against angles by which a person has turned each joint."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Run jobs: each in its own process that runs a verb of the command line, with ids turned into paths here only."""
+"""Run jobs, each as a process of the command line; ids are converted to paths here only."""

@@ -98,7 +98,7 @@ def outcome(heard: ProcessOutput, exit_code: int | None, asked_to_end: str) -> O
         return Outcome("cancelled", asked_to_end, exit_code) if asked_to_end else Outcome("failed", words, exit_code)
     message = _message(heard.answer)
     if _report(heard.answer).get("state") == STOPPED:
-        return Outcome("cancelled", asked_to_end or "the arm was brought to rest: somebody asked for a stop", code)
+        return Outcome("cancelled", asked_to_end or "the arm was brought to rest: a stop was requested", code)
     state = _STATES.get(code, "failed")
     if asked_to_end and state in ("failed", "refused"):
         return Outcome("cancelled", "; ".join(filter(None, (asked_to_end, message))), code)

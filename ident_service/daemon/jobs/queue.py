@@ -180,7 +180,7 @@ class LiveJobs:
             if self._closing:
                 raise MotionRefused("the service is ending and begins nothing")
             if stops is not None and stops != self.stops(live.order.arm):
-                raise MotionRefused("somebody asked for a stop meanwhile; nothing more is begun")
+                raise MotionRefused("a stop was requested meanwhile; nothing more is begun")
             needed = set(live.order.resources)
             before = next((one.job for one in self._jobs.values() if needed & set(one.order.resources)), "")
             if before and not live.order.waits:
@@ -533,7 +533,7 @@ class Engine:
         found = self.live.entered()
         for live in found:
             if live.order.moves and not live.asked_to_end and self._stopped_at_terminal(live):
-                self.live.end(live.job, "somebody asked for a stop")
+                self.live.end(live.job, "a stop was requested")
             # Running jobs first: a waiting one may have to wait for the registry.
             if live.child is not None:
                 self._watch(live, live.child)

@@ -1,1 +1,1 @@
-"""Re-identify arms: schedules and due entries, the steps, the verdict, and the drift alarm that it may raise."""
+"""Re-identify arms on schedule: due entries, steps, verdict and drift alarm."""

@@ -1,1 +1,1 @@
-"""Serve the HTTP API: everything that the command line does, by ids; `app.create_app` builds the application."""
+"""Define the routes of the HTTP API; `app.create_app` builds the application."""

@@ -1,1 +1,1 @@
-"""Serve the web pages: what the API does, for a browser; rendered here, scripts only add comfort."""
+"""Serve the web pages, rendered on the server; they work without scripts, except where a lease must be renewed."""

@@ -135,7 +135,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     designed = len(motions(db, arm))
     checked, ticket = _ticket(ticket_path(state, arm), config)
     rehearsed = _newest(jobs, "rehearse")
-    comparable, words = _comparable(state, config) if accepted else (False, "first something has to be accepted")
+    comparable, words = _comparable(state, config) if accepted else (False, "accept parameters first")
     asks = _asks(db, arm)
     if comparable:
         words = "; ".join(asks) or _last(again)
@@ -187,11 +187,11 @@ def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
 def _asks(db: Database, arm: str) -> list[str]:
     """Return the reasons for a re-identification, in words."""
     due = [f"due: {row['cause']}" for row in pending(db, arm)]
-    return [*due, *(["a drift alarm stands"] if alarms(db, arm, most=1) else [])]
+    return [*due, *(["open drift alarm"] if alarms(db, arm, most=1) else [])]
 
 
 def _last(again: list[Row]) -> str:
-    what = "after maintenance, or when the arm behaves otherwise: check, run, identify, compare with what is accepted"
+    what = "after maintenance or a change in behaviour: preflight, run, identify, compare with the accepted set"
     if not again:
         return what
     when = datetime.fromtimestamp(again[0]["begun"], UTC).strftime("%Y-%m-%d %H:%M UTC")
@@ -236,19 +236,19 @@ def _step(kind: str) -> str:
 def _ticket(path: Path, config: ArmConfig) -> tuple[bool, str]:
     """Return whether the last preflight's ticket still looks valid, and words; the run itself checks it again."""
     if not path.is_file():
-        return False, "not checked yet"
+        return False, "no preflight yet"
     try:
         ticket = read_ticket(path)
     except IdentError:
-        return False, "its ticket cannot be read; check again"
+        return False, "its ticket cannot be read; repeat the preflight"
     until = ticket.expires.strftime("%Y-%m-%d %H:%M UTC")
     if ticket.verdict is not Verdict.PASSED:
-        return False, "the last one did not pass"
+        return False, "the last one failed"
     if ticket.subject.arm_sha256 != config.sha256 or ticket.subject.software != f"ident-service {__version__}":
         return False, "the description or the software has changed since"
     if datetime.now(UTC) >= ticket.expires:
         return False, f"its ticket ended at {until}"
-    return True, f"passed, counts until {until}"
+    return True, f"passed, valid until {until}"
 
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
@@ -349,7 +349,7 @@ def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
 def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Queue a job that moves nothing."""
     if form.get("kind") not in _KINDS:
-        raise UsageError("choose what is to be done on the page of the arm")
+        raise UsageError("choose an action on the page of the arm")
     job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
     return seen(f"/jobs/{job.id}")
 

@@ -38,7 +38,7 @@ async def form_of(request: Request) -> dict[str, str]:
             parse_qsl((await request.body()).decode("utf-8"), keep_blank_values=True, max_num_fields=_MOST_FIELDS)
         )
     except ValueError:
-        raise HTTPException(400, "this is not a form of ours") from None
+        raise HTTPException(400, "not a form of this service") from None
 
 
 Form = Annotated[dict[str, str], Depends(form_of)]

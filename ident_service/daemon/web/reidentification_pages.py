@@ -196,7 +196,7 @@ def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
     except MotionRefused as error:
         if service.db.row("SELECT 1 FROM reidentifications WHERE arm = ? AND state = 'running'", arm) is not None:
             raise
-        words = f"Nothing has moved: that was not the arm's name, this page was open for too long, or else: {error}"
+        words = f"Nothing has moved: that was not the arm's name, this page was open for too long, or: {error}"
         return _confirmation(service, who, arm, form, words)
     if remark:
         note(service.db, who.name, _NOTED, begun.id, note=remark)

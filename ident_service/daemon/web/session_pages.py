@@ -31,7 +31,7 @@ def log_in(service: Serving, request: Request, form: Form) -> Response:
     try:
         about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))
     except HTTPException as error:
-        words = "This token does not count." if error.status_code == 401 else str(error.detail)
+        words = "This token is not valid." if error.status_code == 401 else str(error.detail)
         return page("login", None, error.status_code, where=where, problem=words)
     return answer
 

@@ -1,1 +1,1 @@
-"""Compare two or more parameter sets, and present the changes as a document, text and a page."""
+"""Compare parameter sets, and present the changes as JSON, text and an HTML page."""

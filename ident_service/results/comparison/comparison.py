@@ -364,7 +364,8 @@ def _pair(reference: ComparedSet, side: ComparedSet) -> Pair:
         if differing and found.verdict == "unchanged":
             reason = (
                 f"friction of joint {', '.join(_names(side, differing))} was fitted with another shape and is not "
-                f"compared; all else is unchanged. Identify again with the reference's shape: {_remedy(reference)}"
+                f"compared; everything else is unchanged. Identify again with the reference's shape:"
+                f" {_remedy(reference)}"
             )
         motion = second.motion or first.motion
         if motion is not None:
@@ -480,7 +481,7 @@ def _notes(
         notes.append(f"joints are called {', '.join(reference.joints)} and {', '.join(side.joints)}; compared in order")
     tested = reference.covariance is not None and side.covariance is not None
     if tested and not free and any(content.get("feasible_set") in ("inertia", "pseudo_inertia") for content in both):
-        notes.append("constrained values are compared, in the covariance of unconstrained ones: on the careful side")
+        notes.append("constrained values are compared, with the covariance of unconstrained ones: conservative")
     made = [f"{content.get('method', '?')}, {content.get('feasible_set', '?')}" for content in both]
     if made[0] != made[1] and (worst := in_use.worst()) is not None:
         notes.append(
@@ -489,7 +490,7 @@ def _notes(
         )
     recordings = [{one["sha256"] for one in content.get("provenance", {}).get("recordings", [])} for content in both]
     if reference.sha256 != side.sha256 and recordings[0] & recordings[1]:
-        notes.append("both were fitted to the same recording: their doubts are not independent")
+        notes.append("both were fitted to the same recording: their uncertainties are not independent")
     if differing:
         joints = ", ".join(_names(side, differing))
         notes.append(
@@ -571,7 +572,7 @@ def _whole(pair: Pair, found: ParameterChange, cause: Cause | None, links: int) 
         what, size, meaning = (
             "all parameters together",
             "",
-            "no single joint or link; look at conditions that all share",
+            "no single joint or link; check conditions common to all",
         )
     else:
         owner = f"link {cause.number}" if cause.kind == "body" else f"joint {joint_name(pair, cause.number)}"

@@ -117,7 +117,9 @@ def z_figure(found: ParameterChange, place: int) -> Figure:
         else:
             canvas.circle("good", x, y, 3.4)
     count = int(np.sum(found.p < ALPHA))
-    words = f"{count} of {size} parameters lie beyond chance; the largest |z| is {float(np.max(np.abs(found.z))):.3g}."
+    words = (
+        f"{count} of {size} parameters differ significantly; the largest |z| is {float(np.max(np.abs(found.z))):.3g}."
+    )
     return Figure(
         slug=f"z-{place}",
         title="Difference of every base parameter in standard deviations",
@@ -182,8 +184,8 @@ def _fastest(pair: Pair, joint: int) -> float:
 _WIDTH = 46
 _MOST = 8  # parameters that only one side has, of which each is named
 LEFT_OUT = (
-    "left out: directions that neither motion shows, or that the recordings, being short, cannot tell from noise; of "
-    "these the test says nothing"
+    "left out: directions that neither motion excites, or that short recordings cannot separate from noise; they "
+    "are not tested"
 )
 
 
@@ -227,11 +229,11 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
         if left_out:
             lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in shortened(left_out))]
     if pair.provenance:
-        lines += ["", "what differs in how they came about (reference; compared):"]
+        lines += ["", "differences in how they were made (reference; compared):"]
         said = {key: both for key, both in pair.provenance.items() if UNSAID not in both}
         lines += [f"  {key}: {_short(a, 60)}; {_short(b, 60)}" for key, (a, b) in said.items()]
         if alone := [key for key in pair.provenance if key not in said]:
-            lines.append(f"  said of one alone: {', '.join(alone)}")
+            lines.append(f"  given for one alone: {', '.join(alone)}")
     lines += [f"note: {note}" for note in pair.notes]
     return [*lines, ""]
 
@@ -261,11 +263,11 @@ def contradiction(pair: Pair) -> str:
         own, other = (error.joint_relative_percent[joint] for error in (pair.crossed.own, pair.crossed.reference))
         errors = f" (torque error {own:.3g} % with its own, {other:.3g} % with the reference's)"
     if pair.drift is not None and relevant(pair.drift.shares):
-        why = "the tested values differ by as much, which may be chance: their doubt is as large"
+        why = "the tested values differ by as much, within their uncertainty"
     else:
         why = (
-            "the unconstrained values, which are tested, do not; what was made of them does (feasible set, "
-            "constraints, method, or a file that was edited)"
+            "the tested unconstrained values do not: the difference comes from the feasible set, constraints, "
+            "method, or an edited file"
         )
     return (
         f"BUT the values in use change the torque of joint {joint_name(pair, joint + 1)} by {share:.2%}{errors}: "
@@ -280,7 +282,7 @@ def tested_line(pair: Pair) -> str:
     if not pair.free:
         return "tested: the values in use"
     line = "tested: unconstrained values, to which the covariances belong"
-    return f"{line}; the values in use, held in a feasible set, stand beside them" if pair.in_use.apart else line
+    return f"{line}; the values in use, constrained to a feasible set, are beside them" if pair.in_use.apart else line
 
 
 def shortened(rows: Sequence[str]) -> list[str]:
@@ -505,8 +507,8 @@ def _sections(reference: ComparedSet, pair: Pair, place: int) -> Iterable[str]:
         yield section(f"torque-{place}", "Torque error", _torque(pair))
     if pair.provenance:
         rows = [[Cell(key), Cell(a), Cell(b)] for key, (a, b) in pair.provenance.items()]
-        made = table("What differs in how they came about", ["what", "reference", "compared"], rows)
-        yield section(f"provenance-{place}", "How they came about", made)
+        made = table("Differences in how they were made", ["what", "reference", "compared"], rows)
+        yield section(f"provenance-{place}", "How they were made", made)
 
 
 def _parameters(reference: ComparedSet, pair: Pair) -> str:
@@ -523,7 +525,7 @@ def _parameters(reference: ComparedSet, pair: Pair) -> str:
         if pair.drift is None:
             cells += [_NOTHING] * 3
         elif not np.isfinite(pair.drift.deviations[k]):
-            cells += [Cell("not seen", kind="bad"), _NOTHING, _NOTHING]
+            cells += [Cell("not excited", kind="bad"), _NOTHING, _NOTHING]
         else:
             z, kind = float(pair.drift.z[k]), "bad" if pair.drift.p[k] < ALPHA else ""
             cells += [_number(float(pair.drift.deviations[k]), 2), Cell(number(z), z, kind)]

@@ -1,1 +1,1 @@
-"""Gather, store and read the evidence that a report draws beside `parameters.json`."""
+"""Collect, store and read the data behind a report (`evidence.json`)."""

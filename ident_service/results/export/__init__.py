@@ -1,1 +1,1 @@
-"""Export an identified arm: one file per format, each read back before it is kept."""
+"""Export an identified arm to other formats; each file is read back and checked."""

@@ -6,7 +6,8 @@ import numpy as np
 
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.results.export.bodies import about_center, joint_bodies
+from ident_service.model.parameter_layout import about_center
+from ident_service.results.export.bodies import joint_bodies
 from ident_service.results.export.identified_arm import IdentifiedArm
 
 _LEAST_MASS = 1e-3  # [kg]
@@ -18,7 +19,7 @@ def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
         return ()
     count, size = arm.verdicts.count("unidentified"), arm.base.size
     drawn = arm.model.config.identification.prior.kind != "none"
-    how = "drawn to the prior parameters" if drawn else "the option prior of ident identify draws to plausible ones"
+    how = "regularised towards the prior parameters" if drawn else "see the option --prior of ident identify"
     first = (
         f"link values are one feasible body of many with the same torques ({how}); "
         f"{count} of {size} base parameters are unidentified"

@@ -22,9 +22,9 @@ from ident_service.config.arm import Joint
 from ident_service.errors import ModelError, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.friction_state import presliding_ways
-from ident_service.model.parameter_layout import INERTIAL, Layout
+from ident_service.model.parameter_layout import INERTIAL, Layout, about_center
 from ident_service.model.regressor import joint_regressor
-from ident_service.results.export.bodies import about_center, about_origin, joint_bodies
+from ident_service.results.export.bodies import about_origin, joint_bodies
 from ident_service.results.export.bodies_said import body_notes
 from ident_service.results.export.c_header import c_header, c_prefix, turning_said
 from ident_service.results.export.identified_arm import IdentifiedArm, read_identified
@@ -165,7 +165,7 @@ def _check(arm: IdentifiedArm, text: str, name: str) -> None:
     if content["base_parameters"]["values"] != arm.beta.tolist():
         raise ModelError(f"{name}: the base parameters read back differ; it was not written")
     if content["friction"]["presliding"] != presliding_ways(arm.model).tolist():
-        raise ModelError(f"{name}: the ways of pre-sliding read back differ; it was not written")
+        raise ModelError(f"{name}: the pre-sliding distances read back differ; it was not written")
     if arm.delta is None:
         return
     joints, drives, n = content["joints"], dict(content["drives"]), len(content["joints"])
@@ -217,7 +217,7 @@ class Export:
     notes: tuple[str, ...] = ()
 
 
-_BASE_ONLY = "no body has these parameters: base parameters only"
+_BASE_ONLY = "not feasible: base parameters only"
 
 
 def _urdf(arm: IdentifiedArm) -> Export:

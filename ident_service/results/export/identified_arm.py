@@ -55,7 +55,9 @@ class IdentifiedArm:
         """Return what the standard deviations belong to, where it is not the values beside them; else empty."""
         if self.feasible_set == "none" or not any(deviation is not None for deviation in self.sigma):
             return ""
-        return f"standard deviations are of the unconstrained fit; values are held in the set {self.feasible_set}"
+        return (
+            f"standard deviations are of the unconstrained fit; values are constrained to the set {self.feasible_set}"
+        )
 
     @cached_property
     def base_delta(self) -> Array:
@@ -75,8 +77,8 @@ class IdentifiedArm:
         """
         if self.delta is None:
             raise ModelError(
-                f"{self.model.config.name}: no body has these parameters, so there are no link inertias to export; "
-                "csv, json and c take base parameters, and `ident correct` gives the nearest ones that a body has"
+                f"{self.model.config.name}: these parameters are not feasible, so there are no link inertias to export;"
+                " csv, json and c take base parameters, and `ident project` gives the nearest feasible ones"
             )
         return self.delta
 

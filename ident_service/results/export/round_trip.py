@@ -138,6 +138,6 @@ def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
     if not said:
         return ()
     return (
-        f"pre-sliding of dry friction (way: {', '.join(said)}): here it turns round at once, and torques after a "
+        f"pre-sliding of dry friction (distance: {', '.join(said)}): here it reverses at once, and torques after a "
         "reversal differ by up to twice the dry friction; the torque errors of the report are with pre-sliding",
     )

@@ -15,9 +15,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape  # xml.sax.saxutils brings urllib and ssl
 from pathlib import Path
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -26,9 +26,10 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.parameter_layout import joint_drives
+from ident_service.model.parameter_layout import about_center, joint_drives
+from ident_service.model.solids import rotation_rpy
 from ident_service.model.urdf import urdf_text
-from ident_service.results.export.bodies import about_center, about_origin, is_real, moved, rotation_rpy
+from ident_service.results.export.bodies import about_origin, is_real, joint_bodies, moved
 from ident_service.results.export.round_trip import (
     Carried,
     gravity_of,
@@ -152,9 +153,12 @@ def edited(text: str, edits: Sequence[Edit]) -> str:
     return b"".join([*parts, data[at:]]).decode("utf-8")
 
 
+_WHITESPACE = str.maketrans({"\n": "&#10;", "\r": "&#13;", "\t": "&#9;"})  # a parser makes blanks of plain ones
+
+
 def start_tag(tag: str, attributes: Mapping[str, str], *, closed: bool = True) -> str:
     """Return a start tag, or a whole element without content."""
-    listed = "".join(f" {key}={quoteattr(value)}" for key, value in attributes.items())
+    listed = "".join(f' {key}="{escape(value).translate(_WHITESPACE)}"' for key, value in attributes.items())
     return f"<{tag}{listed}{'/' if closed else ''}>"
 
 
@@ -202,8 +206,6 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
         ModelError: a link without positive mass, or a file that cannot be edited.
     """
     from ident_service.model.mechanism import read_mechanism
-    from ident_service.model.mechanism_process import delta_from_inertia
-    from ident_service.model.pinocchio_models import joint_frame_inertias
 
     file = model.config.kinematics.urdf
     if file is None:
@@ -213,22 +215,23 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     edits: list[Edit] = []
     notes: list[str] = []
     drives = joint_drives(model.chain, model.layout, delta)
-    for k, inertia in enumerate(joint_frame_inertias(model.chain, model.layout, delta)):
+    for k, whole in enumerate(joint_bodies(model, delta)):
         joint = robot.joints[model.chain.names[k]]
         link = _named(joint, "child", file.name)
-        whole = delta_from_inertia(inertia)
         bolted = [
             (name, inertial) for name, inertial in robot.bolted_to(link) if inertial is not None and inertial.any()
         ]
         rest = whole - sum((inertial for _, inertial in bolted), np.zeros(10))
         names = ", ".join(name for name, _ in bolted)
         if bolted and is_real(rest) and all(is_real(inertial) for _, inertial in bolted):
-            notes.append(f"link {link} has the identified body less what is bolted to it, which is as it was: {names}")
+            notes.append(
+                f"link {link} has the identified body less the links fixed to it, which are unchanged: {names}"
+            )
             whole = rest
         elif bolted:
-            notes.append(f"link {link} has the whole identified body; what is bolted to it has no inertia now: {names}")
+            notes.append(f"link {link} has the whole identified body; links fixed to it have no inertia now: {names}")
             if movable := [name for name, _ in bolted if name in robot.on_held_joints]:
-                notes.append(f"of these, {', '.join(movable)} hang on joints that move, which some programs refuse")
+                notes.append(f"of these, {', '.join(movable)} are on moving joints, which some programs refuse")
             edits += [_removed(robot.links[name], file.name) for name, _ in bolted]
         edits += _inertial(file.text, robot.links[link], whole)
         written = {

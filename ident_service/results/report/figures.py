@@ -250,14 +250,14 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
     above = Axes(
         LEFT, _RESIDUAL_TOP, wide, _RESIDUAL_HEIGHT, np.log10(low), np.log10(high), *range_around(*densities, least=1.0)
     )
-    draw_frame(canvas, above, x="frequency [Hz]", y=f"density of what is left [{unit}]", x_log=True, y_log=True)
+    draw_frame(canvas, above, x="frequency [Hz]", y=f"density of the residual [{unit}]", x_log=True, y_log=True)
     for kind, spectrum, density in zip(kinds, spectra, densities, strict=True):
         canvas.polyline(kind, above.x(np.log10(spectrum.frequency)), above.y(density))
     longest = max(float(spectrum.lag[-1]) for spectrum in spectra)
     below = Axes(
         LEFT, _RESIDUAL_TOP + _RESIDUAL_HEIGHT + _RESIDUAL_BETWEEN, wide, _RESIDUAL_HEIGHT, 0.0, longest, -1.05, 1.05
     )
-    draw_frame(canvas, below, x="lag [s]", y="autocorrelation of what is left")
+    draw_frame(canvas, below, x="lag [s]", y="autocorrelation of the residual")
     white = max(spectrum.white for spectrum in spectra)
     for level in (-white, white):
         canvas.line("limit", LEFT, float(below.y(level)), LEFT + wide, float(below.y(level)))
@@ -281,7 +281,7 @@ def _log(spectrum: Spectrum) -> Array:
 
 def _strongest(spectrum: Spectrum) -> str:
     at = spectrum.frequency[int(np.argmax(spectrum.density))]
-    return f"most is left at {number(float(at))} Hz"
+    return f"largest at {number(float(at))} Hz"
 
 
 def _memory(spectrum: Spectrum) -> str:
@@ -320,7 +320,7 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
         max(float(logs.max()), 1.0) + 0.1,
     )
     late = timing.source == "cycle"
-    what = "how late a cycle began" if late else "how far a step is from the usual one"
+    what = "lateness of a cycle" if late else "deviation of a step from the period"
     draw_frame(canvas, axes, x=f"{what} [{unit}]", y="cycles" if late else "steps", y_log=True)
     bottom = _TIMING_TOP + _TIMING_HEIGHT
     for count, log, begin, end in zip(timing.counts, logs, timing.edges[:-1], timing.edges[1:], strict=True):
@@ -336,8 +336,8 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
         title=f"Timing of {timing.recording}",
         description=words,
         caption=(
-            f"{words} Good: one narrow heap at the left, within {within} of the period "
-            f"({number(scale / timing.rate)} {unit}). Bad: a tail as long as the period, or a second heap."
+            f"{words} Good: one narrow peak at the left, within {within} of the period "
+            f"({number(scale / timing.rate)} {unit}). Bad: a tail as long as the period, or a second peak."
         ),
         canvas=canvas,
     )
@@ -454,14 +454,14 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
             canvas.rectangle(kind, x - 3.6, y - 3.6, 7.2, 7.2)
     counts = ", ".join(f"{verdicts.count(word)} {word}" for word in _KINDS)
     blind = int(np.isnan(shares).sum())
-    words = f"Of {size} base parameters: {counts}." + (f" The recordings are blind to {blind}." if blind else "")
+    words = f"Of {size} base parameters: {counts}." + (f" The recordings do not excite {blind}." if blind else "")
     return Figure(
         slug="deviations",
         title="Relative standard deviation of every base parameter",
         description=words,
         caption=(
             f"{words} Good: round dots below the lower line, where it is below {100 * IDENTIFIED_BELOW:g} % of "
-            "the parameter or of what is as good as zero. Bad: squares above the upper line; their values mean nothing."
+            "the parameter or of a negligible size. Bad: squares above the upper line; their values mean nothing."
         ),
         canvas=canvas,
     )
@@ -498,7 +498,7 @@ def correlation_figure(parameters: ParameterFile) -> Figure | None:
         description=words,
         caption=(
             f"{words if pairs else ''} Fuller marks are stronger, below {_LEAST_SHOWN:g} is none. Good: little but "
-            "specks. Bad: marks that fill their place (beyond 0.9), parameters that this motion cannot tell apart."
+            "specks. Bad: marks that fill their place (beyond 0.9), parameters that this motion cannot separate."
         ).strip(),
         canvas=canvas,
     )
@@ -521,7 +521,7 @@ _NAMES = "xyz"
 _SMALLEST = 0.01  # share of the picture below which nothing is seen beside the dot of the centre
 _BODIES_GOOD = (
     "Each ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on. "
-    "Bad: flat, huge or far from their link, which means that the motion says little of how the mass is spread."
+    "Bad: flat, huge or far from their link, which means that the motion does not determine the mass distribution."
 )
 
 
@@ -629,7 +629,7 @@ def _words(joints: tuple[str, ...], posed: PosedArm, outside: list[bool], longes
     if large := [f"{name} ({number(size)} m)" for name, size in zip(joints, lengths, strict=True) if size > longest]:
         words += (
             f" Longer than the picture ({number(longest)} m) and not drawn: the ellipsoid of {', '.join(large)}. "
-            "It is one body of many that move alike; --prior draws the choice to bodies that are known."
+            "It is one body of many with the same dynamics; --prior moves the choice towards known bodies."
         )
     tiny = _SMALLEST * longest
     if small := [name for name, size in zip(joints, lengths, strict=True) if 0.0 < size < tiny]:

@@ -54,7 +54,7 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
     for k, expression in enumerate(content["expressions"]):
         cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
         cells.append(_number(float(parameters.values[k])))
-        cells.append(Cell("not seen", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
+        cells.append(Cell("not excited", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
         cells.append(Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")))
         cells += [_NOTHING if values is None else _number(float(values[k])) for _, values in others]
         if intervals:
@@ -136,8 +136,8 @@ def margin_table(evidence: Evidence) -> str:
         rows.append([Cell(name), *_tightest(own)])
     if several := [one for one in evidence.conditions if len(one.links) != 1]:
         rows.append([Cell("several links"), *_tightest(several)])
-    heads = ["link", "least room in", "smallest eigenvalue", "in reference units"]
-    return table("Room inside the feasible set, link by link", heads, rows)
+    heads = ["link", "smallest margin in", "smallest eigenvalue", "in reference units"]
+    return table("Margin inside the feasible set, link by link", heads, rows)
 
 
 def _tightest(conditions: list[Condition]) -> list[Cell]:
@@ -202,7 +202,7 @@ _NO_WARNING = (
     f"stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands under Timing."
 )
 _NOTHING_AGAINST = (
-    f"None: no joint is off by more than {POOR:g} % of its own torque, no condition is active and no parameter "
+    f"None: no joint is off by more than {POOR:g} % of its own torque, no constraint is active and no parameter "
     "is unidentified."
 )
 _ARRIVAL = (
@@ -261,7 +261,7 @@ _TITLES = {
     "warnings": "Warnings",
     "parameters": "Parameters",
     "torque": "Measured and predicted torque",
-    "residual": "Spectrum and autocorrelation of what is left",
+    "residual": "Spectrum and autocorrelation of the residual",
     "friction": "Friction",
     "doubt": "Uncertainty and correlation",
     "bodies": "Feasibility and bodies",
@@ -318,19 +318,19 @@ def _torque(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> It
     if said := parameters.content.get("fit", {}).get("rows_and_filter"):
         yield items(said)
     for one, made in zip(evidence.recordings, drawn.torque, strict=True):
-        role = "fitted to" if one.role == "identification" else "never seen by the fit"
+        role = "fitted to" if one.role == "identification" else "not used in the fit"
         yield f"<h3>{plain(one.name)}, {role}</h3>{_grid(made, '')}"
     if not any(one.role == "validation" for one in evidence.recordings):
-        yield paragraph("There is no recording that the fit has not seen. Give one with --validate.")
+        yield paragraph("There is no validation recording. Give one with --validate.")
 
 
 def _bodies(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> Iterable[str]:
     if not evidence.conditions:
-        yield paragraph("No body has these parameters, so there are no link parameters, no margins, no ellipsoids.")
+        yield paragraph("These parameters are not feasible, so there are no link parameters, margins or ellipsoids.")
         return
     yield paragraph(
-        "Motion shows base parameters only: the bodies are one choice of many that move alike. Good: much room. "
-        "Bad: almost none: data and condition pull against each other."
+        "Motion determines base parameters only: the bodies are one choice of many with the same dynamics. "
+        "Good: large margins. Bad: almost none, where a constraint is active."
     )
     if strange := parameters.content.get("link_parameters", {}).get("implausible"):
         yield items([f"Implausible, {line}." for line in strange])

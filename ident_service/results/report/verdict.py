@@ -73,14 +73,14 @@ def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
         return ""
     known = {one.name for one in evidence.conditions}
     of = f" of {len(known)}" if known.issuperset(tight) else ""
-    return f"{len(tight)}{of} conditions are active" if len(tight) > 1 else f"1{of} condition is active"
+    return f"{len(tight)}{of} constraints are active" if len(tight) > 1 else f"1{of} constraint is active"
 
 
 def limitations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """Return the limitations of the estimate, in sentences; empty where there are none."""
     found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
     if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
-        found.append("No real body has these parameters.")
+        found.append("The parameters are not physically feasible.")
     second = parameters.content.get("second_opinion", {})
     if second.get("conclusive") and not second.get("agrees", True):
         found.append("A second solution of the constrained problem predicts other torques (report.txt).")
@@ -92,17 +92,19 @@ def limitations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
             f"Off by more than {POOR:g} % of their own torque, near standstill only: {joints_in_words(still)}."
         )
     if words := active_conditions(evidence, parameters):
-        found.append(f"{words}: there the values follow from the conditions, not from the recordings.")
+        found.append(f"{words}: there the values are determined by constraints, not by the recordings.")
     verdicts = parameters.content["base_parameters"].get("verdicts", [])
     if count := verdicts.count("unidentified"):
-        found.append(f"{count} of {len(verdicts)} base parameters are unidentified: these recordings do not tell them.")
+        found.append(
+            f"{count} of {len(verdicts)} base parameters are unidentified: these recordings do not determine them."
+        )
     fit = parameters.content.get("fit")
     # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
     if fit is not None and "unidentified" in verdicts and (fit["condition_number"] or np.inf) > ILL_CONDITIONED:
         size = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
         found.append(
             f"The regressor's condition number is {size}, above {ILL_CONDITIONED:g}: "
-            "some sums of parameters hardly show."
+            "some combinations of parameters are hardly excited."
         )
     return found
 
@@ -129,7 +131,7 @@ def shortened(name: str) -> str:
 
 
 _MUCH_WORSE = 1.5  # times the error on what was fitted to
-SIMULATED = "The arm's driver is a simulated one: this is about a simulation, not a commissioning of a real arm."
+SIMULATED = "The arm is simulated: this is no commissioning of a real arm."
 # The page repeats a file, which anybody may have written; only the verifier, with the arm, can tell.
 _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` checks it in exact arithmetic."
 
@@ -156,30 +158,30 @@ def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = 
 def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     found = parameters.content.get("feasibility")
     if found is None:
-        return ["Whether a real body could have these parameters was not tested."]
+        return ["Physical feasibility was not tested."]
     margin, kind = number(found["margin"]), found.get("certificate", {}).get("kind", "")
     certified = kind in ("witness", "dual")
     tight = listed(found.get("tight", []))
     if parameters.feasible_set == "none":
-        how = "They were not held in any feasible set."
+        how = "They were estimated without a feasible set."
     else:
-        how = f"They were held in the feasible set {parameters.feasible_set}."
+        how = f"They were constrained to the feasible set {parameters.feasible_set}."
     if found["margin"] > 0.0:
-        sentences = [f"A real body could have these parameters (margin {margin})."]
+        sentences = [f"They are physically feasible (margin {margin})."]
         if certified and found["feasible"]:
             sentences.append(_CERTIFIED)
         else:
             sentences.append("They lie too close to the boundary for a certificate in exact arithmetic.")
         if (custom := parameters.content.get("custom")) is not None:
             name = shortened(custom["function"])
-            sentences.append(f"They were also held to what {name} says, a function that no certificate is about.")
+            sentences.append(f"They also meet {name} says, a function that no certificate is about.")
         if tight:
-            sentences.append(f"{active_conditions(evidence, parameters)}, which the data pull against: {tight}.")
+            sentences.append(f"{active_conditions(evidence, parameters)}: {tight}.")
         return [*sentences, how]
-    sentences = [f"No real body has these parameters (margin {margin})."]
+    sentences = [f"They are not physically feasible (margin {margin})."]
     sentences.append(_CERTIFIED if certified else "There is no certificate of that in exact arithmetic.")
     if tight:
-        sentences.append(f"What contradicts them: {tight}.")
+        sentences.append(f"Violated constraints: {tight}.")
     return [*sentences, how]
 
 
@@ -188,13 +190,13 @@ def _prediction(evidence: Evidence) -> str:
     fitted = "" if own.identification is None else _error(own.identification, own.moving)
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
     if not own.validation:
-        known = f" On what it was fitted to its torque error is {fitted}." if fitted else ""
-        return f"It was judged on no recording that it had not seen, so how well it predicts is not known.{known}"
+        known = f" On the fitted recordings its torque error is {fitted}." if fitted else ""
+        return f"There is no validation recording, so its prediction error is unknown.{known}"
     moving = own.moving_validation or (None,) * len(own.validation)
     errors = ", ".join(
         f"{_error(error, alone)} on {name}" for name, error, alone in zip(unseen, own.validation, moving, strict=True)
     )
-    words = f"On what it never saw its torque error is {errors}, against {fitted} on what it was fitted to: "
+    words = f"On validation recordings its torque error is {errors}, against {fitted} on the fitted ones: "
     words += "it predicts other motions " if own.moving is None else "away from standstill it predicts other motions "
     words += "markedly worse than its own" if _generalises_poorly(evidence) else "about as well as its own"
     if own.moving is None or own.identification is None:
@@ -207,7 +209,7 @@ def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """Return sentences on joints whose errors the error of the whole arm hides."""
     poor = poor_joints(evidence, parameters)
     unseen = bool(evidence.estimates[evidence.chosen].validation)
-    where = "what it never saw" if unseen else "what it was fitted to"
+    where = "the validation recordings" if unseen else "the fitted recordings"
     if not poor:
         return [f"No joint's error exceeds {POOR:g} % of its own torque on {where}."]
     sentences = []
@@ -240,7 +242,7 @@ def _knowledge(parameters: ParameterFile) -> str:
     table = parameters.content["base_parameters"]
     verdicts = table.get("verdicts")
     if verdicts is None:
-        return "How sure its parameters are is not known."
+        return "The uncertainty of its parameters is unknown."
     counts = {word: verdicts.count(word) for word in ("identified", "weak", "unidentified")}
     words = f"Of {len(verdicts)} base parameters {counts['identified']} are identified to {100 * IDENTIFIED_BELOW:g} %"
     words += f", {counts['weak']} are weak (to {100 * WEAK_BELOW:g} %) and {counts['unidentified']} unidentified"
@@ -251,24 +253,24 @@ def _knowledge(parameters: ParameterFile) -> str:
         f"{shortened(name)} ({'not seen' if np.isinf(share) else number(share, 2)})" for name, share in unknown[:NAMED]
     )
     more = f"; and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
-    return f"{words}, the least sure first (\u03c3 over the larger of size and reference): {shown}{more}."
+    return f"{words}, the most uncertain first (\u03c3 over the larger of size and reference): {shown}{more}."
 
 
 def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     """Return what a person should do now, the most urgent thing first."""
     if parameters.content.get("unusable"):
-        return "Next: mend what forbids their use, and identify again."
+        return "Next: correct what forbids their use, and identify again."
     steps = []
     found = parameters.content.get("feasibility")
     if found is not None and found["margin"] <= 0.0:
         steps.append("identify within a feasible set, and look first for wrong signs, units or joint directions")
     if evidence.warnings:
-        steps.append("mend what the recordings' warnings name and record again")
+        steps.append("correct what the recordings' warnings name and record again")
     own = evidence.estimates[evidence.chosen]
     if not own.validation:
         steps.append("record a second motion and give it with --validate")
     elif _generalises_poorly(evidence):
-        steps.append("look below at which joint's residual follows the motion, and identify from a richer one")
+        steps.append("see below which joint's residual follows the motion, and identify from a richer motion")
     poor = poor_joints(evidence, parameters)
     if moving := [one.name for one in poor if one.in_motion]:
         steps.append(
@@ -278,11 +280,11 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
     if still := [one.name for one in poor if not one.in_motion]:
         steps.append(f"use it where joints move, not for the torque near standstill of {', '.join(still)}")
     if active_conditions(evidence, parameters):
-        steps.append("find out why the data pull against the active conditions: signs, units, friction, drive inertia")
+        steps.append("find out why constraints are active: signs, units, friction, drive inertia")
     if "unidentified" in parameters.content["base_parameters"].get("verdicts", []):
         steps.append(
-            "where the unidentified parameters matter, design a motion that teaches them (ident design --after)"
+            "where the unidentified parameters matter, design a motion that excites them (ident design --after)"
         )
     if not steps:
-        return "Next: nothing stands against using it."
+        return "Next: it can be used."
     return "Next: " + "; ".join(steps) + "."
