@@ -56,7 +56,7 @@ def entry_of(text: str, name: str, unit: str = "") -> Entry:
 
 
 DRIVE_PROFILE = 402  # low word of 1000h
-TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "mA": 1e-3}
+TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "cNm": 1e-2, "mA": 1e-3}
 _SAME = 0.01  # of a torque's unit: rounding, not another unit
 _ABSURD = 5.0  # between two sayings of one rated torque
 _MOST_TIMES = 20.0  # the rated torque, which no drive's peak torque comes near

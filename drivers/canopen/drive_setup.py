@@ -23,7 +23,15 @@ from drivers.canopen.cia402 import POWER_OFF, state_of
 from drivers.canopen.motor_units import count_limits, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
-from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused, WriteNotVerified, optional
+from drivers.canopen.sdo import (
+    DOES_NOT_EXIST,
+    READ_ONLY,
+    WRONG_VALUE,
+    Objects,
+    SdoRefused,
+    WriteNotVerified,
+    optional,
+)
 from drivers.canopen.stored_zero import Zeros
 from drivers.motor_units import Coordinates
 from ident_service.config.arm import ArmConfig
@@ -42,6 +50,7 @@ from ident_service.errors import AnotherDrive, DriverError
 _SMALL = {0x0002: Kind.I8, 0x0005: Kind.U8}
 _DUMMIES = {0x0003: Kind.I16, 0x0006: Kind.U16} | _SMALL
 _NOT_VALID = 1 << 31
+_AT_SYNC = (1, 0, 255)  # types of frames of targets, in the order in which they are tried
 
 
 def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo], dummies: Sequence[int]) -> None:
@@ -66,7 +75,9 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
     for pdo in waiting:
         _map(objects, variants[pdo])
         for write in pdo.parameters:
-            if write.entry.sub == od.TPDO_INHIBIT.sub:
+            if write.entry.sub == od.RPDO_TYPE.sub and not pdo.sent and pdo.type == _AT_SYNC[0]:
+                _synchronous(objects, pdo, write)
+            elif write.entry.sub == od.TPDO_INHIBIT.sub:
                 objects.ensure_if_there(write)
             else:
                 objects.ensure(write)
@@ -82,6 +93,33 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
             objects.ensure_if_there(
                 pdo.timing
             )  # a deadline left by another host could report a silence where there is none
+
+
+def _synchronous(objects: Objects, pdo: Pdo, wanted: Write) -> None:
+    """Set the type of a frame of targets: at every SYNC, where a drive lacks that at the next, or at once.
+
+    At once, a target acts by the time that its frames need on the wire before the stamp of its cycle.
+    """
+    for kind in _AT_SYNC:
+        try:
+            objects.ensure(replace(wanted, value=kind))
+        except SdoRefused as refused:
+            if kind == _AT_SYNC[-1] or refused.code not in (*WRONG_VALUE, *READ_ONLY):
+                raise
+            if refused.code in READ_ONLY and objects.read(wanted.entry) in _AT_SYNC:
+                return
+        else:
+            return
+
+
+def _is_timed(objects: Objects, pdo: Pdo, write: Write) -> bool:
+    """Return whether an entry holds a value; the type of a frame of targets may be that of the next SYNC.
+
+    One that acts at once is the type from the factory: whether the drive has a better one shows when it is written.
+    """
+    if write.entry.sub == od.RPDO_TYPE.sub and not pdo.sent and pdo.type == _AT_SYNC[0]:
+        return objects.read(write.entry) in _AT_SYNC[:2]
+    return optional(objects.holds, write) is not False
 
 
 def _variants(pdo: Pdo, dummies: Sequence[int]) -> list[Pdo]:
@@ -101,9 +139,7 @@ def _room(slot: Entry, index: int) -> tuple[Entry, ...]:
 
 
 def _is_there(objects: Objects, pdo: Pdo) -> bool:
-    return _is_mapped(objects, pdo) and all(
-        optional(objects.holds, write) is not False for write in (*pdo.parameters, pdo.on)
-    )
+    return _is_mapped(objects, pdo) and all(_is_timed(objects, pdo, write) for write in (*pdo.parameters, pdo.on))
 
 
 def _is_mapped(objects: Objects, pdo: Pdo) -> bool:

@@ -170,10 +170,12 @@ class BusCodec:
         drives: the state of each, in the order of `profile.drives`.
         controller: state of the host's CAN controller.
         counters: frames that were not used.
+        asked: entries whose uploads are kept, by `index << 8 | sub-index`.
     """
 
     def __init__(self, profile: BusProfile) -> None:
         self.profile = profile
+        self.asked = {od.STATUS_WORD.key}
         self.drives = tuple(Drive(node) for node in profile.nodes)
         self.controller = ControllerState.ACTIVE
         self.counters = Counters()
@@ -331,10 +333,10 @@ class BusCodec:
     def _on_upload(self, drive: Drive, frame: Frame) -> None:
         """Keep the answer to a question of one frame (`sdo.upload_request`); others are neither used nor strange."""
         data = frame.data
-        if len(data) != 8 or data[0] & 0xE3 != _UPLOADED:
+        _, index, sub = _MULTIPLEXER.unpack_from(data.ljust(_MULTIPLEXER.size, b"\0"))
+        if len(data) != 8 or data[0] & 0xE3 != _UPLOADED or index << 8 | sub not in self.asked:
             self.counters.ignored += 1
             return
-        _, index, sub = _MULTIPLEXER.unpack_from(data)
         drive.uploads[index << 8 | sub] = value = data[4 : 8 - (data[0] >> 2 & 3)]
         if (index, sub, len(value)) == (od.STATUS_WORD.index, 0, 2):
             self._take_status(drive, od.STATUS_WORD.unpack(value))

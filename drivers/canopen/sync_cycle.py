@@ -147,7 +147,9 @@ class Buses:
 
     def ask(self, number: int, entry: Entry) -> None:
         """Send the upload of an entry of up to four bytes; the answer comes with a later cycle (`Drive.uploads`)."""
-        self._at[number][1].send(Frame(SDO_REQUEST + self.drives[number].node, upload_request(entry)))
+        codec, link = self._at[number]
+        codec.asked.add(entry.key)
+        link.send(Frame(SDO_REQUEST + self.drives[number].node, upload_request(entry)))
 
     def mode_shown(self, number: int) -> int | None:
         """Return the last answer of a drive to `ask` for its mode of operation; None before one."""

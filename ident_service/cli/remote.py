@@ -292,6 +292,10 @@ LOCAL_ONLY: dict[str, str] = {
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
+    **dict.fromkeys(
+        ("bus import", "bus store", "bus restore"), "it changes what drives keep; it is an act at the arm's computer"
+    ),
+    "bus report": "it writes a file beside you; log in where the daemon runs",
     **dict.fromkeys(("backup", "restore"), "it is done at the daemon's machine, in its state folder"),
     "token add": "whoever got hold of an operator's token could make others that outlive it; "
     "it is done at the daemon's machine, in its state folder",

@@ -61,11 +61,14 @@ class PositionPath(Section):
 
 
 class TorqueUnit(Section):
-    """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant."""
+    """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant.
+
+    `cNm` is for drives that count N m x 100 (Roboteq's 6071h: `count: 1`).
+    """
 
     rated: EntryText | None = None
     count: Positive | None = None
-    unit: Literal["mNm", "uNm", "mA"]
+    unit: Literal["mNm", "uNm", "cNm", "mA"]
     writable: bool = False
 
     @model_validator(mode="after")
@@ -73,7 +76,7 @@ class TorqueUnit(Section):
         if (self.rated is None) == (self.count is None):
             raise ValueError("either `rated` names an entry, or `count` is a number")
         if self.writable and (self.rated is None or self.unit == "mA"):
-            raise ValueError("only a rated torque in mNm or uNm is written")
+            raise ValueError("only a rated torque in mNm, uNm or cNm is written")
         return self
 
 

@@ -356,3 +356,27 @@ def change_nothing(frames: list[Frame]) -> None:
         assert -(2**31) <= drive.position < 2**31
         assert not drive.seen or struct.pack("<i", drive.position) in [frame.data for frame in good]
     assert all(isinstance(event, Event) and event.words for event in bus.take_events())
+
+
+def test_uploads_are_kept_of_what_was_asked_for_alone() -> None:
+    """Another tool's conversation with a drive is not ours; a flood of it must not be kept."""
+    bus = codec()
+    drive = bus.drives[0]
+    for index in range(0x1000, 0x1400):
+        bus.receive(Frame(0x580 + drive.node, struct.pack("<BHBI", 0x43, index, 0, 7)))
+        bus.receive(Frame(0x580 + drive.node, b"\x43"))
+    assert drive.uploads == {}
+    assert bus.counters.ignored == 2 * 0x400
+    bus.receive(Frame(0x580 + drive.node, struct.pack("<BHBHxx", 0x4B, 0x6041, 0, 0x1637)))
+    assert (drive.status, drive.uploads) == (0x1637, {0x604100: b"\x37\x16"})
+    bus.asked.add(0x606100)
+    bus.receive(Frame(0x580 + drive.node, struct.pack("<BHBbxxx", 0x4F, 0x6061, 0, 10)))
+    assert drive.uploads[0x606100] == b"\x0a"
+    for torn in (b"", b"\x4b", b"\x4b\x41\x60\x00\x00", bytes(8), b"\x80\x41\x60\x00\x00\x00\x02\x06"):
+        bus.receive(Frame(0x580 + drive.node, torn))
+    assert drive.status == 0x1637
+
+
+def test_a_control_word_by_sdo_is_a_download_of_two_bytes() -> None:
+    frame = codec().control_download(3, 0x0002)
+    assert (frame.identifier, frame.data) == (0x603, bytes((0x2B, 0x40, 0x60, 0, 2, 0, 0, 0)))

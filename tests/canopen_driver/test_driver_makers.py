@@ -262,3 +262,35 @@ def test_a_drive_that_falls_into_another_mode_is_not_enabled() -> None:
         ):
             arm.enable()
         assert "operation enabled" not in bench.states
+
+
+@pytest.mark.parametrize(("low", "high", "kind"), [(0, 0, 0), (254, 255, 255), (0, 240, 1)])
+def test_torque_frames_act_at_sync_at_the_next_or_at_once_as_a_drive_has_it(low: int, high: int, kind: int) -> None:
+    """Trinamic's have 0, or 254 and 255 only."""
+    bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds"))
+    key = 0x140002
+    for face in bench.behind.emulator.faces:
+        objects = face.objects  # type: ignore[attr-defined]
+        objects.entries[key] = type(objects.entries[key])(**{**vars(objects.entries[key]), "low": low, "high": high})
+        objects.values[key] = 253  # whatever it was
+    for first in (True, False):
+        with bench.arm as arm:
+            assert [face.objects.number(0x1400, 2) for face in bench.behind.emulator.faces] == [kind] * 2  # type: ignore[attr-defined]
+            # 255 is what many have from the factory: whether that is all they can shows when another is written.
+            assert first or kind == 255 or not [one for one in bench.downloads() if one[1] == 0x1400]
+            arm.enable()
+            for _ in range(20):
+                sample = arm.exchange(np.array([0.1, -0.1]))
+            np.testing.assert_allclose(sample.torque, [0.1, -0.1], atol=1.1e-3)
+            torques = bench.behind.emulator.body.truth(bench.behind.clock.now_ns()).torque
+            np.testing.assert_allclose(torques, sample.torque, atol=1e-9)
+
+
+def test_a_drive_that_takes_no_type_of_torque_frames_is_refused() -> None:
+    bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds"))
+    objects = bench.behind.emulator.faces[1].objects  # type: ignore[attr-defined]
+    key = 0x140002
+    objects.entries[key] = type(objects.entries[key])(**{**vars(objects.entries[key]), "low": 2, "high": 9})
+    objects.values[key] = 5
+    with pytest.raises(DriverError, match=r"node 2: setting 1400h:02"):
+        bench.arm.open()

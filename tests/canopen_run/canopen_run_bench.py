@@ -10,18 +10,31 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import yaml
+from motion.motion_bench import Story
 
+from drivers.canopen.driver import CanopenArm
 from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.errors import ArmFault
+from ident_service.excitation.described_motion import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.command_channel import StopCondition
+from ident_service.motion.run import RunReport, run
 from ident_service.registry.state_folder import fault_file
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 PATIENCE = 60.0  # s of the machine's time; nothing is judged by it but what never happens
 TRIES = 5
 MOTION = {"kind": "seeded", "seed": 1, "base_frequency": 0.2, "harmonics": 5, "periods": 2}
+SHORT = {"kind": "seeded", "seed": 1, "base_frequency": 0.4, "harmonics": 2, "periods": 1}
 TORQUE_NOISE = [0.05, 0.02]
 # What a machine that stalls does to an arm in real time; a run that ended so is run again. 8250h is the emergency of a
 # drive whose torque frame is overdue, which may be heard before its watchdog's status.
@@ -181,3 +194,51 @@ def child(parent: int, words: str) -> int | None:
 
 def channel() -> str:
     return f"run-{os.getpid()}-{time.monotonic_ns() % 1_000_000}"
+
+
+@dataclass
+class Moved:
+    """A motion with a fault in its midst, and what came of it."""
+
+    behind: LockStepArm
+    story: Story
+    report: RunReport | None = None
+    fault: ArmFault | None = None
+    speed: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def off(self) -> bool:
+        """Whether no drive is enabled any more."""
+        return not any("operation enabled" in state for state in self.behind.emulator.states)
+
+
+def moved_arm(folder: Path, tree: dict[str, Any], fault: str = "", stop_at: int | None = None) -> Moved:
+    """A short motion of an arm over emulated drives in virtual time.
+
+    Args:
+        folder: for its description.
+        tree: the description.
+        fault: that strikes in the midst of it.
+        stop_at: cycle after which a stop is asked for.
+    """
+    tree["motions"] = {"identification": SHORT, "validation": SHORT}
+    config = load_arm(write(folder, tree))
+    behind, model = LockStepArm(config), arm_model(config)
+    came = Moved(behind, Story())
+    behind.emulator.observer = lambda seen: came.speed.append(np.abs(seen.velocity))
+    cycles = 0
+
+    def asked() -> bool:
+        nonlocal cycles
+        cycles += 1
+        if cycles == 600 and fault:
+            behind.inject(parse_fault(fault, tuple(config.joints)))
+        return stop_at is not None and cycles > stop_at
+
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        try:
+            motion = excitation(model, "identification")
+            came.report = run(arm, model, motion, came.story, StopCondition(asked), hold_seconds=0.1)
+        except ArmFault as error:
+            came.fault = error
+    return came

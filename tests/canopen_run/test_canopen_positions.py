@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from canopen_run_bench import canopen, checked, described, truth, write
-from motion.motion_bench import Story
+from canopen_run_bench import Moved, canopen, checked, described, moved_arm, truth, write
 
 from drivers.canopen.driver import CanopenArm
 from ident_service.cli import main
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmFault, ConfigError, DriverError
-from ident_service.excitation.described_motion import excitation
+from ident_service.errors import ConfigError, DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
-from ident_service.motion.command_channel import StopCondition
-from ident_service.motion.run import RunReport, run
 from ident_service.recordings.open import open_recording
-from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
 
 RATE = 250.0
 SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
-MOTION = {"kind": "seeded", "seed": 1, "base_frequency": 0.4, "harmonics": 2, "periods": 1}
 
 
 def positions(name: str, **driver: Any) -> dict[str, Any]:
@@ -90,45 +83,9 @@ def test_an_arm_is_checked_moved_and_identified_from_the_torque_that_its_drives_
     assert z @ z < 35.0, dict(zip(base.expressions, z, strict=True))
 
 
-@dataclass
-class Moved:
-    """A motion with a fault in its midst, and what came of it."""
-
-    behind: LockStepArm
-    story: Story
-    report: RunReport | None = None
-    fault: ArmFault | None = None
-    speed: list[np.ndarray] = field(default_factory=list)
-
-    @property
-    def off(self) -> bool:
-        """Whether no drive is enabled any more."""
-        return not any("operation enabled" in state for state in self.behind.emulator.states)
-
-
 def moved(folder: Path, fault: str = "", stop_at: int | None = None, **driver: Any) -> Moved:
-    tree = positions("faulty", **driver)
-    tree["motions"] = {"identification": MOTION, "validation": MOTION}
-    config = load_arm(write(folder, tree))
-    behind, model = LockStepArm(config), arm_model(config)
-    came = Moved(behind, Story())
-    behind.emulator.observer = lambda seen: came.speed.append(np.abs(seen.velocity))
-    cycles = 0
-
-    def asked() -> bool:
-        nonlocal cycles
-        cycles += 1
-        if cycles == 600 and fault:
-            behind.inject(parse_fault(fault, tuple(config.joints)))
-        return stop_at is not None and cycles > stop_at
-
-    with CanopenArm(config, behind.links if hasattr(behind, "links") else lambda _: [behind.link(0)]) as arm:
-        try:
-            motion = excitation(model, "identification")
-            came.report = run(arm, model, motion, came.story, StopCondition(asked), hold_seconds=0.1)
-        except ArmFault as error:
-            came.fault = error
-    return came
+    """A short motion of it, with a fault in its midst."""
+    return moved_arm(folder, positions("faulty", **driver), fault, stop_at)
 
 
 def test_a_run_ends_where_it_began_and_a_stop_is_a_stop(tmp_path: Path) -> None:

@@ -332,7 +332,7 @@ def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.C
         (change,) = drive["can"]["changes"]
         assert change["where"] == "drives.rated_torque"
         assert "wrong by 10, which is another unit" in change["why"]
-    assert [drive["can"]["identity"]["vendor"] for drive in first["drives"].values()] == [0xFB, 0xFF]
+    assert [first["drives"][f"drive {n}"]["can"]["identity"]["vendor"] for n in (1, 2)] == [0xFB, 0xFF]
     assert not [line for line in document["changed"] if "changes was" not in line]  # the drives are the same
 
 
