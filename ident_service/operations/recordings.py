@@ -160,7 +160,7 @@ def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> fl
 
     From then on brakes or the drives themselves hold the arm, and the recorded torque is not what acts on it.
     """
-    log = whole if isinstance(whole, McapRecording) else McapRecording(whole.path)
+    log = whole if isinstance(whole, McapRecording) else whole.whole
     if not log.own:
         return None
     ends = (event.stamp_ns for event in log.read_extras().events if event.name == "ident" and event.message in _ENDS)

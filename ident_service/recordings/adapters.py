@@ -243,6 +243,7 @@ class MeasuredRecording:
 
     Attributes:
         share: of the samples, that have a measured torque of all joints.
+        whole: the recording.
     """
 
     def __init__(self, whole: McapRecording) -> None:
@@ -259,7 +260,7 @@ class MeasuredRecording:
         self.joint_names = whole.joint_names
         self.joints = whole.joints
         self.torque_held = whole.torque_held
-        self._whole = whole
+        self.whole = whole
         self._stamps, self._torque = whole.measured(TOPIC)
         usable = np.isfinite(self._torque).all(axis=1)
         self._stamps, self._torque = self._stamps[usable], self._torque[usable]
@@ -271,11 +272,11 @@ class MeasuredRecording:
     @property
     def torn(self) -> bool:
         """Return whether the file ended in the middle of a record and was read up to there."""
-        return self._whole.torn
+        return self.whole.torn
 
     @torn.setter
     def torn(self, torn: bool) -> None:
-        self._whole.torn = torn
+        self.whole.torn = torn
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order; see `Recording.blocks`.
@@ -285,7 +286,7 @@ class MeasuredRecording:
         """
         found = False
         before: Block | None = None
-        for block in self._whole.blocks(samples):
+        for block in self.whole.blocks(samples):
             # The first sample of the next block has the torque that acted at the end of this one.
             if before is not None:
                 part = self._with_measured(before, int(block.stamp_ns[0]))

@@ -10,7 +10,7 @@ to stamp; for a bag neither is known. A file that was cut off is read up to the 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Final, Self
@@ -240,7 +240,9 @@ class Extras:
     robot_description: str | None
 
 
-def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) -> Extras:
+def read_extras(
+    path: Path, stream: IO[bytes], size: int, utc_offset_ns: int, runs: Iterable[bytes] | None = None
+) -> Extras:
     """Read the extras from an open file, up to the damage where there is some.
 
     Args:
@@ -248,6 +250,7 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
         stream: the file.
         size: how many bytes of it to read.
         utc_offset_ns: offset to subtract from the events' stamps [ns].
+        runs: of records, where the file's chunks have been expanded already.
 
     Raises:
         RecordingError: attachments of more than 64 MiB, or a chunk that expands beyond that.
@@ -279,7 +282,7 @@ def read_extras(path: Path, stream: IO[bytes], size: int, utc_offset_ns: int) ->
     except mcap.TooLargeError as error:
         raise RecordingError(path, str(error)) from error
     try:
-        for run in mcap.contents(stream, size):
+        for run in mcap.contents(stream, size) if runs is None else runs:
             for channel_id, _, payload in mcap.messages(run, directory, lambda channel_id: bool(kind(channel_id))):
                 if kind(channel_id) == _EVENTS:
                     events.append(event(payload, utc_offset_ns))
@@ -347,12 +350,12 @@ def read_cycles(path: Path) -> Iterator[Cycles]:
             size = stream.seek(0, 2)
             stream.seek(0)
             if stream.read(len(mcap.MAGIC)) == mcap.MAGIC:
-                yield from _decoded(path, _payloads(stream, size))
+                yield from _decoded(path, _payloads(mcap.contents(stream, size)))
     except (mcap.TooLargeError, OSError) as error:
         raise RecordingError(path, str(error)) from error
 
 
-def _payloads(stream: IO[bytes], size: int) -> Iterator[bytes]:
+def _payloads(runs: Iterable[bytes]) -> Iterator[bytes]:
     directory = mcap.Directory()
 
     def choose(channel_id: int) -> bool:
@@ -360,7 +363,7 @@ def _payloads(stream: IO[bytes], size: int) -> Iterator[bytes]:
         return channel is not None and channel.topic == TOPIC and directory.schema_of(channel) == CYCLE
 
     try:
-        for run in mcap.contents(stream, size):
+        for run in runs:
             for _, _, payload in mcap.messages(run, directory, choose):
                 yield payload
     except mcap.TornError:
@@ -410,6 +413,7 @@ def _layout(path: Path, payload: bytes) -> np.dtype[np.void]:
 
 # 292 years: what is beyond cannot be a log time, and would not fit an int64.
 _MAX_STAMP: Final = (1 << 63) - 1
+_KEPT: Final = 64 << 20  # bytes of expanded records of one recording: minutes of seven joints at 1 kHz
 
 
 class McapRecording:
@@ -458,7 +462,7 @@ class McapRecording:
             if stream.read(len(mcap.MAGIC)) != mcap.MAGIC:
                 raise RecordingError(self.path, "is not an MCAP file")
         self.sha256 = sha256(self.path, self._size)
-        self._verify()
+        self._runs = self._verify()
         self._offset_ns = self._utc_offset()
         self.torque_held = self.metadata.get("torque_hold") == "zero_order"
         self.own = bool(self.metadata)
@@ -496,7 +500,15 @@ class McapRecording:
             RecordingError: attachments of more than 64 MiB.
         """
         with self._open() as stream:
-            return read_extras(self.path, stream, self._size, self._offset_ns)
+            return read_extras(self.path, stream, self._size, self._offset_ns, self._runs)
+
+    def read_cycles(self) -> Iterator[Cycles]:
+        """Read `/cycle` as the function of that name does, from what has been expanded already.
+
+        Raises:
+            RecordingError: likewise.
+        """
+        yield from read_cycles(self.path) if self._runs is None else _decoded(self.path, _payloads(self._runs))
 
     def measured(self, topic: str) -> tuple[Stamps, Matrix]:
         """Read the torques that drives measured.
@@ -565,10 +577,9 @@ class McapRecording:
             return self._is_chosen(channel_id, directory, topic)
 
         try:
-            with self._open() as stream:
-                for run in mcap.contents(stream, self._size):
-                    for _, log_time, payload in mcap.messages(run, directory, choose):
-                        yield log_time, payload
+            for run in self._contents():
+                for _, log_time, payload in mcap.messages(run, directory, choose):
+                    yield log_time, payload
         except mcap.TornError as error:
             self._tear(error)
         except (mcap.TooLargeError, OSError) as error:
@@ -614,17 +625,37 @@ class McapRecording:
             what = "position" if layout.position is None else "effort, which is the torque"
             raise RecordingError(self.path, f"{self._topic} has no {what}; identification needs both")
 
-    def _verify(self) -> None:
-        """Read every chunk and every metadata record once, so that `torn` is known from the start."""
+    def _contents(self) -> Iterator[bytes]:
+        if self._runs is not None:
+            yield from self._runs
+            return
+        with self._open() as stream:
+            yield from mcap.contents(stream, self._size)
+
+    def _verify(self) -> tuple[bytes, ...] | None:
+        """Read every chunk and every metadata record once, so that `torn` is known from the start.
+
+        Returns:
+            The runs of records in the chunks and outside; None where they are more than `_KEPT` bytes, or torn.
+        """
+        runs: list[bytes] = []
+        kept = 0
         try:
             with self._open() as stream:
-                for opcode, content in mcap.records(stream, self._size, {Opcode.CHUNK, Opcode.METADATA}):
-                    if opcode == Opcode.CHUNK:
-                        mcap.expand(content)
+                for opcode, content in mcap.records(stream, self._size, {*mcap.CONTENTS, Opcode.METADATA}):
+                    if opcode != Opcode.METADATA:
+                        run = mcap.run_of(opcode, content)
+                        kept += len(run)
+                        if kept > _KEPT:
+                            runs.clear()
+                        else:
+                            runs.append(run)
                     elif (record := mcap.metadata(content)).name == METADATA_NAME:
                         self.metadata.update(record.metadata)
+            return tuple(runs) if kept <= _KEPT else None
         except mcap.TornError as error:
             self._tear(error)
+            return None
         except (mcap.TooLargeError, OSError) as error:
             raise RecordingError(self.path, str(error)) from error
 

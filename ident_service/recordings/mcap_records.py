@@ -27,7 +27,7 @@ _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_HEAD: Final = struct.Struct("<BQH")
 _A_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_FIELDS: Final = _MESSAGE.size - _HEAD.size
-_CONTENTS: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA})
+CONTENTS: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA})
 
 Message = tuple[int, int, bytes]
 
@@ -101,8 +101,13 @@ def contents(stream: IO[bytes], size: int) -> Iterator[bytes]:
         TornError: as `records`, or a chunk that is damaged.
         TooLargeError: as `records`, or a chunk that expands beyond 64 MiB.
     """
-    for opcode, content in records(stream, size, _CONTENTS):
-        yield expand(content) if opcode == Opcode.CHUNK else _HEAD.pack(opcode, len(content)) + content
+    for opcode, content in records(stream, size, CONTENTS):
+        yield run_of(opcode, content)
+
+
+def run_of(opcode: int, content: bytes) -> bytes:
+    """Return the run of records in a record of `CONTENTS`: those of a chunk, else the record itself."""
+    return expand(content) if opcode == Opcode.CHUNK else _HEAD.pack(opcode, len(content)) + content
 
 
 def expand(content: bytes) -> bytes:

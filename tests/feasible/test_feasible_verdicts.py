@@ -5,14 +5,22 @@ from __future__ import annotations
 import cvxpy as cp
 import numpy as np
 import pytest
+from estimation.synthetic import random_information
 from feasible.random_cases import one_link, random_case
+from helpers.random_arms import model_around, random_chain, random_delta
 
 from ident_service.config.arm import Constraints, FeasibleSetName
 from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set, symmetric
 from ident_service.estimation.feasible.formulation import ConditionsError, conflicting_constraints
-from ident_service.estimation.feasible.problems import EPSILON, feasibility_correction, feasibility_test
-from ident_service.model.base_parameters import BaseParameters, base_from_expressions
+from ident_service.estimation.feasible.problems import (
+    EPSILON,
+    constrained_least_squares,
+    feasibility_correction,
+    feasibility_test,
+)
+from ident_service.estimation.least_squares import torque_error, weighted_least_squares
+from ident_service.model.base_parameters import BaseParameters, base_from_expressions, base_parameters
 from ident_service.model.parameter_layout import INERTIAL
 
 NAMES = tuple(f"{symbol}1" for symbol in INERTIAL)
@@ -36,6 +44,26 @@ def bounded(kind: FeasibleSetName, names: tuple[str, ...]) -> FeasibleSet:
     """With a total mass, without which some optima are only approached as masses grow beyond all limits."""
     constraints = Constraints.model_validate({"total_mass": {"upper": 40.0}})
     return feasible_set(kind, names, one_link().model_copy(update={"constraints": constraints}))
+
+
+@pytest.mark.parametrize("kind", ["inertia", "pseudo_inertia"])
+def test_a_finger_of_three_grams_is_as_good_inside_the_set(kind: FeasibleSetName) -> None:
+    """The paper's inset of a millionth (eq. 21) is more than such a link's moments of inertia."""
+    chain = random_chain(np.random.default_rng(4), 2, branches=False, prismatic=False, link_frames=False)
+    model = model_around(chain)
+    base = base_parameters(model.chain, model.layout)
+    delta = random_delta(np.random.default_rng(2), model.layout)
+    size, mass, lever = np.array([9.0, 9.0, 1.0]) * 1e-8, 0.003, np.array([1e-4, 2e-4, 1e-4])
+    L = np.diag(size) + mass * (lever @ lever * np.eye(3) - np.outer(lever, lever))
+    delta[model.layout.inertial(1)] = *L[np.triu_indices(3)], *(mass * lever), mass
+    for term in model.layout.terms:
+        delta[model.layout.term_columns(term)[1]] = 1e-8
+    information = random_information(model, base, delta, samples=2000, noise=1e-7)
+    fit = weighted_least_squares(information)
+    held = constrained_least_squares(fit, base, feasible_set(kind, base.names, model.config))
+    free, inside = (torque_error(information, beta).joint_relative_percent[1] for beta in (fit.beta, held.beta))
+    assert 0.5 < free < 10.0
+    assert inside < 1.1 * free
 
 
 @pytest.mark.parametrize("kind", ["inertia", "pseudo_inertia"])

@@ -8,7 +8,7 @@ import pytest
 from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ParameterError
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.parameter_layout import Layout
+from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
 
 LINK = ["Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m"]
 ALL = ("drive_inertia", "viscous", "coulomb", "offset")
@@ -39,6 +39,15 @@ def test_units_tell_turning_from_sliding_joints() -> None:
     body = ["kg m^2"] * 6 + ["kg m"] * 3 + ["kg"]
     assert list(units[:14]) == [*body, "kg m^2", "N m s/rad", "N m", "N m"]
     assert list(units[14:]) == [*body, "kg", "N s/m", "N", "N"]
+
+
+def test_every_term_has_a_unit() -> None:
+    terms = tuple(TERM_SYMBOLS)
+    units = Layout((True, False), terms, (0.1, 0.1)).units
+    turning = ["kg m^2", "N m s/rad", "N m", "N m", "N m", "N m s^2/rad^2", "N m s/rad"]
+    sliding = ["kg", "N s/m", "N", "N", "N", "N s^2/m^2", "N s/m"]
+    assert list(units[10:17]) == turning
+    assert list(units[27:]) == sliding
 
 
 def test_every_parameter_has_one_place() -> None:

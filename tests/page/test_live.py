@@ -153,20 +153,23 @@ def test_a_run_that_cannot_be_read_says_so_once(tmp_path: Path, caplog: pytest.L
 
 
 def growing_run(
-    seconds: float, noise: float, *, in_blocks: bool = False
+    seconds: float, noise: float, *, in_blocks: bool = False, period: float | None = None, error: float = 0.0
 ) -> tuple[SequentialLeastSquares, np.ndarray, list[np.ndarray]]:
-    """Doubt of a motion of the planar arm that comes in pieces; the true base parameters; deviations on the way."""
+    """Doubt of a motion of the planar arm that comes in pieces; the true base parameters; deviations on the way.
+
+    With a period [s] the motion repeats itself; `error` [N m] is of the model, along the position.
+    """
     model = arm_model(load_arm(shipped_arms()["planar2"]))
-    growing = SequentialLeastSquares(model, in_blocks=in_blocks)
+    growing = SequentialLeastSquares(model, in_blocks=in_blocks, period=period)
     rng, step = np.random.default_rng(3), 0.002
     time_s = np.arange(0.0, seconds, step)
-    w = 2 * np.pi * np.array([[0.31], [0.47]])
+    w = 2 * np.pi * (np.array([[0.31], [0.47]]) if period is None else np.array([[2.0], [3.0]]) / period)
     q = np.stack([0.9 * np.sin(w[0] * time_s), 1.1 * np.sin(w[1] * time_s + 1.0)], axis=1)
     dq = np.stack([0.9 * w[0] * np.cos(w[0] * time_s), 1.1 * w[1] * np.cos(w[1] * time_s + 1.0)], axis=1)
     ddq = -q * (w.T**2)
     beta = rng.uniform(0.3, 1.0, growing.base.size)
     H = joint_regressor(model.chain, model.layout, q, dq, ddq, growing.base.base)
-    torque = np.stack([rows.T @ beta for rows in H], axis=1)
+    torque = np.stack([rows.T @ beta for rows in H], axis=1) + error * np.sin(5.0 * q + 1.0)
     # What is held from stamp to stamp acts half a step later than a sample would.
     held = torque + 0.5 * step * np.gradient(torque, step, axis=0)
     held += noise * rng.standard_normal(torque.shape)
@@ -210,6 +213,16 @@ def test_deviations_from_blocks_are_those_that_blocks_of_the_whole_give() -> Non
     assert (careful.deviations < 4.0 * plain.deviations).all()
     assert (careful.deviations > plain.deviations).any()
     assert 38_000_000_000 < careful.until_ns < 40_000_000_000
+
+
+def test_a_run_with_a_target_does_not_end_on_repetitions_alone() -> None:
+    """What the model lacks errs alike in every period, so that a target is not reached by waiting."""
+    once, often = (
+        growing_run(seconds, 0.002, in_blocks=True, period=10.0, error=0.2)[2][-1] for seconds in (11.0, 101.0)
+    )
+    known = np.isfinite(once) & np.isfinite(often)
+    assert known.sum() > 5
+    assert np.median(often[known] / once[known]) > 0.85
 
 
 def test_what_is_remembered_stays_bounded() -> None:

@@ -17,7 +17,6 @@ from real_data.conftest import Identified
 from benchmarks.real_data import CASES, DATA
 from ident_service.cli import main
 from ident_service.config.arm import ArmConfig, Identification
-from ident_service.config.kinematics import Kinematics
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, ModelError
@@ -78,13 +77,6 @@ def changed(change: Change, model: ArmModel) -> list[Changed]:
     ]
 
 
-def judged(change: Change, config: ArmConfig | None = None) -> tuple[str, ...]:
-    """Identify from the first recording, judge on the second, and give the reasons against using the result."""
-    model = arm_model(config or kuka())
-    recordings = changed(change, model)
-    return objections(identify(model, recordings[:1], recordings[1:]), recordings)
-
-
 def objections(estimate: Estimate, recordings: list[Changed]) -> tuple[str, ...]:
     return unusable_because(estimate, [(one, recording_quality(one, estimate.model)) for one in recordings])
 
@@ -122,23 +114,6 @@ def spike(position: np.ndarray, torque: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (degrees, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
-        (swapped, "lwr_1_joint is recorded from -38.05"),
-        (two_joints, "its torque error is 8. % where joints move on recording_2"),
-        (negated, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
-        (one_negated, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
-        (thousandfold, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
-        (spike, "lwr_3_joint moves 0.3.* rad between two samples, .* mend the samples 10.* s after the first"),
-    ],
-)
-def test_wrong_columns(change: Change, words: str) -> None:
-    assert re.search(words, "\n".join(judged(change)))
-
-
-@pytest.mark.slow
 def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
     bare = arm_model(kuka(joints={}))
     sound = changed(nothing, bare)
@@ -152,28 +127,13 @@ def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
     assert "are the positions in degrees?" in turned
 
 
-@pytest.mark.slow
-def test_gravity_upside_down() -> None:
-    (reason,) = judged(nothing, kuka(gravity=(0.0, 0.0, 9.81)))
-    assert "without feasibility constraints: gravity, signs, order or units" in reason
-
-
 # The KUKA in Craig's convention: a, alpha and d of each row are those before the joint.
 CRAIG = ((0.0, 0.3105), ("pi/2", 0.0), ("-pi/2", 0.4), ("-pi/2", 0.0), ("pi/2", 0.39), ("pi/2", 0.0), ("-pi/2", 0.0))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("convention", ["modified", "standard"])
-def test_standard_for_modified_dh(convention: str) -> None:
+def craig(convention: str) -> dict[str, Any]:
     rows = {f"lwr_{k}_joint": {"alpha": alpha, "d": d} for k, (alpha, d) in enumerate(CRAIG)}
-    kinematics = Kinematics.model_validate({"dh": {"convention": convention, "joints": rows}})
-    reasons = judged(nothing, kuka(kinematics=kinematics))
-    if convention == "modified":
-        assert reasons == ()
-    else:
-        reason = reasons[0]
-        assert re.match(r"its torque error is [3-9]\d % where joints move on recording_2", reason)
-        assert "DH convention" in reason
+    return {"dh": {"convention": convention, "joints": rows}}
 
 
 @pytest.mark.slow
@@ -191,20 +151,68 @@ def test_sound_recordings_are_not_objected_to(identified: Identified) -> None:
         assert unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings]) == ()
 
 
+def written(folder: Path, change: Change, tree: dict[str, Any]) -> list[str]:
+    """Write the recording to fit and the one to judge on, and a description; return the words that identify."""
+    paths = []
+    for wrong in changed(change, arm_model(load_arm("kuka_lwr4"))):
+        lines = [",".join(["t", *(f"q{k}" for k in range(1, 8)), *(f"tau{k}" for k in range(1, 8))])]
+        for block in wrong.blocks():
+            table = np.column_stack([block.stamp_ns * 1e-9, block.position, block.torque])
+            lines += [",".join(f"{value:.9g}" for value in row) for row in table]
+        paths.append(folder / f"run{len(paths)}.csv")
+        paths[-1].write_text("\n".join(lines) + "\n")
+    arm = yaml.safe_load(Path("configs/kuka_lwr4.yaml").read_text())
+    arm["kinematics"]["urdf"] = str(Path("configs/kuka_lwr4.urdf").resolve())
+    (folder / "arm.yaml").write_text(yaml.safe_dump(arm | tree))
+    fitted, unseen = map(str, paths)
+    return ["identify", fitted, "--validate", unseen, "--arm", str(folder / "arm.yaml"), "--out", str(folder / "out")]
+
+
+WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
+    "degrees": (degrees, {}, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
+    "q and tau": (swapped, {}, "lwr_1_joint is recorded from -38.05"),
+    "two joints": (two_joints, {}, "its torque error is 8. % where joints move on run1"),
+    "sign": (negated, {}, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
+    "one sign": (one_negated, {}, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
+    "thousand": (thousandfold, {}, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
+    "spike": (spike, {}, "lwr_3_joint moves 0.3.* rad between two samples, .* mend the samples 10.* s after the first"),
+    "gravity": (
+        nothing,
+        {"gravity": [0.0, 0.0, 9.81]},
+        "without feasibility constraints: gravity, signs, order or units",
+    ),
+    "convention": (
+        nothing,
+        {"kinematics": craig("standard")},
+        r"^its torque error is [3-9]\d % where joints move on run1(.|\n)*DH convention",
+    ),
+}
+SOUND = {"sound": {}, "Craig": {"kinematics": craig("modified")}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRONG)
+def test_the_command_ends_with_3_for_what_cannot_be_right(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, tree, words = WRONG[name]
+    assert main([*written(tmp_path, change, tree), "--json"]) == 3
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["usable"] is False
+    assert re.search(words, "\n".join(answer["unusable"]))
+    assert (tmp_path / "out" / "report.txt").read_text().startswith("DO NOT USE")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOUND)
+def test_the_command_objects_to_nothing_sound(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*written(tmp_path, nothing, SOUND[name]), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["unusable"] == []
+
+
 @pytest.mark.slow
 def test_the_command_says_no_where_people_look(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = [",".join(["t", *(f"q{k}" for k in range(1, 8)), *(f"tau{k}" for k in range(1, 8))])]
-    model = arm_model(load_arm("kuka_lwr4"))
-    wrong = Changed(open_recording(DATA / KUKA.folder / KUKA.fitted, model.chain.names), negated)
-    for block in wrong.blocks():
-        table = np.column_stack([block.stamp_ns * 1e-9, block.position, block.torque])
-        lines += [",".join(f"{value:.9g}" for value in row) for row in table]
-    (tmp_path / "run.csv").write_text("\n".join(lines) + "\n")
-    tree = {"identification": {"method": "wls"}}
-    arm = yaml.safe_load(Path("configs/kuka_lwr4.yaml").read_text()) | tree
-    arm["kinematics"]["urdf"] = str(Path("configs/kuka_lwr4.urdf").resolve())
-    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(arm))
-    words = ["identify", str(tmp_path / "run.csv"), "--arm", str(tmp_path / "arm.yaml"), "--out", str(tmp_path / "out")]
+    words = written(tmp_path, negated, {"identification": {"method": "wls"}})
     assert main(words) == 3
     said = capsys.readouterr().out
     assert said.startswith("DO NOT USE these parameters:\n  - the torque, or the position, may have the wrong sign")

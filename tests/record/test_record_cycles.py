@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from ident_service.errors import RecordingError, UsageError
+from ident_service.recordings import mcap_reader, mcap_records
 from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.cycle import Cycle
-from ident_service.recordings.mcap_reader import read_cycles
+from ident_service.recordings.mcap_reader import McapRecording, read_cycles
 from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Block
@@ -72,6 +73,29 @@ def test_a_foreign_message_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     write(tmp_path / "run.mcap", 3)
     with pytest.raises(RecordingError, match="a message that is not ident_msgs/msg/Cycle"):
         list(read_cycles(tmp_path / "run.mcap"))
+
+
+def test_chunks_are_expanded_once_unless_they_are_too_many(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.mcap"
+    write(path, 2000)
+    expanded: list[int] = []
+    expand = mcap_records.expand
+    monkeypatch.setattr(mcap_records, "expand", lambda content: expanded.append(1) or expand(content))
+
+    def read() -> list[np.ndarray]:
+        recording = McapRecording(path)
+        (block,) = recording.blocks()
+        (cycles,) = recording.read_cycles()
+        assert recording.read_extras().metadata
+        return [block.stamp_ns, block.position, block.torque, cycles.lateness_ns, cycles.valid, cycles.age]
+
+    kept, chunks = read(), len(expanded)
+    monkeypatch.setattr(mcap_reader, "_KEPT", 1 << 16)
+    again = read()
+    assert chunks > 3
+    assert len(expanded) - chunks > 3 * chunks
+    for one, other in zip(kept, again, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 class Counted:

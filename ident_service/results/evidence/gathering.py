@@ -13,7 +13,7 @@ Memory does not grow with a recording: what is kept of it is an envelope, averag
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -29,7 +29,7 @@ from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.kinematics import branches, frame_origins, link_poses
 from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
 from ident_service.recordings.adapters import RangeRecording
-from ident_service.recordings.mcap_reader import Cycles, read_cycles
+from ident_service.recordings.mcap_reader import Cycles, McapRecording, read_cycles
 from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.evidence import (
     Array,
@@ -147,7 +147,7 @@ def timing(recording: Recording) -> Timing:
     order = longer[np.argsort(-steps[longer], kind="stable")][:_GAPS]
     gaps = tuple(((int(stamps[k]) - int(stamps[0])) * 1e-9, int(steps[k]) * 1e-9) for k in order)
     # The loop's account covers a whole run, so it is not used for a part of a recording.
-    parts = [] if isinstance(recording, RangeRecording) else list(read_cycles(path))
+    parts = [] if isinstance(recording, RangeRecording) else list(_cycles(recording))
     if parts:
         return _of_cycles(path.name, parts, 1e9 / usual, gaps, len(longer))
     off = np.abs(steps[steps <= _GAP * usual] - usual) * 1e-9
@@ -179,6 +179,12 @@ def _stamps(recording: Recording) -> NDArray[np.int64]:
         if count >= _MAX_STAMPS:
             break
     return np.concatenate(kept)
+
+
+def _cycles(recording: Recording) -> Iterator[Cycles]:
+    while (inner := getattr(recording, "whole", None)) is not None:
+        recording = inner
+    return recording.read_cycles() if isinstance(recording, McapRecording) else read_cycles(recording.path)
 
 
 def _of_cycles(
