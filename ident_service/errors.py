@@ -174,7 +174,7 @@ class PositionUnknown(DriverError):
 
 
 class Stopped(ArmError):
-    """A motion did not come to its end: a stop was requested, or nobody renewed its lease."""
+    """A motion did not come to its end: a stop was requested, or its lease was not renewed."""
 
 
 class ArmFault(ArmError):
