@@ -9,7 +9,7 @@ READY  := $(VENV)/.ready
 # Set, it has each of a thousand child processes of the tests compile the whole package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers campaign \
+.PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
 	mutants test-socketcan test-foreign test-latest lock clean
 
 demo: $(READY)
@@ -30,7 +30,7 @@ unit: $(READY)
 
 # Every branch of what stops an arm, by its own tests: less than all of them fails.
 GUARDED := encoder_observer faults safety_monitor state_machine stop_trajectory
-GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_motors.py guard_table.py owed.py states.py stop.py told.py)
+GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_motors.py guard_positions.py guard_table.py owed.py states.py stop.py told.py)
 coverage: $(READY)
 	$(TESTS) -m "not campaign" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
 		$(GUARDED:%=--cov=ident_service.motion.%) $(GUARD_TESTS)
@@ -72,6 +72,10 @@ bench-realtime: $(READY)
 # The command beside the script that somebody would write instead.
 bench-peers: $(READY)
 	$(BIN)/python -m benchmarks.peers
+
+# Two hundred recordings of twenty arms, on one and two processes.
+bench-fleet: $(READY)
+	$(BIN)/python -m benchmarks.fleet
 
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
 campaign: test-socketcan

@@ -20,13 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
+from drivers.can.bus_load import exact
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.can.frame_log import SessionLog
 from drivers.can.python_can_link import PythonCanLink, open_bus
-from drivers.canopen.bus_load import exact
 from drivers.clock import RealClock
-from ident_service.config.canopen import CanBus
+from ident_service.config.can_bus import CanBus
 from sim_backend.can_bus.host import LocalPort
 from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.can_bus.link import Connection, WireLink

@@ -28,7 +28,7 @@ from drivers.can.python_can_link import PythonCanLink, open_bus
 from drivers.canopen.driver import CanopenArm
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus
+from ident_service.config.can_bus import CanBus
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError

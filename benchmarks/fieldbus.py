@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.harness import Row, table, write
+from drivers.can.bus_load import exact
 from drivers.can.can_frame import Frame
-from drivers.canopen.bus_load import exact
-from drivers.canopen.motor_units import coordinates, unwrapped
+from drivers.canopen.motor_units import coordinates
 from drivers.canopen.pdo_codec import BusCodec
 from drivers.canopen.pdo_mapping import bus_profiles
+from drivers.motor_units import unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm

@@ -11,6 +11,7 @@ after clipping and quantisation. Sample-to-actuation is therefore exactly one pe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.axis_status import AxisEvent, AxisStatus
+from drivers.can.bus_load import Budget
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 
@@ -32,7 +34,7 @@ Counts = NDArray[np.int64]
 class StopKind(Enum):
     """Name the ways in which drives end torque; a coordinated stop is planned by the motion loop, not by the driver."""
 
-    TORQUE_OFF = "torque_off"  # no torque; an arm without brakes falls
+    TORQUE_OFF = "torque_off"  # no torque; an arm without brakes falls, or sinks where idle drives brake (pucks)
     QUICK_STOP = "quick_stop"  # the drives decelerate on their own, then hold or release as configured
 
 
@@ -51,6 +53,12 @@ class ArmDescription:
         scheduled_stamps: whether stamps are those of a schedule, whole periods apart, as of a plant that moves by whole
             periods; how late a cycle came only the loop's clock says then. Otherwise stamps are the clock's.
         lost_cycles: in a row, without an axis' position, after which it counts as gone.
+        streams_position: whether drives close the position loop: `exchange_position` is what moves the arm, and
+            `Sample.torque` is what they measured last, in place of what they are given.
+        watchdog: after how long without its host the slowest drive gives up torque [s]; None where unknown, or where
+            `Arm.watchdogs` says it of each drive.
+        report_delay: how much later than it happens a change of a drive's status may show in a sample [s].
+        delay_cycles: from a sample to the torque that is computed from it; 1 where a torque acts from the next stamp.
     """
 
     joint_names: tuple[str, ...]
@@ -62,6 +70,10 @@ class ArmDescription:
     software: str
     scheduled_stamps: bool = False
     lost_cycles: int = 3
+    streams_position: bool = False
+    watchdog: float | None = None
+    report_delay: float = 0.0
+    delay_cycles: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +135,37 @@ class Watchdog:
     of_torque: bool = True
 
 
+@dataclass(frozen=True)
+class SetupCheck:
+    """Represent one value that a drive says of itself, compared with what the description expects.
+
+    Attributes:
+        what: the value, and whose it is: `IPNM of puck 3`.
+        found: what the drive says, in words.
+        expected: what it must say; empty where it is only told.
+        remedy: what to do where the two differ.
+    """
+
+    what: str
+    found: str
+    expected: str = ""
+    remedy: str = ""
+
+    @property
+    def good(self) -> bool:
+        """Return whether the value is the expected one, or none is expected."""
+        return not self.expected or self.found == self.expected
+
+    def __str__(self) -> str:
+        return f"{self.what} is {self.found}" + ("" if self.good else f", expected {self.expected}")
+
+
 class Arm(ABC):
     """Define an arm as a context manager: entering opens it, leaving closes it; closing stops torque first."""
 
     clock: Clock
+    # Asked while `enable` waits for a person; when it says no, `enable` gives up and raises DriverError.
+    still_wanted: Callable[[], bool] = staticmethod(lambda: True)
 
     def look(self) -> Arm:
         """Return the same hardware as an arm that can only be observed, not open; this one must not be open beside it.
@@ -177,6 +216,29 @@ class Arm(ABC):
         Watchdogs of torque frames need none of it: `exchange(None)` withholds those.
         """
 
+    def bus_budget(self, rate: float | None = None) -> Budget | None:
+        """Return what this arm's frames cost on its buses; it need not be open.
+
+        Args:
+            rate: cycles per second; by default the description's.
+
+        Returns:
+            None for an arm on no bus whose load is known.
+        """
+        return None
+
+    def setup_checks(self) -> tuple[SetupCheck, ...]:
+        """Return what the drives of the open arm say of their set-up, compared with the description.
+
+        An arm of which one is not `good` refuses to be enabled.
+        """
+        return ()
+
+    @property
+    def operator_action(self) -> str:
+        """Return what a person must do for `enable` to come about, in words; empty where the host enables alone."""
+        return ""
+
     def drive_status(self) -> tuple[AxisStatus, ...]:
         """Return what each drive has reported last, in the order of `watchdogs`."""
         return ()
@@ -192,6 +254,9 @@ class Arm(ABC):
     @abstractmethod
     def enable(self) -> None:
         """Energise all axes with zero torque; what a watchdog or a quick stop left behind ends with it.
+
+        Where a person enables the arm (`operator_action`), it waits for that; the arm may have moved meanwhile, and
+        whoever has planned from where it stood looks again.
 
         Raises:
             DriverError: a drive has latched a fault of its own or an emergency stop, which only `reset` clears, or
@@ -225,6 +290,20 @@ class Arm(ABC):
             DriverError: not open, a torque while not enabled, a torque that is not finite or of the wrong shape,
                 or the bus is gone. A torque that raises has not been sent.
         """
+
+    def exchange_position(self, position: Vector) -> Sample:
+        """Exchange one cycle with axes that close the position loop by themselves: send positions, return the sample.
+
+        Args:
+            position: where each joint shall be one cycle from here [rad or m], shape (joints,).
+
+        Returns:
+            The sample of this cycle; its torque is the one measured last.
+
+        Raises:
+            DriverError: as `exchange`, and for arms that are given torques (`ArmDescription.streams_position`).
+        """
+        raise DriverError("this arm is given torques, not positions")
 
     @abstractmethod
     def stop(self, kind: StopKind) -> None:

@@ -18,7 +18,8 @@
     │   └── PersonNeeded               a re-identification without a verdict: a person must act first
     ├── Unavailable (RuntimeError)     temporarily impossible on this machine or daemon; try again later
     │   ├── RegistryBusy               another process has locked the registry
-    │   └── DiskFull (OSError)         the disk of the state folder has no room
+    │   ├── DiskFull (OSError)         the disk of the state folder has no room
+    │   └── StorageError (OSError)     storage of a fleet's recordings or factors is gone, or too slow
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
@@ -155,6 +156,17 @@ class RegistryBusy(Unavailable):
 
 class DiskFull(Unavailable, OSError):
     """The disk of the state folder has no room."""
+
+
+class StorageError(Unavailable, OSError):
+    """Storage of recordings or factors cannot be reached, or does not give what it lists; the message names the URL."""
+
+    def __init__(self, url: str, message: str) -> None:
+        self.url = url
+        super().__init__(f"{url}: {message}")
+
+    def __reduce__(self) -> tuple[type[StorageError], tuple[str, str]]:
+        return type(self), (self.url, str(self).removeprefix(f"{self.url}: "))
 
 
 class ArmError(IdentError, RuntimeError):

@@ -389,6 +389,7 @@ class SimulatedHardware:
         self.plant = plant
         self.imperfections = imperfections
         self.seed = seed
+        self.watchdog, self.delay_cycles = watchdog, delay_cycles
         self.faults = tuple(faults)
         # Rounding must not make the watchdog one period slower than it is.
         periods = max(1, int(np.ceil(watchdog / plant.period - 1e-6)))
@@ -547,4 +548,6 @@ def description(machine: SimulatedHardware) -> ArmDescription:
         identities=tuple(f"simulated axis {name}, seed {machine.seed}" for name in names),
         software=f"sim_backend {version('ident-service')}",
         scheduled_stamps=True,
+        watchdog=machine.watchdog,
+        delay_cycles=machine.delay_cycles,
     )

@@ -32,6 +32,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("preflight", "results"),
     ("registry",),
     ("operations",),
+    ("fleet",),
     ("client",),
     ("daemon",),
     ("cli",),
@@ -75,15 +76,33 @@ DOORS: dict[str, set[str]] = {
     "canopen": {"drivers", "sim_backend"},
     "can": {"drivers", "sim_backend"},
     "cronsim": {"operations"},
+    "dask": {"fleet"},
+    "distributed": {"fleet"},
     "fastapi": {"daemon"},
     "httpx": {"client"},
-    "jinja2": {"daemon"},
+    "fsspec": {"fleet"},
+    "jinja2": {"daemon", "fleet"},
     "prometheus_client": {"daemon"},
+    "pyarrow": {"fleet"},
     "standardwebhooks": {"daemon"},
     "starlette": {"daemon"},
     "uvicorn": {"daemon"},
 }
-HEAVY = ("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn")
+# What may know CANopen: its driver, its emulation, its configuration, and the commands that scan, probe and
+# configure its nodes.
+CANOPEN_ROOMS = ("drivers/canopen/", "sim_backend/canopen_device/")
+CANOPEN_FILES = {
+    "ident_service/config/arm.py",
+    "ident_service/config/canopen.py",
+    "ident_service/config/load.py",
+    "ident_service/operations/drive_configuration.py",
+    "ident_service/operations/fieldbus.py",
+    "sim_backend/emulator/build.py",
+}
+HEAVY = (
+    *("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn"),
+    *("distributed", "fsspec", "pyarrow"),
+)
 
 
 @dataclass(frozen=True)
@@ -166,6 +185,20 @@ def python_files() -> list[str]:
 def test_every_file_imports_only_what_its_layer_may() -> None:
     found = [text for file in python_files() for text in violations((ROOT / file).read_text(encoding="utf-8"), file)]
     assert found == []
+
+
+def test_canopen_is_known_in_its_own_folder_only() -> None:
+    """Everything else reaches drives by the Arm contract, whatever protocol they speak."""
+    foreign = []
+    for file in python_files():
+        if file.startswith(CANOPEN_ROOMS) or file in CANOPEN_FILES:
+            continue
+        foreign += [
+            f"{file}:{found.line}: {found.module}"
+            for found in imports_in((ROOT / file).read_text(encoding="utf-8"), file)
+            if found.module.startswith(("drivers.canopen", "ident_service.config.canopen", "canopen"))
+        ]
+    assert foreign == []
 
 
 def test_the_files_are_where_this_test_looks() -> None:
@@ -275,6 +308,8 @@ def test_the_architecture_page_names_what_exists() -> None:
         ("ident_service/estimation/x.py", "from mcap.reader import make_reader", "mcap may only"),
         ("ident_service/cli.py", "import fastapi", "fastapi may only"),
         ("ident_service/motion/x.py", "from can import Bus", "can may only"),
+        ("ident_service/operations/x.py", "from distributed import Client", "distributed may only"),
+        ("ident_service/results/x.py", "import ident_service.fleet.factor", "results imports fleet"),
         ("ident_service/attic/x.py", "import json", "no package is called 'attic'"),
     ],
 )

@@ -24,7 +24,7 @@ from typing import Protocol, cast
 from drivers.can.can_frame import Frame
 from drivers.clock import Clock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.can_bus import CanBus
 from ident_service.errors import DriverError
 
 GROUP = "ident_service.can_links"
@@ -57,13 +57,13 @@ def open_links(config: ArmConfig) -> list[Link]:
         config: the arm's.
 
     Raises:
-        DriverError: the driver section is not CANopen's, or a bus that cannot be had; nothing stays open.
+        DriverError: the driver section has no CAN bus, or one that cannot be had; nothing stays open.
     """
-    if not isinstance(config.driver, CanopenDriver):
-        raise DriverError(f"{config.name}: the driver is not CANopen's")
+    if not config.can_buses:
+        raise DriverError(f"{config.name}: the driver has no CAN bus")
     links: list[Link] = []
     try:
-        for number, bus in enumerate(config.driver.buses):
+        for number, bus in enumerate(config.can_buses):
             special = entry_points(group=GROUP, name=bus.interface)
             entry = next(iter(special or entry_points(group=GROUP, name="python_can")), None)
             if entry is None:

@@ -24,7 +24,7 @@ from drivers.can.can_frame import MOST_AT_ONCE, RECEIVE_FILTER, Frame, check_sen
 from drivers.can.socketcan_link import check_interface
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.can_bus import CanBus
 from ident_service.errors import DriverError
 
 _OURS = ("interface", "channel", "bitrate", "data_bitrate", "fd", "receive_own_messages", "can_filters")
@@ -37,11 +37,11 @@ def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
 
     Raises:
         BusError: no such interface, it is down or without the CAN FD asked for, or it cannot be opened.
-        DriverError: the driver section is not CANopen's, or sets an option that is the link's.
+        DriverError: the driver section has no CAN bus, or it sets an option that is the link's.
     """
-    if not isinstance(config.driver, CanopenDriver):
-        raise DriverError(f"{config.name}: the driver is not CANopen's")
-    bus = config.driver.buses[bus_number]
+    if not config.can_buses:
+        raise DriverError(f"{config.name}: the driver has no CAN bus")
+    bus = config.can_buses[bus_number]
     if taken := [name for name in _OURS if name in bus.options]:
         raise DriverError(f"driver.buses.{bus_number}.options: {', '.join(taken)} cannot be set here")
     if bus.interface == _KERNELS:

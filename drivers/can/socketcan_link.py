@@ -30,7 +30,7 @@ from drivers.can.can_frame import (
 )
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.can_bus import CanBus
 from ident_service.errors import DriverError
 
 # Values of the kernel's headers; Python defines the CAN ones only where it was built with them.
@@ -84,11 +84,11 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
 
     Raises:
         BusError: the interface is missing, down, or without the CAN FD asked for, or this kernel has no CAN sockets.
-        DriverError: the driver section is not CANopen's, or has options, which this interface does not know.
+        DriverError: the driver section has no CAN bus, or it has options, which this interface does not know.
     """
-    if not isinstance(config.driver, CanopenDriver):
-        raise DriverError(f"{config.name}: the driver is not CANopen's")
-    bus = config.driver.buses[bus_number]
+    if not config.can_buses:
+        raise DriverError(f"{config.name}: the driver has no CAN bus")
+    bus = config.can_buses[bus_number]
     if bus.options:
         raise DriverError(f"driver.buses.{bus_number}.options: interface raw has none, found {', '.join(bus.options)}")
     check_interface(bus)

@@ -1,37 +1,20 @@
-"""Work out what an arm's frames cost on each bus, bit by bit (ISO 11898-1), and whether they fit.
+"""Work out what an arm's CANopen frames cost on each bus, and whether they fit (`drivers/can/bus_load.py`).
 
-Classical frame with an 11-bit identifier and n bytes: start, identifier, RTR, IDE, r0, DLC, data and CRC-15 are
-34 + 8 n bits, among which a bit of the other value is stuffed after five alike; CRC delimiter, acknowledge, end of
-frame and three bits of intermission are 13 more. So there are 47 + 8 n bits without stuffing, and at most
-floor((33 + 8 n)/4) stuffed ones: the first after five bits, each further one after four, as it begins the next run.
+Typical values are positions within ten motor turns of zero, and torques of a tenth of rated torque. A cycle has SYNC,
+torque frames and positions; beside it there are heartbeats, status reports as often as their inhibit time allows, and
+one emergency a second and drive (`EMERGENCY_INHIBIT`). SDOs flow before streaming only, control words once.
 
-CAN FD, with the bit rate switched: the first 17 bits (start to BRS) and the last 13 last as long as in a classical
-frame; ESI, DLC, data and CRC take data bits. Up to the end of the data bits are stuffed as above, but for a run that
-ends there; stuff count and CRC (17 bits up to 16 bytes, 21 above) have a fixed stuff bit in front and after every
-four bits, so that their values do not change the length.
-
-Every length includes the three bits of intermission.
-
-Every frame takes its bits without stuffing at least, those of the worst case at most; typical is the mean over real
-identifiers, real checksums and values as a moving arm has them (positions within ten motor turns of zero, torques of
-a tenth of rated torque). A cycle has SYNC, torque frames and positions; beside it there are heartbeats, status reports
-as often as their inhibit time allows, and one emergency a second and drive (`EMERGENCY_INHIBIT`). SDOs flow before
-streaming only, control words once.
-
-The rule: at most 100 % of a bus in the worst case, at most 90 % typically. Frames of the background have the lower
-priority (but for emergencies), so that they wait for the cycle, not the cycle for them.
+Frames of the background have the lower priority (but for emergencies), so that they wait for the cycle, not the cycle
+for them.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from math import floor
-from typing import NamedTuple
 
-from drivers.can.can_frame import Frame
+from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Cost, Line, line_of, mean_bits, shares
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import NmtState
 from drivers.canopen.object_dictionary import Entry, Kind
@@ -46,163 +29,10 @@ from drivers.canopen.pdo_mapping import (
     BusProfile,
     bus_profiles,
 )
-from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.can_bus import CanBus
+from ident_service.config.canopen import CanopenDriver
 
-FD_LENGTHS: tuple[int, ...] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-_TAIL = 13  # CRC delimiter, acknowledge slot and delimiter, 7 of end of frame, 3 of intermission
-_POLYNOMIAL = 0x4599  # CRC-15, without its highest bit
-_FD_ARBITRATION = 17  # start, identifier, RRS, IDE, FDF, res, BRS
-_FD_CONTROL = 5  # ESI, DLC
-
-
-class Bits(NamedTuple):
-    """Hold the length of a frame: bits at the arbitration bit rate, and at the data bit rate of CAN FD."""
-
-    nominal: int
-    data: int = 0
-
-    def seconds(self, bitrate: int, data_bitrate: int | None = None) -> float:
-        """Return how long the bits last at these bit rates [s]; rates in [bit/s]."""
-        return self.nominal / bitrate + (self.data / data_bitrate if data_bitrate is not None else 0.0)
-
-
-def padded(length: int) -> int:
-    """Return the shortest CAN FD length that holds so many bytes; raises ValueError above 64."""
-    for longer in FD_LENGTHS:
-        if longer >= length:
-            return longer
-    raise ValueError(f"a frame of CAN FD has at most 64 bytes, not {length}")
-
-
-def unstuffed(length: int, *, fd: bool = False) -> Bits:
-    """Return the bits of a data frame of so many bytes without stuffing; ValueError for a length no frame has."""
-    if not fd:
-        return Bits(_classical(length) + _TAIL)
-    return Bits(_FD_ARBITRATION + _TAIL, _FD_CONTROL + 8 * padded(length) + _fd_checksum(padded(length)))
-
-
-def worst(length: int, *, fd: bool = False) -> Bits:
-    """Return the most bits that a data frame of so many bytes can have; ValueError for a length no frame has."""
-    plain = unstuffed(length, fd=fd)
-    if not fd:
-        return Bits(plain.nominal + (_classical(length) - 1) // 4)
-    stuffable = _FD_ARBITRATION + _FD_CONTROL + 8 * padded(length)
-    early = (_FD_ARBITRATION - 1) // 4
-    return Bits(plain.nominal + early, plain.data + (stuffable - 2) // 4 - early)
-
-
-def exact(frame: Frame, *, fd: bool = False) -> Bits:
-    """Return the bits of one frame with this content; raises ValueError for a length no frame has.
-
-    Error frames are the controller's and not on the wire: 0 bits. Remote frames count as asking for no data.
-    """
-    if frame.error:
-        return Bits(0)
-    if fd:
-        return _exact_fd(frame)
-    data = frame.data
-    _classical(len(data))
-    if frame.extended:
-        # Start 0, 11 bits, SRR 1, IDE 1, 18 bits, RTR, r1 0, r0 0, DLC.
-        high, low = frame.identifier >> 18 & 0x7FF, frame.identifier & 0x3FFFF
-        head, count = (high << 2 | 3) << 25 | low << 7 | frame.remote << 6 | len(data), 39
-    else:
-        head, count = (frame.identifier & 0x7FF) << 7 | frame.remote << 6 | len(data), 19
-    value, count = head << 8 * len(data) | int.from_bytes(data, "big"), count + 8 * len(data)
-    value, count = value << 15 | crc15(value, count), count + 15
-    return Bits(count + _stuffed(value, count) + _TAIL)
-
-
-def crc15(value: int, count: int) -> int:
-    """Return the CRC-15 of the lowest `count` bits, first bit highest (ISO 11898-1:2015, 10.4.2.6)."""
-    crc = 0
-    # Leading zeros leave a CRC that starts at 0 as it is.
-    for byte in value.to_bytes((count + 7) // 8, "big"):
-        crc = (crc << 8 & 0x7FFF) ^ _CRC[(crc >> 7) ^ byte]
-    return crc
-
-
-def _exact_fd(frame: Frame) -> Bits:
-    length = padded(len(frame.data))
-    # Start 0, identifier, RRS 0, IDE 0, FDF 1, res 0, BRS 1, ESI 0, DLC; padding is zeros.
-    head = (frame.identifier & 0x7FF) << 10 | 0b101 << 5 | FD_LENGTHS.index(length)
-    value = head << 8 * length | int.from_bytes(frame.data, "big") << 8 * (length - len(frame.data))
-    count = _FD_ARBITRATION + _FD_CONTROL + 8 * length
-    early = _stuffed(value >> count - _FD_ARBITRATION, _FD_ARBITRATION)
-    # What would be stuffed after the last bit is the fixed stuff bit before the stuff count.
-    every = _stuffed(value, count) - _run_ends(value, count)
-    plain = unstuffed(length, fd=True)
-    return Bits(plain.nominal + early, plain.data + every - early)
-
-
-def _classical(length: int) -> int:
-    """Return the bits from start to CRC of a frame with an 11-bit identifier."""
-    if not 0 <= length <= 8:
-        raise ValueError(f"a classical frame has 0 to 8 bytes, not {length}")
-    return 34 + 8 * length
-
-
-def _fd_checksum(length: int) -> int:
-    """Return the bits of stuff count (4), CRC, and a fixed stuff bit in front and after every four bits."""
-    content = 4 + (17 if length <= 16 else 21)
-    return content + 1 + content // 4
-
-
-# Stuffing as an automaton: a state is the last bit and how many alike there are, 0 before the first bit.
-_START = 0
-
-
-def _step(state: int, bit: int) -> tuple[int, int]:
-    """Return the state after one bit, and how many bits were stuffed; states are 1 + 5 bit + (run - 1), run 1 to 4."""
-    last, run = divmod(state - 1, 5) if state else (1 - bit, 0)
-    run = run + 2 if state and last == bit else 1
-    if run == 5:
-        return 1 + 5 * (1 - bit), 1  # the stuffed bit begins a run of its own
-    return 1 + 5 * bit + run - 1, 0
-
-
-def _byte_steps(state: int, byte: int) -> tuple[int, int]:
-    stuffed = 0
-    for place in range(7, -1, -1):
-        state, more = _step(state, byte >> place & 1)
-        stuffed += more
-    return state, stuffed
-
-
-_STEPS = [[_byte_steps(state, byte) for byte in range(256)] for state in range(11)]
-
-
-def _stuffed(value: int, count: int) -> int:
-    state, stuffed = _START, 0
-    whole, rest = divmod(count, 8)
-    for place in range(count - 1, count - 1 - rest, -1):
-        state, more = _step(state, value >> place & 1)
-        stuffed += more
-    for byte in (value & (1 << 8 * whole) - 1).to_bytes(whole, "big"):
-        state, more = _STEPS[state][byte]
-        stuffed += more
-    return stuffed
-
-
-def _run_ends(value: int, count: int) -> int:
-    """Return 1 when a bit is stuffed after the last one, else 0."""
-    return _stuffed(value, count) - _stuffed(value >> 1, count - 1)
-
-
-def _crc_byte(byte: int) -> int:
-    crc = byte << 7
-    for _ in range(8):
-        crc = (crc << 1 ^ (_POLYNOMIAL if crc & 0x4000 else 0)) & 0x7FFF
-    return crc
-
-
-_CRC = [_crc_byte(byte) for byte in range(256)]
-
-
-MOST_WORST, MOST_TYPICAL = 1.0, 0.9  # of a bus
-ROUND_RATES = (1000, 800, 500, 400, 250, 200, 125, 100, 50)  # Hz
 _FD_FACTOR = 4  # data bit rate over bit rate of the remedy with CAN FD
-_DRAWN = 256  # frames behind one mean
 
 HEARTBEAT_STATE = Entry(0x1017, 0, Kind.U8, "NMT state")  # not an entry: what a heartbeat frame carries
 VENDOR_BYTE = Entry(0x1003, 0, Kind.U8, "vendor's byte of an emergency")
@@ -211,6 +41,7 @@ EMERGENCY_SLOTS = (od.LAST_EMERGENCY, od.ERROR_REGISTER, *(VENDOR_BYTE,) * 5)
 _VALUES: dict[Entry, Callable[[random.Random], int]] = {
     od.POSITION: lambda draw: draw.randint(-40_000, 40_000),
     od.TARGET_TORQUE: lambda draw: draw.randint(-100, 100),
+    od.TARGET_POSITION: lambda draw: draw.randint(-40_000, 40_000),
     od.TORQUE_ACTUAL: lambda draw: draw.randint(-100, 100),
     od.STATUS_WORD: lambda draw: draw.choice((0x1637, 0x1E37)),
     od.LAST_EMERGENCY: lambda draw: draw.choice((0x2310, 0x3220, 0x4310, 0x7305, 0x8130, 0x8250, 0x8611)),
@@ -218,123 +49,6 @@ _VALUES: dict[Entry, Callable[[random.Random], int]] = {
     HEARTBEAT_STATE: lambda draw: NmtState.OPERATIONAL,
     VENDOR_BYTE: lambda draw: 0,
 }
-
-
-class Cost(NamedTuple):
-    """Hold one quantity without stuffing, in the mean, and in the worst case."""
-
-    unstuffed: float
-    typical: float
-    worst: float
-
-    def times(self, factor: float) -> Cost:
-        """Return the cost multiplied by a factor."""
-        return Cost(*(factor * each for each in self))
-
-
-@dataclass(frozen=True)
-class Line:
-    """Describe the frames of one sort.
-
-    Attributes:
-        name: of the sort.
-        cob_ids: identifiers, one frame each.
-        length: bytes of one.
-        per_second: how often each is sent, at most.
-        cyclic: whether each is sent once a cycle.
-        each: time of one on the wire, intermission included [s]; the mean over `cob_ids`.
-    """
-
-    name: str
-    cob_ids: tuple[int, ...]
-    length: int
-    per_second: float
-    cyclic: bool
-    each: Cost
-
-    @property
-    def load(self) -> Cost:
-        """Return the share of the bus that all frames of this sort take."""
-        return self.each.times(len(self.cob_ids) * self.per_second)
-
-
-@dataclass(frozen=True)
-class BusLoad:
-    """Describe the load of one bus.
-
-    Attributes:
-        profile: frames of the bus.
-        lines: their load, by sort.
-    """
-
-    profile: BusProfile
-    lines: tuple[Line, ...]
-
-    @property
-    def cycle(self) -> Cost:
-        """Return the time on the wire of the frames of one cycle [s], within which the last position has come."""
-        return _sum(line.each.times(len(line.cob_ids)) for line in self.lines if line.cyclic)
-
-    @property
-    def background(self) -> Cost:
-        """Return the share of the bus that does not depend on the rate."""
-        return _sum(line.load for line in self.lines if not line.cyclic)
-
-    @property
-    def load(self) -> Cost:
-        """Return the share of the bus taken by all frames."""
-        return _sum(line.load for line in self.lines)
-
-    @property
-    def fits(self) -> bool:
-        """Return whether the bus keeps the rule: at most `MOST_WORST` and `MOST_TYPICAL` of it."""
-        return self.load.worst <= MOST_WORST and self.load.typical <= MOST_TYPICAL
-
-    @property
-    def highest_rate(self) -> int:
-        """Return the most whole cycles per second that keep the rule; 0 where the background alone breaks it."""
-        cycle, background = self.cycle, self.background
-        most = min((MOST_WORST - background.worst) / cycle.worst, (MOST_TYPICAL - background.typical) / cycle.typical)
-        return max(0, floor(most + 1e-9))
-
-
-@dataclass(frozen=True)
-class Budget:
-    """Describe the load of all buses of an arm.
-
-    Attributes:
-        rate: cycles per second.
-        buses: in the order of the configuration.
-        remedies: changes of which each alone would make the load fit, in words; empty where it fits.
-    """
-
-    rate: float
-    buses: tuple[BusLoad, ...]
-    remedies: tuple[str, ...] = ()
-
-    @property
-    def fits(self) -> bool:
-        """Return whether every bus keeps the rule."""
-        return all(bus.fits for bus in self.buses)
-
-    @property
-    def highest_rate(self) -> int:
-        """Return the most whole cycles per second that every bus carries."""
-        return min(bus.highest_rate for bus in self.buses)
-
-    @property
-    def reason(self) -> str:
-        """Describe in words which buses are over budget; empty where none is."""
-        return "; ".join(
-            f"bus {bus.profile.number} ({bus.profile.bus.channel}) is over budget at {self.rate:g} Hz: {_shares(bus)}"
-            for bus in self.buses
-            if not bus.fits
-        )
-
-    @property
-    def remedy(self) -> str:
-        """Return one sentence that says what to do; empty where nothing has to be done."""
-        return f"Do one of these: {'; '.join(self.remedies)}." if self.remedies else ""
 
 
 def budget(driver: CanopenDriver, rate: float) -> Budget:
@@ -356,26 +70,32 @@ def frame_cost(cob_id: int, slots: Sequence[Entry], bus: CanBus) -> Cost:
         slots: entries that it carries; they decide its length and which values are typical.
         bus: its bit rates.
     """
+    return _line_of("", (cob_id,), tuple(slots), 1.0, bus).each
+
+
+def _line_of(
+    name: str,
+    cob_ids: tuple[int, ...],
+    slots: tuple[Entry, ...],
+    per_second: float,
+    bus: CanBus,
+    *,
+    cyclic: bool = False,
+) -> Line:
     length, fd = sum(slot.kind.size for slot in slots), bus.data_bitrate is not None
-    rates = bus.bitrate, bus.data_bitrate
-    nominal, data = _mean_bits(cob_id, tuple(slots), fd)
-    typical = nominal / bus.bitrate + (data / bus.data_bitrate if bus.data_bitrate is not None else 0.0)
-    return Cost(unstuffed(length, fd=fd).seconds(*rates), typical, worst(length, fd=fd).seconds(*rates))
+    return line_of(name, cob_ids, length, per_second, bus, lambda one: _mean_bits(one, slots, fd), cyclic=cyclic)
 
 
 @lru_cache(maxsize=512)
 def _mean_bits(cob_id: int, slots: tuple[Entry, ...], fd: bool) -> tuple[float, float]:
-    """Return the mean length over typical values, at the nominal and at the data bit rate; the same on every call."""
-    draw = random.Random(cob_id)  # noqa: S311 - values, not secrets
-    nominal = data = 0
-    for _ in range(_DRAWN):
-        bits = exact(Frame(cob_id, b"".join(slot.pack(_VALUES[slot](draw)) for slot in slots)), fd=fd)
-        nominal, data = nominal + bits.nominal, data + bits.data
-    return nominal / _DRAWN, data / _DRAWN
+    def draw(source: random.Random) -> bytes:
+        return b"".join(slot.pack(_VALUES[slot](source)) for slot in slots)
+
+    return mean_bits(cob_id, draw, fd=fd)
 
 
 def _budget(driver: CanopenDriver, rate: float) -> Budget:
-    return Budget(rate, tuple(BusLoad(profile, tuple(_lines(profile))) for profile in bus_profiles(driver, rate)))
+    return Budget(rate, tuple(BusLoad(one.number, one.bus, tuple(_lines(one))) for one in bus_profiles(driver, rate)))
 
 
 def _lines(profile: BusProfile) -> Iterator[Line]:
@@ -385,9 +105,11 @@ def _lines(profile: BusProfile) -> Iterator[Line]:
     for frame in profile.torque_frames:
         if len(frame.nodes) > 1:
             whose = f"torques of nodes {', '.join(map(str, frame.nodes))}"
-            yield _line(profile, whose, (frame.cob_id,), (od.TARGET_TORQUE,) * len(frame.nodes), rate, cyclic=True)
+            yield _line(profile, whose, (frame.cob_id,), (frame.target,) * len(frame.nodes), rate, cyclic=True)
     if alone:
-        yield _line(profile, "torques, one drive each", alone, (od.TARGET_TORQUE,), rate, cyclic=True)
+        target = profile.torque_frames[0].target
+        whose = "torques" if target is od.TARGET_TORQUE else "target positions"
+        yield _line(profile, f"{whose}, one drive each", alone, (target,), rate, cyclic=True)
     yield _line(profile, "positions", tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
     status = profile.status_slots
     yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
@@ -414,9 +136,7 @@ def _line(
     *,
     cyclic: bool = False,
 ) -> Line:
-    costs = [frame_cost(cob_id, slots, profile.bus) for cob_id in cob_ids]
-    mean = _sum(costs).times(1.0 / len(costs))
-    return Line(name, cob_ids, sum(slot.kind.size for slot in slots), per_second, cyclic, mean)
+    return _line_of(name, cob_ids, slots, per_second, profile.bus, cyclic=cyclic)
 
 
 def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str]:
@@ -429,7 +149,7 @@ def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str
 
 
 def _variants(driver: CanopenDriver) -> Iterator[tuple[str, CanopenDriver]]:
-    if driver.torque_frames == "single" and driver.shares_by_sheet:
+    if driver.torque_frames == "single" and driver.streams == "torque" and driver.shares_by_sheet:
         words = "let up to four drives share a torque frame (driver.torque_frames: shared)"
         yield words, driver.model_copy(update={"torque_frames": "shared"})
     if len(driver.buses) == 1 and len(driver.drives) > 1:
@@ -445,13 +165,4 @@ def _variants(driver: CanopenDriver) -> Iterator[tuple[str, CanopenDriver]]:
 
 
 def _left(other: Budget) -> str:
-    return f"{_shares(max(other.buses, key=lambda bus: bus.load.worst))}"
-
-
-def _shares(bus: BusLoad) -> str:
-    return f"{100 * bus.load.worst:.1f} % worst, {100 * bus.load.typical:.1f} % typical"
-
-
-def _sum(costs: Iterator[Cost] | Sequence[Cost]) -> Cost:
-    every = list(costs)
-    return Cost(*(sum(column) for column in zip(*every, strict=True))) if every else Cost(0.0, 0.0, 0.0)
+    return shares(max(other.buses, key=lambda bus: bus.load.worst))

@@ -17,17 +17,18 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from drivers.axis_status import AxisStatus
+from drivers.can.bus_load import worst
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import BusLock, Link
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import worst
 from drivers.canopen.cia402 import NmtState, axis_status, drive_words, joint_status, nmt_words
 from drivers.canopen.drive_setup import identify
-from drivers.canopen.motor_units import coordinates, unwrapped
+from drivers.canopen.motor_units import coordinates
 from drivers.canopen.pdo_mapping import HEARTBEAT, SDO_REPLY, SYNC
 from drivers.canopen.sdo import TIMEOUT, Answers, Objects, Place, poll
 from drivers.canopen.stored_zero import zeros_of
 from drivers.clock import Clock, RealClock
+from drivers.motor_units import unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError, PositionUnknown

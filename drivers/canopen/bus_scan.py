@@ -11,11 +11,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from drivers.can.bus_load import worst
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import BusLock, Link, open_links
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import worst
 from drivers.canopen.bus_monitor import BusListener
 from drivers.canopen.capabilities import DRIVE_PROFILE
 from drivers.canopen.drive_setup import IDENTITY

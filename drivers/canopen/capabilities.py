@@ -9,7 +9,7 @@ it.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.object_dictionary import Entry, Kind, pdo_entry
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
 from ident_service.config.canopen import CanopenDrive, CanopenDriver, WatchdogKind
-from ident_service.config.drive_family import Family, TorqueLimit, TorquePath, family_from
+from ident_service.config.drive_family import Family, PositionPath, TorqueLimit, TorquePath, family_from
 from ident_service.config.eds import DataSheet
 from ident_service.errors import DriverError
 
@@ -94,7 +94,7 @@ _OPTIONAL: Sequence[tuple[Entry, str]] = (
 _OTHERS: Sequence[Entry] = (
     *(od.DEVICE_TYPE, od.PRODUCT, od.REVISION, od.SERIAL, od.SYNC_WINDOW, od.SYNC_OVERFLOW, od.GUARD_TIME),
     *(od.LIFE_FACTOR, od.HEARTBEAT_CONSUMER, od.HEARTBEAT_PRODUCER, od.RPDO_DEADLINE, pdo_entry(od.TPDO_PERIOD, 2)),
-    *(od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
+    *(od.TARGET_POSITION, od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
 )
 
 
@@ -107,12 +107,14 @@ class DriveEntries:
         values: of the entries, by key, where known.
         unread: why one that it seems to have could not be read, by key.
         asked: whether the drive was asked; else its data sheet foretells.
+        firmware: its software version (100Ah), empty where it does not tell it.
     """
 
     there: frozenset[int]
     values: Mapping[int, int]
     unread: Mapping[int, str] = field(default_factory=dict)
     asked: bool = True
+    firmware: str = ""
 
     def has(self, entry: Entry) -> bool:
         """Tell whether the drive has an entry."""
@@ -147,7 +149,7 @@ class Capabilities:
     Attributes:
         family: that it belongs to.
         found: what it has.
-        torque: how torques are streamed; None for no way.
+        torque: how torques are streamed, or positions (`driver.streams`); None for no way.
         count: a count of the target [N m]; None where nothing tells it.
         limit: of the torque, in the drive; None for none.
         speed: entry of the largest speed; None where the drive has none.
@@ -162,7 +164,7 @@ class Capabilities:
 
     family: Family
     found: DriveEntries
-    torque: TorquePath | None
+    torque: TorquePath | PositionPath | None
     count: float | None
     limit: TorqueLimit | None
     speed: Entry | None
@@ -173,6 +175,20 @@ class Capabilities:
     problems: tuple[Problem, ...]
     changes: tuple[Problem, ...]
     notes: tuple[str, ...]
+
+    @property
+    def summary(self) -> str:
+        """Describe what a preflight ticket is for: mode, size of a count, limits, watchdogs, status reports."""
+        unknown = "unknown"
+        torque = unknown if self.torque is None else f"mode {self.torque.mode} by {named(self.torque.target)}"
+        count = unknown if self.count is None else f"{self.count:.6g} N m"
+        limit = unknown if self.limit is None else named(self.limit.entry)
+        speed = "none" if self.speed is None else where(self.speed)
+        status = "by timer" if self.event else "by SYNC"
+        return (
+            f"{self.family.name}, {torque}, a count {count}, torque limit {limit}, speed limit {speed}, "
+            f"watchdogs {' '.join(self.watchdogs) or 'none'}, status {status}"
+        )
 
     def require(self, node: int) -> None:
         """Raise DriverError where the drive is to be refused, with everything that is wrong."""
@@ -218,7 +234,16 @@ def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()
     objects.read_bytes(od.DEVICE_TYPE.index, 0, od.DEVICE_TYPE.name)  # one that is silent is not asked for all the rest
     first = _asked(objects, (od.DEVICE_TYPE, od.VENDOR, od.PRODUCT))
     family = family_of(first.identity, own)
-    return family, _asked(objects, _entries(family, drive))
+    return family, replace(_asked(objects, _entries(family, drive)), firmware=_firmware(objects))
+
+
+def _firmware(objects: Objects) -> str:
+    try:
+        return objects.read_bytes(od.FIRMWARE_INDEX, 0, "software version").decode("ascii", "replace").strip("\0 ")
+    except BusError:
+        raise
+    except DriverError:
+        return ""
 
 
 def entries_from_sheet(
@@ -237,6 +262,8 @@ def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
     texts += [text for one in family.torque_limit for text in (one.entry, one.per, one.negative) if text]
     texts += [*family.speed_limit, *([family.unit.rated] if family.unit and family.unit.rated else [])]
     texts += [family.watchdog.entry] if family.watchdog else []
+    texts += [family.brake] if family.brake else []
+    texts += [family.position.target] if family.position else []
     entries = [*(entry for entry, _ in (*_INDISPENSABLE, *_OPTIONAL)), *_OTHERS]
     entries += [entry_of(text, "entry of its family") for text in texts]
     if (mine := drive.watchdog_entry) is not None:
@@ -276,16 +303,19 @@ def assess(
     problems = [Problem(where(entry), f"missing; {why}") for entry, why in _INDISPENSABLE if not found.has(entry)]
     notes = [f"{where(entry)} is missing: {words}" for entry, words in _OPTIONAL if not found.has(entry)]
     notes += [f"cannot be read: {why}" for why in found.unread.values()]
-    torque = next((path for path in family.torque if _streams(path, found)), None)
+    positions = driver.streams == "position"
+    paths = ([family.position] if family.position else []) if positions else family.torque
+    torque = next((path for path in paths if _streams(path, found)), None)
     kind = found.get(od.DEVICE_TYPE)
     if kind is not None and kind & 0xFFFF != DRIVE_PROFILE:
         problems = [Problem("1000h", f"is {kind:08X}h, which is no drive of CiA 402")]
     elif torque is None:
-        problems = [Problem("6502h", family.refuse or _no_torque(family, found))]
+        problems = [Problem("6502h", _no_position(found) if positions else family.refuse or _no_torque(family, found))]
     elif kind is None and found.asked:
         problems.insert(0, Problem("1000h", "does not report to be a drive of CiA 402"))
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
+    notes += _other_limits(family, found, drive, limit)
     speeds = [entry_of(text, "largest speed", "turns per minute") for text in family.speed_limit]
     speed = next((entry for entry in speeds if found.has(entry)), None)
     if speed is None:
@@ -293,6 +323,8 @@ def assess(
     watchdogs = tuple(_watchdogs(family, found, drive))
     changes: list[Problem] = []
     if torque is not None:
+        if positions and (family.unit is None or family.unit.rated is None):
+            problems.append(Problem("6077h", "nobody knows what a count of the torque that it measures is"))
         problems += _unit_problems(family, found, count)
         changes += _unit_changes(family, found, drive, count)
         if limit is None:
@@ -305,6 +337,9 @@ def assess(
         elif drive.watchdog not in watchdogs:
             words = f"{drive.watchdog}: this drive lacks it; it has {', '.join(watchdogs)}"
             changes.append(Problem("drives.watchdog", words))
+        if driver.zero == "at_home" and not found.has(od.ZERO_COUNTS):
+            words = "at_home: it has no 1020h to keep a zero in; its encoder must know its position (absolute)"
+            changes.append(Problem("driver.zero", words))
         if driver.torque_reports != "none" and not found.has(od.TORQUE_ACTUAL):
             changes.append(Problem("driver.measured_torque", "it does not report its torque (6077h): set it to none"))
     event = found.has(pdo_entry(od.TPDO_PERIOD, 2))
@@ -339,8 +374,8 @@ def named(text: str) -> str:
     return where(entry_of(text, ""))
 
 
-def _streams(path: TorquePath, found: DriveEntries) -> bool:
-    """Return whether a drive supports a way of streaming torques; where 6502h is unknown, it may."""
+def _streams(path: TorquePath | PositionPath, found: DriveEntries) -> bool:
+    """Return whether a drive supports a way of streaming; where 6502h is unknown, it may."""
     needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
     modes = found.get(od.SUPPORTED_MODES)
     supported = path.supported is None or modes is None or bool(modes >> path.supported & 1)
@@ -354,8 +389,28 @@ def _no_torque(family: Family, found: DriveEntries) -> str:
     return f"no torque mode: 6502h {said}" + (f", {', '.join(lacking)} missing" if lacking else "")
 
 
+def _no_position(found: DriveEntries) -> str:
+    modes = found.get(od.SUPPORTED_MODES)
+    said = "has no value" if modes is None else f"is {modes:X}h"
+    return f"no cyclic synchronous position mode: 6502h {said}" + (
+        "" if found.has(od.TARGET_POSITION) else ", 607Ah missing"
+    )
+
+
 def _limits(limit: TorqueLimit, found: DriveEntries) -> bool:
     return all(found.has(entry_of(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
+
+
+def _other_limits(
+    family: Family, found: DriveEntries, drive: CanopenDrive, chosen: TorqueLimit | None
+) -> Iterator[str]:
+    """Tell of further limits that are below the described torque: a drive keeps the lowest (Nanotec, 6071h)."""
+    most = 1000.0 * drive.max_torque / drive.rated_torque
+    for limit in family.torque_limit:
+        held = None if limit is chosen or limit.per else found.get(entry_of(limit.entry, ""))
+        if held is not None and held < most:
+            share = held * drive.rated_torque / 1000.0
+            yield f"{named(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
 
 
 def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | None:

@@ -20,11 +20,12 @@ from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, entry_of, where
 from drivers.canopen.cia402 import POWER_OFF, state_of
-from drivers.canopen.motor_units import Coordinates, torque_limit_counts
-from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.motor_units import count_limits, torque_limit_counts
+from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, READ_ONLY, Objects, SdoRefused, WriteNotVerified, optional
 from drivers.canopen.stored_zero import Zeros
+from drivers.motor_units import Coordinates
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import (
     CanopenDrive,
@@ -32,9 +33,10 @@ from ident_service.config.canopen import (
     DriveIdentity,
     Reactions,
     motor_speeds,
+    motor_torques,
     quick_stop_decelerations,
 )
-from ident_service.config.drive_family import TorquePath
+from ident_service.config.drive_family import PositionPath, TorquePath
 from ident_service.errors import AnotherDrive, DriverError
 
 _SMALL = {0x0002: Kind.I8, 0x0005: Kind.U8}
@@ -143,7 +145,7 @@ LIMIT_SLACK = 0.05  # rad or m by which the drives' position limits exceed the j
 _FIRMWARE = 0x100A
 _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
-_MODE_PATIENCE, _MODE_AGAIN_NS = 5.0, 10_000_000  # s in all, ns between two reads
+_MODE_PATIENCE, _MODE_AGAIN_NS = 0.5, 10_000_000  # s for drives that show it while off, ns between two reads
 _ROUNDING = 1e-6
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
@@ -157,11 +159,13 @@ class MotorLimits:
         positions: lowest and highest [counts], for a drive that heeds them; None where joints have none.
         speed: at which it turns when all joints move at their velocity limits [turns per minute].
         deceleration: 6085h, in the drive's unit; None where neither the drive's section nor the joints say one.
+        torque: that keeps its joints within their torque limits, whatever the others give [N m].
     """
 
     positions: tuple[int, int] | None
     speed: float = 0.0
     deceleration: int | None = None
+    torque: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -186,15 +190,24 @@ class DriveConfiguration:
     can: Capabilities
 
     @property
-    def torque(self) -> TorquePath:
-        """Return how torques are streamed to the drive."""
+    def torque(self) -> TorquePath | PositionPath:
+        """Return how torques, or positions, are streamed to the drive."""
         assert self.can.torque is not None  # noqa: S101 - else it has been refused
         return self.can.torque
 
     @property
     def limit_counts(self) -> int:
-        """Return the largest torque [counts of the target]."""
-        return torque_limit_counts(self.drive.max_torque, self.drive.rated_torque)
+        """Return the largest torque [per mille of rated torque].
+
+        Where positions are streamed the drive alone can keep the joints' limits; else the host does, cycle by cycle.
+        """
+        most = min(self.drive.max_torque, self.motor.torque) if self.positions else self.drive.max_torque
+        return torque_limit_counts(most, self.drive.rated_torque)
+
+    @property
+    def positions(self) -> bool:
+        """Return whether positions are streamed."""
+        return isinstance(self.can.torque, PositionPath)
 
     def watchdog(self) -> list[Write]:
         """Return the downloads that set a watchdog of the maker's."""
@@ -211,17 +224,25 @@ class DriveConfiguration:
         ]
 
     def hints(self) -> list[Write]:
-        """Return the downloads of the cycle and the position limits, for drives that want to know them.
+        """Return the downloads of what drives want to know: the cycle and, in torque mode, the position limits.
 
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
         todo = [Write(od.SYNC_PERIOD, self.period_us)]
-        if self.motor.positions is not None:
-            lowest, highest = self.motor.positions
-            todo += [Write(od.LOWER_LIMIT, lowest), Write(od.UPPER_LIMIT, highest)]
+        return todo if self.positions else [*todo, *self.walls(), *self.interpolation()]
+
+    def walls(self) -> list[Write]:
+        """Return the downloads of the position limits."""
+        if self.motor.positions is None:
+            return []
+        lowest, highest = self.motor.positions
+        return [Write(od.LOWER_LIMIT, lowest), Write(od.UPPER_LIMIT, highest)]
+
+    def interpolation(self) -> list[Write]:
+        """Return the downloads of the interpolation period; none where 8 bits do not hold it."""
         power = next(power for power in (-3, -4, -5, -6) if self.period_us % 10 ** (6 + power) == 0)
         number = self.period_us // 10 ** (6 + power)
-        return [*todo, Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)] if number <= 0xFF else todo
+        return [Write(od.PERIOD_POWER, power), Write(od.PERIOD_NUMBER, number)] if number <= 0xFF else []
 
     @property
     def period_us(self) -> int:
@@ -230,10 +251,10 @@ class DriveConfiguration:
 
     def pdos(self) -> list[Pdo]:
         """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
-        target = entry_of(self.torque.target, "target torque", "counts")
+        target = entry_of(self.torque.target, "target position" if self.positions else "target torque", "counts")
         found = []
         for pdo in self.profile.pdos(self.drive.node):
-            own = tuple(target if slot == od.TARGET_TORQUE else slot for slot in pdo.slots)
+            own = tuple(target if slot in (od.TARGET_TORQUE, od.TARGET_POSITION) else slot for slot in pdo.slots)
             found.append(replace(pdo, slots=own))
             if od.STATUS_WORD in pdo.slots and not self.can.event:
                 found[-1] = replace(pdo, type=self.profile.status_syncs, inhibit=0, timer=0)
@@ -251,10 +272,11 @@ def motor_limits(config: ArmConfig, found: Coordinates) -> list[MotorLimits]:
     assert isinstance(driver, CanopenDriver)  # noqa: S101 - refused in the beginning
     assert gears is not None  # noqa: S101 - likewise
     lowest, highest = np.array([joint.position or (-np.inf, np.inf) for joint in joints]).T
-    limits = found.count_limits(lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
+    limits = count_limits(found, lowest - LIMIT_SLACK, highest + LIMIT_SLACK)
     speeds = motor_speeds(gears, [joint.velocity for joint in joints])
     brakes = quick_stop_decelerations(driver, gears, [joint.acceleration for joint in joints])
-    return [MotorLimits(*one) for one in zip(limits, speeds, brakes, strict=True)]
+    torques = motor_torques(driver, gears, [joint.torque for joint in joints])
+    return [MotorLimits(*one) for one in zip(limits, speeds, brakes, torques, strict=True)]
 
 
 def watchdogs_of(driver: CanopenDriver, names: Sequence[str]) -> tuple[Watchdog, ...]:
@@ -311,11 +333,11 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
     return f"node {objects.node}: {words}, firmware {firmware}"
 
 
-def configure(objects: Objects, setup: DriveConfiguration) -> int:
+def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
 
     Returns:
-        The mode of operation (6060h), which is sent with every control word.
+        The mode of operation, which is sent with every control word.
 
     Raises:
         DriverError: it lacks, refuses or forgets something; the message names the entry and says why.
@@ -337,11 +359,12 @@ def configure(objects: Objects, setup: DriveConfiguration) -> int:
         (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
     for write in setup.watchdog():
         objects.ensure(write)
+    for write in setup.walls() + setup.interpolation() if setup.positions else ():
+        objects.ensure_if_there(write)  # here they count: a drive moves by them
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):
             objects.ensure_if_there(write)
-    _mode(objects, setup)
-    return setup.torque.mode if setup.torque.by is None else objects.read(od.MODE)
+    return _mode(objects, setup)
 
 
 def _timing(objects: Objects, setup: DriveConfiguration) -> None:
@@ -374,18 +397,17 @@ def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
         objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
 
 
-def _mode(objects: Objects, setup: DriveConfiguration) -> None:
-    """Set the mode of operation, and wait until the drive reports it, which may take some time."""
-    by, clock = setup.torque.by, objects.clock
+def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
+    """Set the mode of operation, and give the drive a moment to report it; before it is enabled it must have."""
+    by, clock, mode = setup.torque.by, objects.clock, setup.torque.mode
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
-    if not objects.holds(wanted := Write(entry, setup.torque.mode)):
+    if not objects.holds(wanted := Write(entry, mode)):
         objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
-    last = clock.now_ns() + round(_MODE_PATIENCE * 1e9)
-    while (mode := objects.read(display)) != setup.torque.mode:
-        if clock.now_ns() > last:
-            words = f"is in mode {mode} ({display.index:04X}h) although {setup.torque.mode} was set"
-            raise DriverError(f"node {objects.node}: {words}")
+    shows = setup.can.family.mode_shown == "off" and not objects.dry
+    last = clock.now_ns() + (round(_MODE_PATIENCE * 1e9) if shows else 0)
+    while objects.read(display) != mode and clock.now_ns() < last:
         clock.sleep_until_ns(clock.now_ns() + _MODE_AGAIN_NS)
+    return OperationMode(mode if by is None else objects.read(od.MODE), display, mode)
 
 
 def _mode_entry(text: str) -> Entry:

@@ -26,13 +26,15 @@ from numpy.typing import NDArray
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
+from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
 from drivers.can.can_link import BusLock, Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links, require_format
 from drivers.canopen import object_dictionary as od
+from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.capabilities import required
-from drivers.canopen.cia402 import DISABLE_VOLTAGE, QUICK_STOP, DriveState, NmtCommand, joint_status
+from drivers.canopen.cia402 import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, DriveState, NmtCommand, joint_status
 from drivers.canopen.drive_setup import (
     DriveConfiguration,
     configure,
@@ -43,13 +45,14 @@ from drivers.canopen.drive_setup import (
     watchdogs_of,
 )
 from drivers.canopen.homing import ZeroingArm
-from drivers.canopen.motor_units import Coordinates, coordinates, unwrapped
+from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from drivers.canopen.stored_zero import zeros_of
 from drivers.canopen.sync_cycle import Buses, EnableSequence, Resetting, hold
 from drivers.clock import Clock, RealClock, VirtualClock
+from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError, PositionUnknown
@@ -87,7 +90,7 @@ class StopCommand:
         word, drives, self._untold = QUICK_STOP if self.braking else DISABLE_VOLTAGE, self._untold, []
         for number in drives:
             try:
-                buses.control(number, word)
+                buses.control_stop(number, word)
             except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
                 self._untold.append(number)
 
@@ -130,13 +133,22 @@ class MeasuredTorque:
     Attributes:
         torque: by the newest reports, where one came since the cycle before, else NaN [N m or N], shape (joints,);
             None where no drive has reported.
+        last: of every joint, the last torque by a report, 0 before the first [N m or N], shape (joints,).
         difference: how much more than they were told drives measured in their last two reports, the smaller of both
             [N m or N], shape (joints,); None likewise.
     """
 
-    def __init__(self, coordinates: Coordinates, rate: float) -> None:
-        """Start with drives without a commanded torque; `rate` is in cycles per second."""
+    def __init__(self, coordinates: Coordinates, rate: float, *, compares: bool = True) -> None:
+        """Start with drives without a commanded torque.
+
+        Args:
+            coordinates: of the arm.
+            rate: cycles per second.
+            compares: whether drives are given torques, with which the measured ones are compared.
+        """
         self._coordinates = coordinates
+        self._compares = compares
+        self.last: Vector = np.zeros(len(coordinates.offset))
         self._told = np.zeros((max(2, round(WINDOW * rate)), len(coordinates.limit)))
         self._cycle = 0
         self._outside, self._before = [0.0] * len(coordinates.limit), [0.0] * len(coordinates.limit)
@@ -151,7 +163,8 @@ class MeasuredTorque:
             counts: sent with its SYNC [per mille of rated torque], by drive.
             drives: as they are at its end.
         """
-        self._told[self._cycle % len(self._told)] = counts
+        if self._compares:
+            self._told[self._cycle % len(self._told)] = counts
         self._cycle += 1
         new = [drive.torques > known for drive, known in zip(drives, self._reports, strict=True)]
         if not any(new):
@@ -169,7 +182,9 @@ class MeasuredTorque:
         for motors, joints in self._coordinates.groups:
             if not (all(self._reports[k] for k in motors) and any(new[k] for k in motors)):
                 torque[list(joints)] = np.nan
-        self.torque, self.difference = torque, self._coordinates.joint_torque(self._outside)
+        self.torque, self.last = torque, _frozen(np.where(np.isnan(torque), self.last, torque))
+        if self._compares:
+            self.difference = self._coordinates.joint_torque(self._outside)
 
 
 _CODES: dict[EventCode, AxisEventCode] = {
@@ -295,6 +310,7 @@ class CanopenArm(Arm):
         self._coordinates: Coordinates = coordinates(config.driver, config.transmission)
         self._zeros = zeros_of(config)
         self._quick_stop = quick_stop_option(config)
+        self._positions = config.driver.streams == "position"
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
         if len(self._limits) != len(config.driver.drives):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
@@ -326,7 +342,7 @@ class CanopenArm(Arm):
         self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
         first = {k: joints[0] for k, joints in self._joints_of.items()}
         self._reports = Reports(self._driver, first, self._look_every)
-        self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns)
+        self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns, compares=not self._positions)
         self._identities: tuple[str, ...] = ()
 
     def look(self) -> Arm:
@@ -397,7 +413,14 @@ class CanopenArm(Arm):
             self._identities,
             "drivers.canopen",
             lost_cycles=self._driver.lost_cycles,
+            streams_position=self._positions,
+            watchdog=self._driver.watchdog,
+            report_delay=self._driver.report_delay,
         )
+
+    def bus_budget(self, rate: float | None = None) -> Budget:
+        """Return the load of the buses, see `Arm`."""
+        return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def enable(self) -> None:
         """Energise all drives together with zero torque, through the states of CiA 402.
@@ -414,13 +437,15 @@ class CanopenArm(Arm):
         try:
             reports = self._driver.status.inhibit, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
-            steps = EnableSequence(buses.drives, self._names, self._driver.bring_up, now_ns, reports, option)
+            buses.forget_modes()
+            tell = self._names, self._driver.bring_up, now_ns, reports, option, buses.other_modes
+            steps = EnableSequence(buses.drives, *tell)
             self._through(buses, steps)
         except BaseException:
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
             raise
         buses.forget_events()  # of the states that drives went through
-        self._enabled = True
+        self._enabled = buses.enabled = True
 
     def reset(self) -> None:
         """Clear the faults that drives have latched; nothing is energised.
@@ -441,6 +466,8 @@ class CanopenArm(Arm):
         """
         buses = self._open()
         if torque is not None:
+            if self._positions:
+                raise DriverError("a torque was given, but these drives are given positions (driver.streams)")
             if not self._enabled:
                 raise DriverError("a torque was given, but the arm is not enabled")
             wanted = np.asarray(torque, dtype=float)
@@ -449,10 +476,32 @@ class CanopenArm(Arm):
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
             self._counts, _ = self._coordinates.torque_counts(wanted)
             self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+        return self._exchanged(buses, sends=torque is not None)
+
+    def exchange_position(self, position: Vector) -> Sample:
+        """Exchange one cycle with drives that are given positions, as the contract says.
+
+        Raises:
+            DriverError: as in the contract.
+        """
+        buses = self._open()
+        if not self._positions:
+            raise DriverError("a position was given, but these drives are given torques (driver.streams)")
+        if not self._enabled:
+            raise DriverError("a position was given, but the arm is not enabled")
+        wanted = np.asarray(position, dtype=float)
+        if wanted.shape != self._limits.shape or not np.isfinite(wanted).all():
+            raise DriverError(f"{len(self._limits)} finite positions are needed, not {position}")
+        self._counts = [signed(counts) for counts in self._coordinates.counts_at(wanted)]
+        return self._exchanged(buses, sends=True)
+
+    def _exchanged(self, buses: Buses, *, sends: bool) -> Sample:
         self._stop.repeat(buses)
-        # While enabled, an exchange without a torque sends no torque frame: drives that supervise them must notice.
+        if self._positions and not self._enabled:
+            self._no_torque()
+        # While enabled, an exchange without a target sends no frame of it: drives that supervise them must notice.
         idle = self._stop.counts(self._counts) if self._streaming and not self._enabled else None
-        stamp_ns = buses.cycle(idle if torque is None else self._counts)
+        stamp_ns = buses.cycle(self._counts if sends else idle)
         self._measured.cycle(self._counts, buses.drives)
         sample = self._sample(buses, stamp_ns)
         self._cycle += 1
@@ -527,7 +576,9 @@ class CanopenArm(Arm):
         return self._buses
 
     def _no_torque(self) -> None:
-        self._counts = [0] * len(self._limits)
+        """Set the targets of drives that are to do nothing: no torque, or the position where each of them is."""
+        there = self._positions and self._buses is not None
+        self._counts = [drive.position for drive in self._buses.drives] if there else [0] * len(self._limits)  # type: ignore[union-attr]
         self._acting = _frozen(np.zeros(len(self._limits)))
 
     def _find_zero(self, buses: Buses) -> None:
@@ -542,7 +593,9 @@ class CanopenArm(Arm):
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
             identity = identify(objects, drive.identity)
-            own = self._driver.reactions, self._quick_stop, motors[number], required(objects, self._driver, number)
+            can = required(objects, self._driver, number)
+            identity += f"; {can.summary}"  # a preflight ticket is for what was found of the drive
+            own = self._driver.reactions, self._quick_stop, motors[number], can
             self._begun = number + 1
             buses.modes[number] = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
             if self._zeros is not None:
@@ -559,10 +612,13 @@ class CanopenArm(Arm):
 
     def _through(self, buses: Buses, steps: EnableSequence | Resetting) -> None:
         """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
-        stops = self._stops
+        stops, held = self._stops, False
         while not steps.done:
+            if not held:  # where positions are given, the one from which a drive is enabled is the one that it holds
+                self._no_torque()
             buses.cycle(self._counts if self._streaming else None)
             for number, word in steps.commands(self.clock.now_ns()):
+                held = held or word == ENABLE
                 if self._stops == stops:
                     buses.control(number, word)
             if self._stops != stops:
@@ -586,7 +642,7 @@ class CanopenArm(Arm):
             stamp_ns,
             self._coordinates.positions(self._unwrapped),
             None,
-            self._acting,
+            self._measured.last if self._positions else self._acting,
             valid,
             age,
             buses.lost,

@@ -15,9 +15,9 @@ from drivers.arm import Vector
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.cia402 import DriveState, drive_words, state_of
-from drivers.canopen.motor_units import unwrapped
 from drivers.canopen.sdo import TIMEOUT, Place
 from drivers.canopen.stored_zero import Zeros
+from drivers.motor_units import unwrapped
 from ident_service.errors import DriverError
 
 APART = 0.5  # s between two readings of a standing arm

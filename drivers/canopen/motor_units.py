@@ -1,164 +1,15 @@
-"""Convert between joints, motors, and the integers that drives use: counts and thousandths of a rated torque.
-
-With the gear ratios r, the coupling C and the offsets q0 of the arm's transmission (`config/recording.py`):
-
-    q = C^-1 diag(1/r) q_motor + q0,    tau = C^T diag(r) tau_motor,
-
-so that power is the same on both sides. A motor's position is `2 pi (counts - zero)/counts_per_turn`; the torque that
-it really gives for `n` thousandths is `n/1000 rated_torque torque_scale`.
-
-Clipping. Motors that share joints (a differential) are one group. Where one of them is asked for more than it may
-give, all joint torques of its group are scaled by the same factor: the direction is kept, so that no joint of the
-group is pushed the other way, and joints outside the group get all they asked for.
-
-Joints are arrays here, values that go over the bus plain integers.
-"""
+"""Convert to the integers of CANopen drives: counts of 32 bits, thousandths of a rated torque (`motor_units.py`)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import pi
-
-import numpy as np
-from numpy.typing import NDArray
-
+from drivers.motor_units import Coordinates, Vector, motor_coordinates
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.recording import Transmission
 from ident_service.errors import DriverError
 
-Vector = NDArray[np.float64]
-Matrix = NDArray[np.float64]
-
 MOST_COUNTS = 32_767  # of a torque, either way: -32768 has no opposite
 _TURN = 1 << 32  # counts after which a position of 32 bits comes round
 _PER_MILLE = 1000.0
-_ABSURD = 1e12  # N m; beyond, scaling down would not be exact, and no machine means it
-
-
-@dataclass(frozen=True)
-class Coordinates:
-    """Convert between n joints and their n motors.
-
-    Attributes:
-        joint_per_count: position [rad or m] per count of each motor, shape (n joints, n motors).
-        torque_per_count: joint torque [N m or N] per thousandth of each motor, shape (n joints, n motors).
-        count_per_torque: its inverse, shape (n motors, n joints).
-        offset: position of the joints where all counts are `zero`, shape (n,).
-        zero: counts of the motors there; whole numbers, any size.
-        limit: most thousandths that each motor may be asked for, either way.
-        groups: motors that share joints, and the joints they share, by number.
-    """
-
-    joint_per_count: Matrix
-    torque_per_count: Matrix
-    count_per_torque: Matrix
-    offset: Vector
-    zero: tuple[int, ...]
-    limit: tuple[int, ...]
-    groups: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
-
-    @property
-    def motors_of(self) -> list[tuple[int, ...]]:
-        """Return the motors that each joint's position is computed from, by number."""
-        return [next(motors for motors, joints in self.groups if j in joints) for j in range(len(self.offset))]
-
-    @property
-    def torque_limit(self) -> Vector:
-        """Return the most each joint can be given while the others are given nothing [N m or N], shape (n,)."""
-        with np.errstate(divide="ignore"):
-            alone = np.array(self.limit)[:, None] / np.abs(self.count_per_torque)
-        return np.asarray(alone.min(axis=0))
-
-    @property
-    def torque_resolution(self) -> Vector:
-        """Return the largest change of each joint's torque by one thousandth of one motor [N m or N], shape (n,)."""
-        return np.asarray(np.abs(self.torque_per_count).max(axis=1))
-
-    @property
-    def position_resolution(self) -> Vector:
-        """Return the largest change of each joint's position by one count of one motor [rad or m], shape (n,)."""
-        return np.asarray(np.abs(self.joint_per_count).max(axis=1))
-
-    def positions(self, counts: Sequence[int]) -> Vector:
-        """Return the joint positions [rad or m], shape (n,), of motors at these counts, unwrapped (`unwrapped`)."""
-        return self.joint_per_count @ [float(n - zero) for n, zero in zip(counts, self.zero, strict=True)] + self.offset
-
-    def counts_at(self, position: Vector) -> list[int]:
-        """Return the nearest counts of the motors when the joints are at this position [rad or m], shape (n,)."""
-        motors = np.linalg.solve(self.joint_per_count, position - self.offset)
-        return [round(turn) + zero for turn, zero in zip(motors.tolist(), self.zero, strict=True)]
-
-    def count_limits(self, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
-        """Return the range of counts of each motor while all joints are between these positions.
-
-        Args:
-            lowest: [rad or m], shape (n,); not finite where a joint has no limit.
-            highest: the other end, likewise.
-
-        Returns:
-            Lowest and highest counts of each motor; None for one that moves a joint without limits.
-
-        Raises:
-            DriverError: counts that 32 bits do not hold.
-        """
-        found: list[tuple[int, int] | None] = []
-        for row, zero in zip(np.linalg.inv(self.joint_per_count), self.zero, strict=True):
-            moved = row != 0.0
-            ends = row[moved] * (np.array([lowest, highest]) - self.offset)[:, moved]
-            if not np.isfinite(ends).all():
-                found.append(None)
-                continue
-            low, high = round(zero + ends.min(axis=0).sum()), round(zero + ends.max(axis=0).sum())
-            if not -_TURN // 2 <= low <= high < _TURN // 2:
-                raise DriverError(
-                    f"position limits at counts {low} to {high} do not fit the 32 bits of 607Dh; "
-                    "a drive that counts from power-up starts again when its power is switched"
-                )
-            found.append((low, high))
-        return found
-
-    def zeroed(self, counts: Sequence[int], position: Vector) -> Coordinates:
-        """Return coordinates for an arm whose motors are at these counts while its joints are at this position.
-
-        Args:
-            counts: of the motors, one each.
-            position: of the joints [rad or m], shape (n,).
-        """
-        return replace(self, zero=tuple(counts), offset=np.array(position, dtype=float))
-
-    def torque_counts(self, torque: Vector) -> tuple[list[int], bool]:
-        """Convert a joint torque to the motors' torques.
-
-        Args:
-            torque: of the joints [N m or N], shape (n,).
-
-        Returns:
-            Thousandths of rated torque of each motor, clipped (see above) and rounded; whether it was clipped.
-
-        Raises:
-            DriverError: a torque that is not finite (or absurd), or not of this shape.
-        """
-        wanted = np.asarray(torque, dtype=float)
-        if wanted.shape != self.offset.shape or not np.abs(wanted).max() < _ABSURD:
-            raise DriverError(f"{len(self.limit)} finite joint torques are needed, not {torque}")
-        exact = (self.count_per_torque @ wanted).tolist()
-        counts, clipped = [0] * len(exact), False
-        for motors, _ in self.groups:
-            share = 1.0
-            for k in motors:
-                asked = abs(exact[k])
-                if asked * share > self.limit[k]:
-                    share = self.limit[k] / asked
-                    clipped = True
-            for k in motors:
-                limit = self.limit[k]
-                counts[k] = min(max(round(exact[k] * share), -limit), limit)
-        return counts, clipped
-
-    def joint_torque(self, counts: Sequence[float]) -> Vector:
-        """Return the joint torque [N m or N], shape (n,), that motors really give at these thousandths."""
-        return np.asarray(self.torque_per_count @ [float(n) for n in counts])
 
 
 def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinates:
@@ -171,29 +22,29 @@ def coordinates(driver: CanopenDriver, transmission: Transmission) -> Coordinate
     Raises:
         DriverError: not as many drives as ratios.
     """
-    size = len(driver.drives)
-    if size != len(transmission.ratios):
-        raise DriverError(f"{size} drives but {len(transmission.ratios)} ratios in the transmission")
-    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
-    motor_per_joint = np.array(transmission.ratios)[:, None] * coupling
-    joint_per_motor = np.linalg.inv(motor_per_joint)
-    # An inverse that is only nearly zero where it should be zero would couple joints that are not coupled.
-    groups = _groups(coupling)
-    inside = np.zeros((size, size), dtype=bool)
-    for motors, joints in groups:
-        inside[np.ix_(joints, motors)] = True
-    joint_per_motor[~inside] = 0.0
-    radians = np.array([2.0 * pi / drive.counts for drive in driver.drives])
-    newton = np.array([drive.rated_torque * drive.torque_scale / _PER_MILLE for drive in driver.drives])
-    return Coordinates(
-        joint_per_motor * radians,
-        motor_per_joint.T * newton,
-        joint_per_motor.T / newton[:, None],
-        np.array(transmission.offsets or np.zeros(size)),
-        (0,) * size,
-        tuple(torque_limit_counts(drive.max_torque, drive.rated_torque) for drive in driver.drives),
-        groups,
+    drives = driver.drives
+    return motor_coordinates(
+        transmission,
+        [drive.counts for drive in drives],
+        [drive.rated_torque * drive.torque_scale / _PER_MILLE for drive in drives],
+        [torque_limit_counts(drive.max_torque, drive.rated_torque) for drive in drives],
     )
+
+
+def count_limits(found: Coordinates, lowest: Vector, highest: Vector) -> list[tuple[int, int] | None]:
+    """Return the range of counts of each motor (607Dh), as `Coordinates.count_limits`.
+
+    Raises:
+        DriverError: counts that 32 bits do not hold.
+    """
+    limits = found.count_limits(lowest, highest)
+    for low, high in filter(None, limits):
+        if not -_TURN // 2 <= low <= high < _TURN // 2:
+            raise DriverError(
+                f"position limits at counts {low} to {high} do not fit the 32 bits of 607Dh; "
+                "a drive that counts from power-up starts again when its power is switched"
+            )
+    return limits
 
 
 def torque_limit_counts(max_torque: float, rated_torque: float) -> int:
@@ -205,30 +56,3 @@ def torque_limit_counts(max_torque: float, rated_torque: float) -> int:
 def signed(value: int) -> int:
     """Convert an unsigned number of 32 bits to the signed one with the same bits."""
     return (value + _TURN // 2) % _TURN - _TURN // 2
-
-
-def unwrapped(before: int, counts: int) -> int:
-    """Return a position of 32 bits without wrap-around: the value nearest to the one before.
-
-    Args:
-        before: the last position, unwrapped [counts].
-        counts: present position of the drive, a signed number of 32 bits.
-    """
-    return before + (counts - before + _TURN // 2) % _TURN - _TURN // 2
-
-
-def _groups(coupling: Matrix) -> tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]:
-    """Return motors (rows) and joints (columns) connected through elements that are not zero."""
-    size, left = len(coupling), set(range(len(coupling)))
-    found = []
-    while left:
-        motors, joints = {min(left)}, set[int]()
-        while True:
-            more = {j for m in motors for j in range(size) if coupling[m, j] != 0.0}
-            others = {m for j in more for m in range(size) if coupling[m, j] != 0.0}
-            if more == joints and others == motors:
-                break
-            joints, motors = more, others | motors
-        left -= motors
-        found.append((tuple(sorted(motors)), tuple(sorted(joints))))
-    return tuple(found)

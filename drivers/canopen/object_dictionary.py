@@ -99,6 +99,7 @@ SERIAL = Entry(0x1018, 4, Kind.U32, "serial number")
 SYNC_OVERFLOW = Entry(0x1019, 0, Kind.U8, "counter in SYNC, 0 for none")
 # A host may store two numbers of its own here (CiA 301, "verify configuration"); see `stored_zero.py`.
 STORED = Entry(0x1010, 1, Kind.U32, "what is stored when")
+RESTORE = Entry(0x1011, 1, Kind.U32, "what is restored when")
 ZERO_COUNTS = Entry(0x1020, 1, Kind.U32, "counts at home", "counts, as 32 bits")
 ZERO_MARK = Entry(0x1020, 2, Kind.U32, "mark of the counts at home")
 ERROR_BEHAVIOUR = Entry(0x1029, 1, Kind.U8, "state after a communication error")
@@ -134,6 +135,7 @@ VELOCITY = Entry(0x606C, 0, Kind.I32, "velocity", "drive's unit")
 TARGET_TORQUE = Entry(0x6071, 0, Kind.I16, "target torque", "per mille of rated torque")
 MAX_TORQUE = Entry(0x6072, 0, Kind.U16, "largest torque", "per mille of rated torque")
 MAX_CURRENT = Entry(0x6073, 0, Kind.U16, "largest current", "per mille of rated current")
+TARGET_POSITION = Entry(0x607A, 0, Kind.I32, "target position", "counts")
 TORQUE_DEMAND = Entry(0x6074, 0, Kind.I16, "torque demand", "per mille of rated torque")
 RATED_CURRENT = Entry(0x6075, 0, Kind.U32, "rated current", "mA")
 RATED_TORQUE = Entry(0x6076, 0, Kind.U32, "rated torque", "mN m")
@@ -154,8 +156,25 @@ PERIOD_NUMBER = Entry(0x60C2, 1, Kind.U8, "interpolation period", "10^PERIOD_POW
 PERIOD_POWER = Entry(0x60C2, 2, Kind.I8, "power of ten of the interpolation period")
 SUPPORTED_MODES = Entry(0x6502, 0, Kind.U32, "supported modes")
 
+
+@dataclass(frozen=True)
+class OperationMode:
+    """Represent a mode of operation: the value sent with control words (6060h), and the entry that shows it in effect.
+
+    Attributes:
+        sent: in 6060h.
+        display: entry that tells the mode in effect.
+        wanted: value of `display` in that mode.
+    """
+
+    sent: int
+    display: Entry
+    wanted: int
+
+
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h
 CST_SUPPORTED = 1 << 9  # in 6502h
+CSP = 8  # cyclic synchronous position
 
 
 def pdo_entry(entry: Entry, number: int, sub: int | None = None) -> Entry:

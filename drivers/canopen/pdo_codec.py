@@ -27,6 +27,7 @@ from drivers.can.bus_state import (
     overflowed,
 )
 from drivers.can.can_frame import Frame
+from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import (
     FOLLOWS,
     INTERNAL_LIMIT,
@@ -55,6 +56,8 @@ from ident_service.config.canopen import BUS_EMERGENCIES
 from ident_service.errors import DriverError
 
 _CONTROL = struct.Struct("<Hb")
+_CONTROL_DOWNLOAD, _DOWNLOAD_2 = struct.Struct("<BHBHxx"), 0x2B  # expedited SDO download of two bytes
+_MULTIPLEXER, _UPLOADED = struct.Struct("<BHB"), 0x43  # expedited SDO upload that tells its size
 _EMERGENCY_BYTES = 8
 _MOST_EVENTS = 256  # that wait to be taken; a flood must neither eat the memory nor hide what matters
 _FOLLOWED = 64  # identifiers of strangers that are remembered
@@ -90,6 +93,7 @@ class Drive:
         heartbeat_ns: when that was [ns of the link's clock].
         boots: boot-up messages.
         emergency: the latest, None before the first and after a reset.
+        uploads: last value of each entry that it was asked for by one frame, by `index << 8 | sub-index`.
     """
 
     node: int
@@ -108,6 +112,7 @@ class Drive:
     heartbeat_ns: int = 0
     boots: int = 0
     emergency: Emergency | None = None
+    uploads: dict[int, bytes] = field(default_factory=dict)
 
     @property
     def state(self) -> DriveState:
@@ -184,7 +189,9 @@ class BusCodec:
         self._strangers: set[int] = set()
         self._foreign: set[int] = set()
         self._frames = [
-            _Packed(frame.cob_id, frame.drives, struct.Struct(f"<{len(frame.drives)}h").pack)
+            _Packed(
+                frame.cob_id, frame.drives, struct.Struct("<" + frame.target.kind.value[1:] * len(frame.drives)).pack
+            )
             for frame in profile.torque_frames
         ]
         self._sync = Frame(SYNC)
@@ -195,26 +202,27 @@ class BusCodec:
                 (TPDO2, self._on_status),
                 (EMERGENCY, self._on_emergency),
                 (HEARTBEAT, self._on_heartbeat),
+                (SDO_REPLY, self._on_upload),
             ):
                 self._handlers[base + drive.node] = handler, drive
         # Before streaming these belong to the configuration plane; they are neither used nor strange.
-        self._others = {SDO_REPLY + node for node in profile.nodes} | {SDO_REQUEST + node for node in profile.nodes}
+        self._others = {SDO_REQUEST + node for node in profile.nodes}
         self._ours = {NMT, SYNC, HEARTBEAT + profile.host, *(RPDO2 + node for node in profile.nodes)}
         self._ours |= {frame.cob_id for frame in profile.torque_frames}
 
     def torque_frames(self, counts: Sequence[int]) -> list[Frame]:
-        """Return the frames that carry a torque to every drive of this bus.
+        """Return the frames that carry a torque, or a position, to every drive of this bus.
 
         Args:
-            counts: of all drives of the arm [per mille of rated torque], in the arm's order.
+            counts: of all drives of the arm [per mille of rated torque, or counts], in the arm's order.
 
         Raises:
-            DriverError: a torque that 16 bits do not hold, or too few of them; nothing is to be sent then.
+            DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.
         """
         try:
             return [Frame(one.cob_id, one.pack(*[counts[k] for k in one.drives])) for one in self._frames]
         except (struct.error, IndexError, TypeError) as error:
-            raise DriverError(f"bus {self.profile.number}: torques {list(counts)} cannot be sent: {error}") from None
+            raise DriverError(f"bus {self.profile.number}: targets {list(counts)} cannot be sent: {error}") from None
 
     def sync(self) -> Frame:
         """Return the SYNC frame, which starts a cycle: drives latch torques and sample positions."""
@@ -227,6 +235,10 @@ class BusCodec:
     def control_word(self, node: int, word: int, mode: int) -> Frame:
         """Return the frame with a control word (6040h) and a mode of operation (6060h) for one drive (RPDO2)."""
         return Frame(RPDO2 + node, _CONTROL.pack(word, mode))
+
+    def control_download(self, node: int, word: int) -> Frame:
+        """Return the SDO download of a control word: a drive that has left `operational` takes no RPDO."""
+        return Frame(SDO_REQUEST + node, _CONTROL_DOWNLOAD.pack(_DOWNLOAD_2, od.CONTROL_WORD.index, 0, word))
 
     def nmt(self, command: NmtCommand, node: int = 0) -> Frame:
         """Return the frame with an NMT command for one node, or for all (0)."""
@@ -314,6 +326,20 @@ class BusCodec:
         status, *measured = self._reports.unpack(frame.data)
         if measured:
             drive.torque, drive.torques = measured[0], drive.torques + 1
+        self._take_status(drive, status)
+
+    def _on_upload(self, drive: Drive, frame: Frame) -> None:
+        """Keep the answer to a question of one frame (`sdo.upload_request`); others are neither used nor strange."""
+        data = frame.data
+        if len(data) != 8 or data[0] & 0xE3 != _UPLOADED:
+            self.counters.ignored += 1
+            return
+        _, index, sub = _MULTIPLEXER.unpack_from(data)
+        drive.uploads[index << 8 | sub] = value = data[4 : 8 - (data[0] >> 2 & 3)]
+        if (index, sub, len(value)) == (od.STATUS_WORD.index, 0, 2):
+            self._take_status(drive, od.STATUS_WORD.unpack(value))
+
+    def _take_status(self, drive: Drive, status: int) -> None:
         before, drive.status, drive.status_age = drive.status, status, 0
         if before == status:
             return

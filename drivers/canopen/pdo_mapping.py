@@ -15,12 +15,12 @@ from functools import cached_property
 
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.object_dictionary import Entry, pdo_entry
-from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver, WatchdogKind
+from ident_service.config.can_bus import CanBus
+from ident_service.config.canopen import CanopenDrive, CanopenDriver, WatchdogKind
 
 NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080
 TPDO1, RPDO1, TPDO2, RPDO2 = 0x180, 0x200, 0x280, 0x300
 SDO_REPLY, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
-SLOTS = 4  # torques of 16 bits in a frame of eight bytes
 
 # CiA 301, table "restricted COB-IDs": of no PDO, SYNC or EMCY that can be configured.
 _RESTRICTED = (
@@ -70,22 +70,24 @@ class Write:
 
 @dataclass(frozen=True)
 class TorqueFrame:
-    """Represent a frame with the torques of some drives.
+    """Represent a frame with the targets of some drives: torques, or positions.
 
     Attributes:
         cob_id: of the frame.
-        drives: whose torques it carries, in the order of its slots; numbers in the arm's list of drives.
+        drives: whose targets it carries, in the order of its slots; numbers in the arm's list of drives.
         nodes: the same drives as node numbers.
+        target: entry that each of them takes from it.
     """
 
     cob_id: int
     drives: tuple[int, ...]
     nodes: tuple[int, ...]
+    target: Entry = od.TARGET_TORQUE
 
     @property
     def length(self) -> int:
         """Return the frame's length [bytes]."""
-        return 2 * len(self.drives)
+        return self.target.kind.size * len(self.drives)
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ class BusProfile:
         drives: which of the arm's drives are on it, in the arm's order.
         nodes: the same drives as node numbers.
         notices: of each of them, emergency codes by which it only informs.
-        torque_frames: that carry their torques.
+        torque_frames: that carry their torques, or their positions.
         heartbeat_host: period of the host's heartbeat [s].
         heartbeat_drives: period of each drive's [s].
         heartbeat_timeout: how long the host waits for a drive's [s].
@@ -230,7 +232,7 @@ class BusProfile:
         frame = next((frame for frame in self.torque_frames if node in frame.nodes), None)
         if frame is None:
             raise KeyError(node)
-        slots = tuple(od.TARGET_TORQUE if other == node else od.DUMMY_INT16 for other in frame.nodes)
+        slots = tuple(frame.target if other == node else od.DUMMY_INT16 for other in frame.nodes)
         deadline = _whole(self.torque_deadline, 1e-3) if self.watchdog(node) == "rpdo_timer" else 0
         inhibit, period = _whole(self.status_inhibit, 1e-4), _whole(self.status_period, 1e-3)
         return [
@@ -293,7 +295,7 @@ def bus_profiles(driver: CanopenDriver, rate: float) -> list[BusProfile]:
 
 def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> BusProfile:
     drives = [k for k, drive in enumerate(driver.drives) if drive.bus == number]
-    slots = SLOTS if driver.torque_frames == "shared" else 1
+    slots, target = driver.drives_a_frame, od.TARGET_POSITION if driver.streams == "position" else od.TARGET_TORQUE
     together = [drives[first : first + slots] for first in range(0, len(drives), slots)]
     return BusProfile(
         number,
@@ -303,7 +305,7 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
         tuple(drives),
         _nodes(driver.drives, drives),
         tuple(frozenset(driver.drives[k].notices) for k in drives),
-        tuple(_torque_frame(driver.drives, frame) for frame in together),
+        tuple(_torque_frame(driver.drives, frame, target) for frame in together),
         driver.heartbeats.period,
         driver.heartbeats.drives,
         driver.heartbeats.timeout,
@@ -318,9 +320,9 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
     )
 
 
-def _torque_frame(drives: Sequence[CanopenDrive], chosen: Sequence[int]) -> TorqueFrame:
+def _torque_frame(drives: Sequence[CanopenDrive], chosen: Sequence[int], target: Entry) -> TorqueFrame:
     nodes = _nodes(drives, chosen)
-    return TorqueFrame(RPDO1 + nodes[0], tuple(chosen), nodes)
+    return TorqueFrame(RPDO1 + nodes[0], tuple(chosen), nodes, target)
 
 
 def _nodes(drives: Sequence[CanopenDrive], chosen: Sequence[int]) -> tuple[int, ...]:

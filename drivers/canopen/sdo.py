@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -60,7 +60,15 @@ def optional(do: Callable[[Any], T], what: Any) -> T | None:
 
 
 class Objects:
-    """Access the object dictionary of one node, while nothing streams."""
+    """Access the object dictionary of one node, while nothing streams.
+
+    Attributes:
+        dry: whether nothing is really written.
+        patience: how long a reply is waited for [s]; storing in flash memory takes longer than reading.
+    """
+
+    dry = False
+    patience = TIMEOUT
 
     def __init__(self, link: Link, node: int, others: Callable[[Frame], None] = lambda frame: None) -> None:
         """Use the given link, which stays the caller's.
@@ -86,7 +94,7 @@ class Objects:
         self._link.send(Frame(can_id, bytes(data), remote=remote))
         if data[0] == _ABORT:  # is not replied to
             return
-        deadline = self._link.clock.now_ns() + round(TIMEOUT * 1e9)
+        deadline = self._link.clock.now_ns() + round(self.patience * 1e9)
         while (frame := self._link.receive(deadline)) is not None:
             if frame.identifier == SDO_REPLY + self.node and len(frame.data) == 8 and not frame.error:
                 self._client.on_response(frame.identifier, frame.data, 0.0)
@@ -149,6 +157,59 @@ class Objects:
             raise SdoRefused(f"node {self.node}: {what}: {abort_words(error.code)}", error.code) from None
         except SdoCommunicationError as error:
             raise DriverError(f"node {self.node}: {what}: no proper answer ({error})") from None
+
+
+@dataclass(frozen=True)
+class Change:
+    """Represent one value that a drive would be given: its entry, and what it holds; None where that cannot be read."""
+
+    entry: Entry
+    before: int | None
+    after: int
+
+
+class DryRunObjects(Objects):
+    """Read the object dictionary of one node, and note what would be written instead of writing it.
+
+    Attributes:
+        changes: noted so far, in order; an entry that is written twice is there twice.
+    """
+
+    dry = True
+
+    def __init__(
+        self, link: Link, node: int, others: Callable[[Frame], None], fixed: Collection[int] = frozenset()
+    ) -> None:
+        """Begin without changes.
+
+        Args:
+            link: of the node's bus.
+            node: its number.
+            others: takes the frames that are not replies of this node.
+            fixed: keys of the entries that cannot be written, which no upload tells.
+        """
+        super().__init__(link, node, others)
+        self.changes: list[Change] = []
+        self._fixed = fixed
+        self._written: dict[int, int] = {}
+
+    def read(self, entry: Entry) -> int:
+        """Return what an entry would hold; raises as `Objects.read`."""
+        written = self._written.get(entry.key)
+        return super().read(entry) if written is None else written
+
+    def write(self, write: Write) -> None:
+        """Note a change; raises as `Objects.read` where the node has no such entry."""
+        try:
+            before: int | None = self.read(write.entry)
+        except SdoRefused as refused:
+            if refused.code not in WRITE_ONLY:
+                raise
+            before = None
+        if write.entry.key in self._fixed:
+            raise SdoRefused(f"node {self.node}: {write.entry} is fixed by its data sheet", READ_ONLY[-1])
+        self.changes.append(Change(write.entry, before, write.value))
+        self._written[write.entry.key] = write.value
 
 
 Place = tuple[int, int]

@@ -18,9 +18,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.motor_units import Vector, signed
+from drivers.canopen.motor_units import signed
 from drivers.canopen.pdo_mapping import Write
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
+from drivers.motor_units import Vector
 from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError, PositionUnknown

@@ -15,14 +15,15 @@ one before, and an arm without brakes would sink unnoticed, and without torque, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from drivers.can.bus_load import worst
 from drivers.can.bus_state import EventCode
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
-from drivers.canopen.bus_load import worst
+from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import (
     DISABLE_VOLTAGE,
     ENABLE,
@@ -34,10 +35,10 @@ from drivers.canopen.cia402 import (
     NmtState,
     emergency_words,
 )
-from drivers.canopen.object_dictionary import CST
+from drivers.canopen.object_dictionary import CST, Entry, OperationMode
 from drivers.canopen.pdo_codec import BusCodec, Drive
 from drivers.canopen.pdo_mapping import GUARD_EARLY, HEARTBEAT, SDO_REPLY, SDO_REQUEST, BusProfile
-from drivers.canopen.sdo import TIMEOUT, Objects
+from drivers.canopen.sdo import TIMEOUT, Objects, upload_request
 from drivers.clock import Clock
 from ident_service.errors import DriverError
 
@@ -47,6 +48,7 @@ LISTEN = 0.12  # s before we send anything; another host's heartbeat comes withi
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+_SILENT = 2  # cycles without a position, after which a drive may have left `operational`
 _MISSED = 0.25  # of a period late, and the slot is left to the next
 _DOUBT = 0.25  # of a period: sending a SYNC takes less, unless this computer stalls
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
@@ -71,8 +73,10 @@ class Buses:
         complete: whether every drive answered in the last cycle.
         lost: positions that did not come in their cycle, so far.
         stamp_doubt_ns: of the last cycle, see `Sample`.
-        modes: of operation, that control words of each drive come with.
+        modes: of operation of each drive; control words come with them.
         withheld: kinds of watchdogs that are not fed, so that they can be seen to act.
+        enabled: whether the drives have been energised in this session; from then on those that miss cycles are asked
+            for their status word, and stopped by SDO too.
     """
 
     def __init__(self, profiles: Sequence[BusProfile], links: Sequence[Link], period_ns: int) -> None:
@@ -95,13 +99,15 @@ class Buses:
             for number, drive in zip(codec.profile.drives, codec.drives, strict=True):
                 drives[number], self._at[number] = drive, (codec, link)
         self.drives = [drives[number] for number in range(len(drives))]
-        self.modes = [CST] * len(self.drives)
+        self.modes = [OperationMode(CST, od.MODE_DISPLAY, CST)] * len(self.drives)
         self._period_ns = period_ns
         wire = max(_on_the_wire(profile) for profile in profiles)
         self._least_ns = round(min(max(LEAST * period_ns, 1e9 * wire), RECEIVE * period_ns))
         self._heartbeat_period_ns = min(round(0.5e9 * profile.heartbeat_host) for profile in profiles)
         self._heartbeat_ns = 0
         self.withheld: set[str] = set()
+        self.enabled = False
+        self._asked = 0
         # When each guarded drive is asked next, one after the other: remote frames in a row would delay a cycle.
         self._guards: dict[int, GuardedNode] = {}
         for number, (codec, _) in self._at.items():
@@ -129,7 +135,43 @@ class Buses:
     def control(self, number: int, word: int) -> None:
         """Send a control word to one drive."""
         codec, link = self._at[number]
-        link.send(codec.control_word(self.drives[number].node, word, self.modes[number]))
+        link.send(codec.control_word(self.drives[number].node, word, self.modes[number].sent))
+
+    def control_stop(self, number: int, word: int) -> None:
+        """Send a control word that stops; by SDO too where a drive may have left `operational`, deaf to RPDOs."""
+        self.control(number, word)
+        codec, link = self._at[number]
+        drive = self.drives[number]
+        if self.enabled and (drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL)):
+            link.send(codec.control_download(drive.node, word))
+
+    def ask(self, number: int, entry: Entry) -> None:
+        """Send the upload of an entry of up to four bytes; the answer comes with a later cycle (`Drive.uploads`)."""
+        self._at[number][1].send(Frame(SDO_REQUEST + self.drives[number].node, upload_request(entry)))
+
+    def mode_shown(self, number: int) -> int | None:
+        """Return the last answer of a drive to `ask` for its mode of operation; None before one."""
+        display = self.modes[number].display
+        data = self.drives[number].uploads.get(display.key)
+        return display.unpack(data) if data is not None and len(data) == display.kind.size else None
+
+    def other_modes(self) -> dict[int, str]:
+        """Return what drives tell instead of their mode of operation, in words by number, and ask one of them anew."""
+        found = {}
+        for number, mode in enumerate(self.modes):
+            if (shown := self.mode_shown(number)) != mode.wanted:
+                told = "tells no mode" if shown is None else f"is in mode {shown}"
+                found[number] = f"{told} ({mode.display.index:04X}h) although {mode.wanted} was set"
+        if found:
+            self._asked += 1
+            number = list(found)[self._asked % len(found)]
+            self.ask(number, self.modes[number].display)
+        return found
+
+    def forget_modes(self) -> None:
+        """Discard what drives have told of their modes of operation."""
+        for drive, mode in zip(self.drives, self.modes, strict=True):
+            drive.uploads.pop(mode.display.key, None)
 
     def objects(self, number: int) -> Objects:
         """Return the object dictionary of one drive, usable as long as nothing streams."""
@@ -270,8 +312,20 @@ class Buses:
         self.complete = all(codec.complete for codec in self.codecs)
         if not self.complete:
             self.lost += sum(not drive.answered for drive in self.drives)
+            self._ask_silent()
         self.keep_alive()
         return stamp_ns
+
+    def _ask_silent(self) -> None:
+        """Ask the drive that tells nothing any more for its status word: out of `operational` it still answers SDOs.
+
+        A drive whose watchdog was tried may end there, and whether it has let go must be heard of. One drive a cycle;
+        none that has booted, as it has no power and must be configured first.
+        """
+        silent = [number for number, drive in enumerate(self.drives) if drive.age >= _SILENT and not drive.boots]
+        if self.enabled and silent:
+            self._asked += 1
+            self.ask(silent[self._asked % len(silent)], od.STATUS_WORD)
 
     def keep_alive(self) -> None:
         """Send the host's heartbeat at half of its period, so that a late one is not missed; poll guarded drives."""
@@ -296,13 +350,14 @@ def _on_the_wire(profile: BusProfile) -> float:
     """Return how long the frames of a cycle take at most [s]."""
     lengths = [
         0,
-        *(2 * len(frame.drives) for frame in profile.torque_frames),
+        *(frame.length for frame in profile.torque_frames),
         *(sum(slot.kind.size for slot in profile.position_slots) for _ in profile.nodes),
     ]
     bus = profile.bus
     return sum(worst(length, fd=profile.fd).seconds(bus.bitrate, bus.data_bitrate) for length in lengths)
 
 
+MODE_PATIENCE = 5.0  # s that a mode of operation may take once drives are switched on (ros2_canopen waits as long)
 SEEDED = 5  # cycles in a row with zero torque and all positions before anything is enabled
 REPEAT = 0.05  # s after which a command that had no effect is sent again
 _WAY = (DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON, DriveState.OPERATION_ENABLED)
@@ -320,6 +375,7 @@ class EnableSequence:
         now_ns: int,
         reports: tuple[float, float],
         quick_stop: int,
+        other_modes: Callable[[], Mapping[int, str]],
     ) -> None:
         """Start with drives that are switched off.
 
@@ -330,7 +386,9 @@ class EnableSequence:
             now_ns: of the link's clock.
             reports: least and longest time between two status reports of a drive [s].
             quick_stop: 605Ah; drives that stay in quick stop hold the arm, and are enabled out of it with the others.
+            other_modes: has drives asked for their mode; returns what those in another one tell, by number.
         """
+        self._other_modes = other_modes
         self._stays = quick_stop in STAY_IN_QUICK_STOP
         self._drives, self._names = drives, names
         self._inhibit_ns, self._report_ns = (round(seconds * 1e9) for seconds in reports)
@@ -341,6 +399,7 @@ class EnableSequence:
         self._target = 0
         self._seeded = 0
         self._sent: dict[int, tuple[DriveState, int]] = {}
+        self._in_other_mode = dict.fromkeys(range(len(drives)), "")  # until each has told otherwise
 
     @property
     def done(self) -> bool:
@@ -369,6 +428,9 @@ class EnableSequence:
             return []
         if now_ns > self._deadline_ns:
             late = [drive for drive in self._drives if not self._there(drive)] or list(self._drives)
+            if self._target == 1 and self._in_other_mode and late == list(self._drives):
+                told = "; ".join(f"{self._names[number]} {words}" for number, words in self._in_other_mode.items())
+                raise DriverError(f"not enabled: {told}")
             raise DriverError(
                 f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {_told(self._drives, self._names, late)}"
             )
@@ -390,7 +452,12 @@ class EnableSequence:
         """Check that seed cycles have passed and no drive's next report would be held back; the latter not for ever."""
         if self._seeded < SEEDED:
             return False
-        self._ready_ns = now_ns if self._ready_ns is None else self._ready_ns
+        if self._in_other_mode:
+            self._in_other_mode = dict(self._other_modes())
+        if self._ready_ns is None:  # a mode may take effect only now that the drives are switched on
+            self._ready_ns, self._deadline_ns = now_ns, now_ns + round(MODE_PATIENCE * 1e9)
+        if self._in_other_mode:
+            return False
         ages = [now_ns - reported for reported in self._reported_ns]
         soon = min(ages) > self._inhibit_ns and max(ages) < self._report_ns - self._inhibit_ns // 10
         return soon or now_ns - self._ready_ns > 3 * self._report_ns

@@ -47,7 +47,9 @@ from ident_service.errors import (
     IdentError,
     ModelError,
     MotionRefused,
+    ParameterError,
     PersonNeeded,
+    RecordingError,
     UsageError,
 )
 
@@ -57,9 +59,11 @@ GROUPS = (
     *(identification_commands, planning_commands, motion_commands, recovery_commands, archive_commands),
     *(maintenance_commands, daemon_commands, remote),
 )
-_EXIT_CODES: tuple[tuple[type[IdentError], int], ...] = (
-    (ConfigError, USAGE),
-    (UsageError, USAGE),
+# One rule for all verbs: USAGE when what was given cannot be used, be it words, a description or any other file; FAILED
+# when it was understood and came to nothing.
+_BAD_INPUT: tuple[type[IdentError], ...] = (UsageError, ConfigError, ModelError, RecordingError, ParameterError)
+_EXIT_CODES: tuple[tuple[type[IdentError] | tuple[type[IdentError], ...], int], ...] = (
+    (_BAD_INPUT, USAGE),
     (PersonNeeded, PERSON_NEEDED),
     (MotionRefused, VERDICT_NO),
     (ArmFault, FAULTED),

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight
+from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -213,6 +213,100 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
         "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
         **convex_document(estimate),
     }
+
+
+def _add_fleet(verbs: VerbList) -> None:
+    """Register `fleet identify` and `fleet status`."""
+    fleet = verbs.group("fleet", "many recordings of many arms, on several processes or a cluster")
+    sub = fleet.add(
+        "identify",
+        _fleet_identify,
+        "each arm and what is common, trends, one page (exit code 3: recordings left out, or an arm changed)",
+    )
+    sub.add_argument(
+        "patterns",
+        nargs="+",
+        metavar="PATTERN",
+        help="files, folders or globs; also as URLs: s3://, gs://, sftp:// ...",
+    )
+    _fleet_options(sub)
+    sub.add_argument(
+        "--scheduler", metavar="ADDRESS", help="of a Dask cluster, tcp://HOST:8786 (default: this machine)"
+    )
+    sub.add_argument("--workers", type=workers, metavar="N", help="processes on this machine (default: one per core)")
+    sub.add_argument("--memory", default="500MiB", metavar="SIZE", help="limit of each of them (default: 500MiB)")
+    sub.add_argument(
+        "--settle-again", action="store_true", help="choose filter, delay and friction's shape anew; factors follow"
+    )
+    sub.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="where results go, in the place of an earlier result (default: a new folder below the state folder)",
+    )
+    sub = fleet.add("status", _fleet_status, "what the store has of these recordings; nothing is computed")
+    sub.add_argument("patterns", nargs="*", metavar="PATTERN", help="as for identify")
+    _fleet_options(sub)
+
+
+def _fleet_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--arm", required=True, metavar="ARM", help="description of every arm: file, or shipped name")
+    sub.add_argument(
+        "--names",
+        metavar="REGEX",
+        help="finds (?P<arm>...), and (?P<date>...) if any, in a recording's URL (default: the arm is its folder)",
+    )
+    sub.add_argument(
+        "--store", metavar="URL", help="where factors are kept, a folder or URL (default: below the state folder)"
+    )
+
+
+def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
+    try:
+        from ident_service.fleet.reduction import FleetRequest
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in ("distributed", "dask", "fsspec"):
+            raise
+        raise UsageError(f"{error.name} is not installed; pip install 'ident-service[fleet]'") from None
+    store = arguments.store or str(own_state_folder(arguments) / "fleet" / "store")
+    return FleetRequest(
+        arm=arguments.arm, patterns=tuple(arguments.patterns), store=store, names=arguments.names, **more
+    )
+
+
+def _fleet_identify(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.registry.state_folder import new_run_folder
+
+    request = _fleet_request(
+        arguments,
+        scheduler=arguments.scheduler,
+        workers=arguments.workers,
+        memory=arguments.memory,
+        settle_again=arguments.settle_again,
+    )
+    from ident_service.fleet.identify import identify_fleet
+    from ident_service.fleet.results import fleet_text
+
+    name = load_arm(arguments.arm).name
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), name, "fleets")
+    result = identify_fleet(request, folder, lambda line: tell(arguments, line))
+    good = not result.document["left_out"] and not result.changed
+    return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
+
+
+def _fleet_status(arguments: argparse.Namespace) -> Answer:
+    request = _fleet_request(arguments)
+    from ident_service.fleet.reduction import status_of
+
+    document = dict(status_of(request))
+    lines = [f"{document['factors']} factors, {document['bytes'] / 2**20:.1f} MiB, in {document['store']}"]
+    if document["settled"]:
+        lines.append(f"filter, delay and friction's shape are settled by {document['settled_by']}")
+    for arm, counts in document.get("arms", {}).items():
+        lines.append(f"  {arm}: {counts['reduced']} of {counts['recordings']} recordings reduced")
+    lines += [f"  new: {url}" for url in document.get("new", [])]
+    return DONE, "\n".join(lines) + "\n", document
 
 
 def _add_comparing(verbs: VerbList) -> None:
@@ -453,5 +547,5 @@ def _figures(arguments: argparse.Namespace) -> Answer:
 
 def add(verbs: VerbList) -> None:
     """Register the verbs of this module."""
-    for register in (_add_commission, _add_comparing, _add_parameters, _add_exports, _add_results):
+    for register in (_add_commission, _add_fleet, _add_comparing, _add_parameters, _add_exports, _add_results):
         register(verbs)

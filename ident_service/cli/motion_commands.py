@@ -214,6 +214,23 @@ def _files(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+def add_dry_run(sub: Parser) -> None:
+    """Add the option `--dry-run` to a verb that configures drives."""
+    text = "move and write nothing: list what opening the arm would write into its drives (exit code 3: one is refused)"
+    sub.add_argument("--dry-run", action="store_true", help=text)
+
+
+def dry_run(arguments: argparse.Namespace) -> Answer:
+    """Return what opening the arm of a verb would write into its drives; nothing is written and nothing moves."""
+    from ident_service.config.load import load_arm
+    from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
+
+    config = load_arm(arguments.arm)
+    planned = planned_configuration(config)
+    code = VERDICT_NO if any(one.refused for one in planned) else DONE
+    return code, planned_text(config, planned), planned_document(config, planned)
+
+
 def add_can_log(sub: Parser) -> None:
     """Add the option `--can-log` to a verb that moves an arm."""
     sub.add_argument("--can-log", action="store_true", help="log every CAN frame to can.log, beside the recording")
@@ -303,6 +320,7 @@ def add(verbs: VerbList) -> None:
         "--scale", action="store_true", help="check position scales: turn each joint by hand and type the angle"
     )
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
+    add_dry_run(sub)
     add_lease(sub, confirm=False)
     sub = verbs.add("run", _run, "move the arm along a motion and record it")
     _motion(sub)
@@ -353,6 +371,7 @@ def _motion(sub: Parser) -> None:
         "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
     )
     add_can_log(sub)
+    add_dry_run(sub)
     add_lease(sub)
 
 
@@ -382,6 +401,8 @@ def _watch(arguments: argparse.Namespace) -> Answer:
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.arm_factory import make_arm
@@ -425,7 +446,15 @@ def _check(arguments: argparse.Namespace) -> Answer:
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
-            ticket = preflight(stoppable, model, motion, confirm=confirm, rate_seconds=seconds, closed=closed)
+            ticket = preflight(
+                stoppable,
+                model,
+                motion,
+                confirm=confirm,
+                rate_seconds=seconds,
+                closed=closed,
+                announce=lambda action: tell(arguments, f"{config.name}: {action}"),
+            )
         if any(one.code == "at_rest" and one.verdict is Verdict.PASSED for one in ticket.checks):
             positions.keep(arm)
     write_ticket(path, ticket)
@@ -459,6 +488,8 @@ def _rehearse(arguments: argparse.Namespace) -> Answer:
 
 def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float | None = None) -> Answer:
     """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
 
     config = load_arm(arguments.arm)
@@ -501,6 +532,8 @@ def _target(arguments: argparse.Namespace) -> Target | None:
 
 
 def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 

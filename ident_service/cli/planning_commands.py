@@ -1,4 +1,4 @@
-"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `doctor`, `emulate`."""
+"""Commands before a motion: `design`, `preview`, `new`, `config check`, `bus`, `driver`, `doctor`, `emulate`."""
 
 from __future__ import annotations
 
@@ -204,7 +204,7 @@ def _new(arguments: argparse.Namespace) -> Answer:
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
-    return DONE, "\n".join(lines), {"description": str(path), "guessed": list(guessed)}
+    return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
@@ -234,6 +234,114 @@ def _add_bus(verbs: VerbList) -> None:
     help_eds = "EDS or DCF files to read instead of the drives, without a bus"
     sub.add_argument("--eds", nargs="+", default=[], metavar="FILE", help=help_eds)
 
+    text = (
+        "write what DCFs of the maker's tool configure: one file for each drive; each change is listed, drives are off"
+    )
+    sub = bus.add("import", _import, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("files", nargs="+", metavar="DCF", help="one for each drive, in the order of the description")
+    sub.add_argument("--dry-run", action="store_true", help="list the changes, and write nothing")
+    sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
+    for name, text in (
+        ("store", "have all drives store what they hold (1010h), over the loss of power; drives are off"),
+        ("restore", "have all drives take back what they were shipped with (1011h), at the next loss of power"),
+    ):
+        sub = bus.add(name, _store, text)
+        sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+        sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
+        sub.set_defaults(stores=name == "store")
+
+    text = "a ZIP file to send when drives do not work: probe, frames, EDS hashes, ticket, versions; no secrets"
+    sub = bus.add("report", _bus_report, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument("--out", type=Path, metavar="FILE", help="must not exist (default: below the state folder)")
+    sub.add_argument(
+        "--run", type=Path, metavar="DIR", help="run folder whose can.log goes along (`ident run --can-log`)"
+    )
+
+    driver = verbs.group("driver", "drivers of arms, your own ones too (docs/drivers.md)")
+    text = "try a driver on the promises of the Arm contract, with zero torque alone (exit code 3: one is broken)"
+    sub = driver.add("test", _driver_test, text)
+    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    sub.add_argument(
+        "--confirm", metavar="NAME", help="the arm's name: it is supported, and nobody is within its reach"
+    )
+
+
+def _bus_report(arguments: argparse.Namespace) -> Answer:
+    from datetime import UTC, datetime
+
+    from ident_service.config.load import load_arm
+    from ident_service.operations.fieldbus import bus_report
+    from ident_service.registry.state_folder import arm_folder, ticket_path
+
+    config, state = load_arm(arguments.arm), own_state_folder(arguments)
+    if arguments.run is not None and not (arguments.run / "can.log").is_file():
+        raise UsageError(f"{arguments.run}: has no can.log; `ident run --can-log` makes one")
+    named = f"report-{datetime.now(UTC):%Y%m%d-%H%M%S}.zip"
+    path = arguments.out or arm_folder(state, config.name) / named
+    frames = None if arguments.run is None else arguments.run / "can.log"
+    names = bus_report(config, path, ticket_path(state, config.name), frames)
+    text = f"{path}: look into it before you send it\n" + "".join(f"  {name}\n" for name in names)
+    return DONE, text, {"path": str(path), "files": names}
+
+
+def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
+    """Require that a person has typed the arm's name; raises UsageError."""
+    typed = arguments.confirm
+    if typed is None and sys.stdin.isatty() and not arguments.json:
+        typed = input(f"{name}: {what}. Type the arm's name to go on: ").strip()
+    if typed != name:
+        raise UsageError(f"{what}: that is confirmed by the arm's name, typed: --confirm {name}; nothing was written")
+
+
+def _import(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm, sheet_file
+    from ident_service.operations.drive_configuration import import_configuration, imported_document, imported_text
+
+    config, dry = load_arm(arguments.arm), arguments.dry_run
+    files = [sheet_file(name) for name in arguments.files]
+    if not dry:
+        _require_name(arguments, config.name, "drives are configured anew")
+    found = import_configuration(config, files, dry=dry)
+    return DONE, imported_text(config, found, dry=dry), imported_document(config, found, dry=dry)
+
+
+def _store(arguments: argparse.Namespace) -> Answer:
+    from ident_service.config.load import load_arm
+    from ident_service.operations.drive_configuration import store_or_restore
+
+    config, stores = load_arm(arguments.arm), arguments.stores
+    _require_name(
+        arguments, config.name, "drives store what they hold" if stores else "drives lose their configuration"
+    )
+    nodes = store_or_restore(config, store=stores)
+    told = "have stored what they hold" if stores else "take back what they were shipped with when power comes next"
+    text = f"{config.name}: drives {', '.join(map(str, nodes))} {told}\n"
+    return DONE, text, {"arm": config.name, "stored": stores, "nodes": list(nodes)}
+
+
+def _driver_test(arguments: argparse.Namespace) -> Answer:
+    from dataclasses import asdict
+
+    from ident_service.config.load import load_arm
+    from ident_service.motion.command_channel import ControlFile
+    from ident_service.operations.driver_contract import Outcome, contract_text, try_driver
+    from ident_service.registry.state_folder import control_path
+
+    config = load_arm(arguments.arm)
+
+    def confirm(question: str) -> str:
+        if arguments.confirm is not None:
+            return str(arguments.confirm)
+        return input(question) if sys.stdin.isatty() and not arguments.json else ""
+
+    with ControlFile.take(control_path(own_state_folder(arguments), config.name), None):
+        found = try_driver(config, confirm)
+    broken = any(one.outcome is Outcome.BROKEN for one in found)
+    document = {"arm": config.name, "kept": not broken, "promises": [asdict(one) for one in found]}
+    return VERDICT_NO if broken else DONE, contract_text(config.name, found), document
+
 
 def _load(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
@@ -255,11 +363,17 @@ def _scan(arguments: argparse.Namespace) -> Answer:
 
 def _probe(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm, sheet_file
-    from ident_service.operations.fieldbus import bus_probe, probe_document, probe_text
+    from ident_service.operations.fieldbus import FILE, bus_probe, keep_outcome, probe_document, probe_text
+    from ident_service.registry.state_folder import arm_folder
 
     config = load_arm(arguments.arm)
     found = bus_probe(config, [sheet_file(name) for name in arguments.eds])
-    return DONE if found.good else VERDICT_NO, probe_text(config, found), probe_document(config, found)
+    text, document = probe_text(config, found), probe_document(config, found)
+    if not arguments.eds:
+        path = arm_folder(own_state_folder(arguments), config.name) / FILE
+        document |= {"changed": keep_outcome(path, document), "kept": str(path)}
+        text += "".join(f"CHANGED: {line}\n" for line in document["changed"]) + f"kept in {path}\n"
+    return DONE if found.good else VERDICT_NO, text, document
 
 
 _DEFAULT_RATE = 1000.0  # Hz

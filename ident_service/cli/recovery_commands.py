@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
-from ident_service.cli.motion_commands import add_can_log, run_and_report
+from ident_service.cli.motion_commands import add_can_log, add_dry_run, dry_run, run_and_report
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -50,6 +50,7 @@ def _add_recovery(verbs: VerbList) -> None:
     sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
+    add_dry_run(sub)
     add_lease(sub, confirm=False)
     text = (
         "define the posture in which the arm stands as its home: sets the zero of incremental encoders, moves nothing"
@@ -68,10 +69,13 @@ def _add_recovery(verbs: VerbList) -> None:
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
+    add_dry_run(sub)
     add_lease(sub)
 
 
 def _home(arguments: argparse.Namespace) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.motion.run_plan import Destination
 
@@ -123,7 +127,6 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
 
 
 def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
-    from ident_service.config.canopen import CanopenDriver
     from ident_service.operations.recovery import home_posture, set_home
 
     posture, lease = home_posture(config), requested_lease(arguments, config)
@@ -141,7 +144,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     done = set_home(config, own_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
     lines += [f"  still active: {fault.code}: {fault.cause}" for fault in done.faults]
-    if isinstance(config.driver, CanopenDriver) and all(bus.interface == "lock_step" for bus in config.driver.buses):
+    if config.can_buses and all(bus.interface == "lock_step" for bus in config.can_buses):
         lines.append(
             "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )
@@ -151,6 +154,8 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
 
 def _recover(arguments: argparse.Namespace) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.operations.arm_checks import watch_document
     from ident_service.operations.recovery import recover

@@ -288,6 +288,7 @@ REMOTE: dict[str, Verb] = {
 LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
+    **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
@@ -356,7 +357,8 @@ def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None
     lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
     lines += [job["detail"]] if job["detail"] else []
     lines += [f"run {job['run']}"] if job["run"] else []
-    code = _CODES.get(job["state"], FAILED) if code is None else code
+    if code is None:  # bad input has the code that it has at the machine
+        code = USAGE if (job["state"], job["exit_code"]) == ("failed", USAGE) else _CODES.get(job["state"], FAILED)
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 

@@ -19,6 +19,8 @@ from pydantic import (
     model_validator,
 )
 
+from ident_service.config.barrett import BarrettDriver
+from ident_service.config.can_bus import CanBus
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.control import Control, Realtime
 from ident_service.config.kinematics import Kinematics
@@ -52,17 +54,20 @@ class PluginDriver(Section):
 
 def _driver_kind(value: Any) -> str:
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return kind if kind in ("simulated", "canopen") else "plugin"
+    return kind if kind in ("simulated", "canopen", "barrett") else "plugin"
 
 
 # Chosen by `kind`, so that a mistake in a built-in driver's section is not taken for a plug-in's options.
 Driver = Annotated[
     Annotated[SimulatedDriver, Tag("simulated")]
     | Annotated[CanopenDriver, Tag("canopen")]
+    | Annotated[BarrettDriver, Tag("barrett")]
     | Annotated[PluginDriver, Tag("plugin")],
     Discriminator(_driver_kind),
 ]
 
+
+_BUILT_IN = (SimulatedDriver, CanopenDriver, BarrettDriver)
 
 JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry"]
 FeasibleSetName = Literal["pseudo_inertia", "inertia"]
@@ -404,6 +409,54 @@ class ArmConfig(ExtendedSection):
     motions: Motions = Motions()
     driver: Driver | None = None
     unattended_motion: Literal["refused", "allowed"] = "refused"
+
+    @property
+    def can_buses(self) -> tuple[CanBus, ...]:
+        """Return the CAN buses of the arm's drives, in the order of their numbers; none where they are on none."""
+        if isinstance(self.driver, CanopenDriver):
+            return self.driver.buses
+        return (self.driver.bus,) if isinstance(self.driver, BarrettDriver) else ()
+
+    @property
+    def motor_torques(self) -> tuple[float, ...] | None:
+        """Return what the motors give at most [N m], in the order of the transmission; None where unknown."""
+        if isinstance(self.driver, CanopenDriver):
+            return tuple(drive.max_torque * drive.torque_scale for drive in self.driver.drives)
+        if isinstance(self.driver, BarrettDriver):
+            return tuple(puck.max_torque * puck.torque_scale for puck in self.driver.pucks)
+        return None
+
+    @property
+    def watchdog(self) -> float | None:
+        """Return after how long without its host the slowest drive gives up torque [s]; None where unknown.
+
+        What an open arm says of itself counts more (`ArmDescription.watchdog`); this is for before it is opened.
+        """
+        return self.driver.watchdog if isinstance(self.driver, _BUILT_IN) else None
+
+    @property
+    def watchdog_reason(self) -> str:
+        """Return why drives of an arm that can fall may go on for longer than usual; empty for no reason."""
+        return self.driver.watchdog_reason if isinstance(self.driver, _BUILT_IN) else ""
+
+    @property
+    def delay_cycles(self) -> int:
+        """Return the cycles from a sample to the torque that is computed from it; 1 is the Arm contract's."""
+        return self.driver.delay_cycles if isinstance(self.driver, SimulatedDriver) else 1
+
+    @property
+    def zeroed_at_home(self) -> bool:
+        """Return whether a person zeroes the arm at its home, since encoders count from where power came."""
+        at_home = isinstance(self.driver, CanopenDriver) and self.driver.zero == "at_home"
+        return at_home or isinstance(self.driver, BarrettDriver)
+
+    @property
+    def idle_drives_hold(self) -> bool:
+        """Return whether drives that were stopped go on holding the arm, as CANopen's in quick stop do.
+
+        Idle pucks brake by their windings, so that an arm sinks; there is nothing to let go of.
+        """
+        return isinstance(self.driver, CanopenDriver)
 
     def has_brake(self, joint: str) -> bool:
         """Return whether a holding brake holds the joint when its drive has no power."""

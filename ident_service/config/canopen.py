@@ -13,6 +13,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from ident_service.config.can_bus import CanBus
 from ident_service.config.drive_family import Family, family_from
 from ident_service.config.eds import DataSheet, data_sheet
 from ident_service.config.quantities import (
@@ -90,38 +91,13 @@ class NodeGuarding(Section):
 
 
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
-_KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
+_SLOTS = 4  # torques of 16 bits in a frame of eight bytes
 _DUMMIES = frozenset({2, 3, 5, 6})  # data types of 8 or 16 bits, which fill the 16 bits of a torque
 _MOST_PER_MILLE = 32_767  # of a torque of 16 bits
 EmergencyCode = Annotated[int, Field(strict=True, ge=1, le=0xFFFF)]
 # CiA 301, table 26: CAN controller in error passive; no heartbeat, or no torque frame, of the host.
 BUS_EMERGENCIES = frozenset({0x8120, 0x8130, 0x8250})
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
-
-
-class CanBus(Section):
-    """One CAN bus, and the interface that gives access to it.
-
-    `interface` is python-can's name of an interface, or `raw` for a CAN socket of the kernel without python-can, or
-    `lock_step` for emulated drives in this process and in virtual time. `options` go to python-can as they are.
-    """
-
-    interface: Annotated[str, Field(min_length=1)] = "socketcan"
-    channel: str = "can0"
-    bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
-    data_bitrate: Count | None = None
-    options: dict[str, str | int | float | bool] = Field(default_factory=dict)
-
-    @property
-    def medium(self) -> str:
-        """Return the namespace of `channel`: `kernel` for CAN interfaces of the kernel, else the interface."""
-        return "kernel" if self.interface in _KERNELS else self.interface
-
-    @model_validator(mode="after")
-    def _data_not_slower(self) -> CanBus:
-        if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
-            raise ValueError(f"data_bitrate {self.data_bitrate} is below bitrate {self.bitrate}; CAN FD only speeds up")
-        return self
 
 
 class DriveIdentity(Section):
@@ -254,7 +230,9 @@ class CanopenDriver(ExtendedSection):
     says whether drives report the torque that they measure (6077h): with their positions, in every cycle
     (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
     object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the
-    host is gone. `profiles` are files of families of drives, which count before the shipped ones.
+    host is gone. `profiles` are files of families of drives, which count before the shipped ones. `streams` says
+    what the host sends in every cycle: the torque of each drive, or its position (cyclic synchronous position), where
+    the drives close the position loop by themselves and tell the torque that they measure.
     """
 
     kind: Literal["canopen"]
@@ -270,7 +248,8 @@ class CanopenDriver(ExtendedSection):
     watchdog_reason: Annotated[str, Field(max_length=200)] = ""
     guarding: NodeGuarding = NodeGuarding()
     profiles: tuple[TextBeside, ...] = ()
-    later = frozenset({"measured_torque", "watchdog_reason", "guarding", "profiles"})
+    streams: Literal["torque", "position"] = "torque"
+    later = frozenset({"measured_torque", "watchdog_reason", "guarding", "profiles", "streams"})
     heartbeats: Heartbeats = Heartbeats()
     reactions: Reactions = Reactions()
     status: StatusReports = StatusReports()
@@ -314,7 +293,14 @@ class CanopenDriver(ExtendedSection):
         """Return whether drives report measured torque in every cycle, with their status, or not at all."""
         if self.measured_torque is not None:
             return self.measured_torque
+        if self.streams == "position":
+            return "cyclic"
         return "status" if all(sheet.has(0x6077) for sheet in self.sheets) else "none"
+
+    @property
+    def drives_a_frame(self) -> int:
+        """Return how many drives a torque or position frame is for, at most; two positions fit, but no dummies do."""
+        return _SLOTS if self.torque_frames == "shared" and self.streams == "torque" else 1
 
     @property
     def report_delay(self) -> float:
@@ -354,6 +340,41 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
     known = np.array([0.0 if one is None else one for one in velocities])
     motors = np.abs(np.array(transmission.ratios)) * (np.abs(coupling) @ known)
     return [float(speed) for speed in motors * 60.0 / (2.0 * math.pi)]
+
+
+def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[float]:
+    """Return the most that each joint can be given when the others are given nothing [N m or N].
+
+    Args:
+        driver: the section `driver`, with as many drives as ratios.
+        transmission: the arm's.
+    """
+    size = len(transmission.ratios)
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    motors = np.array([drive.max_torque for drive in driver.drives])
+    # tau_motor = J^-T tau: a joint alone asks each of its motors for a share.
+    shares = np.abs(np.linalg.inv(np.array(transmission.ratios)[:, None] * coupling))  # (joints, motors)
+    with np.errstate(divide="ignore"):
+        return [float(most) for most in (motors / np.where(shares > 1e-12, shares, 0.0)).min(axis=1)]
+
+
+def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Sequence[float | None]) -> list[float]:
+    """Return the torque of each motor that keeps all joints within their limits, whatever the other motors give [N m].
+
+    Args:
+        driver: the section `driver`, with as many drives as ratios.
+        transmission: the arm's.
+        torques: limits of the joints [N m or N]; None where one has none.
+    """
+    size = len(transmission.ratios)
+    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    reach = np.abs(np.array(transmission.ratios)[:, None] * coupling)  # (motors, joints): tau = J^T tau_motor
+    most = np.array([drive.max_torque for drive in driver.drives])
+    allowed = np.array([np.inf if one is None else one for one in torques])
+    share = np.minimum(
+        allowed / (reach.T @ most), 1.0
+    )  # of every joint, when all of its motors give all that they have
+    return [float(torque * share[row > 0.0].min()) for torque, row in zip(most, reach, strict=True)]
 
 
 def quick_stop_decelerations(

@@ -50,6 +50,16 @@ class TorquePath(Section):
         return self
 
 
+class PositionPath(Section):
+    """Way to stream positions: a mode, its bit in 6502h, and the entry that takes the position [counts]."""
+
+    mode: Annotated[int, Field(strict=True, ge=-128, le=_MOST_MODE)]
+    supported: Annotated[int, Field(strict=True, ge=0, le=31)] | None = None
+    target: Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i32$")]
+    by: None = None
+    slope: None = None
+
+
 class TorqueUnit(Section):
     """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant."""
 
@@ -86,8 +96,10 @@ class MakersWatchdog(Section):
 class Family(Section):
     """Known properties of a family of drives.
 
-    `refuse` is the sentence with which drives without a torque mode are refused. `sources` says for every other key
-    where it is from; `proved` whether somebody has run it on hardware.
+    `refuse` is the sentence with which drives without a torque mode are refused. `mode_shown` says in which state a
+    mode of operation takes effect (6061h): already while the drive is off, or only when it is switched on.
+    `brake` is the maker's entry in which its tool has set up a holding brake, which is shown and never written.
+    `sources` says for every other key where it is from; `proved` whether somebody has run it on hardware.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -95,11 +107,14 @@ class Family(Section):
     match: Match = Match()
     refuse: str = ""
     torque: tuple[TorquePath, ...] = ()
+    position: PositionPath | None = None
     unit: TorqueUnit | None = None
     torque_limit: tuple[TorqueLimit, ...] = ()
     speed_limit: tuple[EntryText, ...] = ()
     dummies: tuple[Literal["0003", "0006", "0005", "0002"], ...] | None = None
     watchdog: MakersWatchdog | None = None
+    mode_shown: Literal["off", "switched_on"] = "off"
+    brake: EntryText | None = None
     notes: str = ""
     sources: dict[str, Annotated[str, Field(min_length=1)]]
 

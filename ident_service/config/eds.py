@@ -28,6 +28,7 @@ class DataSheetEntry:
         low: least value, None where the file says none.
         high: greatest value, likewise.
         text: its value as the file has it, None where it says none; that of a DCF before the default.
+        configured: whether that is a value which a DCF gives to this drive, not the default of its kind.
     """
 
     kind: int
@@ -36,6 +37,7 @@ class DataSheetEntry:
     low: int | None = None
     high: int | None = None
     text: str | None = None
+    configured: bool = False
 
     @property
     def writable(self) -> bool:
@@ -110,7 +112,8 @@ def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, DataShe
     low, high = (_number(section.get(key, ""), 0) for key in ("lowlimit", "highlimit"))
     kind = _number(section.get("datatype", ""), 0) or 0
     access = section.get("accesstype", "ro").strip().lower()
-    found = DataSheetEntry(kind, access, bool(_number(section.get("pdomapping", ""), 0)), low, high, text)
+    mappable, configured = bool(_number(section.get("pdomapping", ""), 0)), own is not None and text is own
+    found = DataSheetEntry(kind, access, mappable, low, high, text, configured)
     if many := min(_number(section.get("compactsubobj", ""), 0) or 0, _MOST_SUBS):
         yield 0, DataSheetEntry(_NUMBER_OF_ENTRIES, text=str(many))
         yield from ((number, found) for number in range(1, many + 1))

@@ -9,9 +9,10 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from ident_service.config import control, motion_design, recording, simulation
+from ident_service.config import barrett, control, motion_design, recording, simulation
 from ident_service.config.arm import ArmConfig, FourierMotion
-from ident_service.config.canopen import ABORTING, CanopenDriver, motor_speeds
+from ident_service.config.barrett import BarrettDriver
+from ident_service.config.canopen import ABORTING, CanopenDriver, joint_torques, motor_speeds
 from ident_service.config.eds import data_sheet
 from ident_service.config.kinematics import DHTable
 from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile
@@ -23,6 +24,10 @@ from ident_service.errors import ConfigError, DriverError, Problem, UsageError
 
 _ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
+_ANOTHER_UNIT = (
+    30.0  # times between a joint's torque limit and what its motors give: no choice of a limit is so far off
+)
+_POSITION_RATES = 100.0, 500.0  # Hz; slower the guard sees too little, faster a torque path is what a drive has
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 # Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.
 _LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
@@ -35,6 +40,7 @@ def disagreements(
     rate: float,
     homeless: Sequence[str] = (),
     velocities: Sequence[float | None] = (),
+    torques: Sequence[float | None] = (),
 ) -> Iterator[tuple[tuple[str | int, ...], str]]:
     """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
 
@@ -45,6 +51,7 @@ def disagreements(
         rate: cycles per second.
         homeless: those without a `home`.
         velocities: of the joints [rad/s or m/s], None where one has no limit; none where the file names no joints.
+        torques: torque limits of the joints [N m or N], likewise.
     """
     if driver.zero == "at_home" and homeless:
         yield (
@@ -92,7 +99,17 @@ def disagreements(
                     f" per minute (6080h), but its motor turns at {speed:.0f} when joints move at their limits:"
                     " raise max_speed, or lower joints.NAME.velocity",
                 )
-    shares = driver.torque_frames == "shared" and any(
+    if transmission is not None and len(torques) == len(driver.drives) == len(transmission.ratios):
+        for k, (limit, reach) in enumerate(zip(torques, joint_torques(driver, transmission), strict=True)):
+            ratio = 1.0 if limit is None else max(reach / limit, limit / reach)
+            if ratio > _ANOTHER_UNIT:
+                yield (
+                    ("driver", "drives", k),
+                    f"driver.drives: joint {joints[k]} can be given {reach:.4g} by its gears and max_torque, but"
+                    f" joints.{joints[k]}.torque is {limit:g}: {ratio:.3g} times apart, which is another unit or gear",
+                )
+    yield from _positions(driver, rate)
+    shares = driver.drives_a_frame > 1 and any(
         sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
     )
     if why := data_sheet(driver.eds.text).mistake:
@@ -115,6 +132,27 @@ def disagreements(
         yield ("driver", "profiles"), f"driver.profiles: {error}"
     if joints and len(joints) != len(driver.drives):
         yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"
+
+
+def _positions(driver: CanopenDriver, rate: float) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Yield what is inconsistent with drives that are given positions."""
+    if driver.streams != "position":
+        return
+    if driver.torque_reports != "cyclic":
+        yield (
+            ("driver", "measured_torque"),
+            "driver.measured_torque: drives that are given positions (driver.streams) must tell their torque in every"
+            " cycle, as nobody else knows it; leave it out, or set it to cyclic",
+        )
+    least, most = _POSITION_RATES
+    if not least <= rate <= most:
+        yield (
+            ("driver", "streams"),
+            f"driver.streams: positions are streamed at {least:g} to {most:g} Hz, between which drives interpolate"
+            f" (60C2h); control.rate is {rate:g}",
+        )
+    elif abs(1e6 / rate - round(1e6 / rate)) > 1e-6:
+        yield ("driver", "streams"), f"driver.streams: a period of 1/{rate:g} s is not whole microseconds (60C2h)"
 
 
 _MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
@@ -308,10 +346,26 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             if names and isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names, config.control.rate)
+    homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
+    if isinstance(config.driver, BarrettDriver):
+        yield from barrett.disagreements(config.driver, config.transmission, names, config.control.rate, homeless)
     if isinstance(config.driver, CanopenDriver):
-        homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
         velocities = [joint.velocity if (joint := config.joints.get(name)) else None for name in names]
-        yield from disagreements(config.driver, config.transmission, names, config.control.rate, homeless, velocities)
+        torques = [joint.torque if (joint := config.joints.get(name)) else None for name in names]
+        limits = velocities, torques
+        yield from disagreements(config.driver, config.transmission, names, config.control.rate, homeless, *limits)
+        if config.driver.streams == "position" and config.control.after_stop in ("hold", "lower"):
+            yield (
+                ("control", "after_stop"),
+                "control.after_stop: drives that are given positions (driver.streams) cannot lower an arm by torque;"
+                " give its joints brakes, and leave this out",
+            )
+        if config.driver.streams == "position" and config.identification.torque == "commanded":
+            yield (
+                ("identification", "torque"),
+                "identification.torque: of drives that are given positions (driver.streams) no torque is commanded;"
+                " leave it out, or set it to measured",
+            )
     if config.payload is not None and config.payload.link is not None and names and config.payload.link not in names:
         yield ("payload", "link"), f"payload.link: {config.payload.link!r} is none of {', '.join(names)}"
     yield from recording.disagreements(config.recording, config.transmission, names)

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDriver
 from ident_service.config.recording import motor_groups
 from ident_service.errors import MotionRefused
 
@@ -53,7 +52,7 @@ class MotorLimits:
         """Return joint torque within the motors' limits [N m or N], shape (joints,).
 
         Joints that share motors are scaled by one factor, so that no joint is pushed the other way, as drives do that
-        are asked for too much (`drivers/canopen/motor_units.py`).
+        are asked for too much (`drivers/motor_units.py`).
         """
         return np.asarray(torque / np.maximum(self.used_of_joints(torque), 1.0))
 
@@ -99,9 +98,8 @@ def motor_limits(config: ArmConfig) -> MotorLimits | None:
     if (together.sum(axis=1) == 1).all():
         return None
     most = np.full(len(coupling), np.inf) if gears.motor_torque is None else np.array(gears.motor_torque)
-    if isinstance(config.driver, CanopenDriver):
-        drives = np.array([drive.max_torque * drive.torque_scale for drive in config.driver.drives])
-        most = np.minimum(most, drives)
+    if config.motor_torques is not None:
+        most = np.minimum(most, np.array(config.motor_torques))
     if not np.isfinite(most).any():
         return None
     to_motors = np.linalg.inv(np.array(gears.ratios)[:, None] * coupling).T

@@ -44,7 +44,14 @@ from ident_service.daemon.routes import (
 from ident_service.daemon.routes.checks import Checks
 from ident_service.daemon.settings import Settings
 from ident_service.daemon.uploads import delete_half_uploads
-from ident_service.daemon.web.routes import PAGES
+from ident_service.daemon.web import (
+    arm_pages,
+    job_pages,
+    maintenance_pages,
+    reidentification_pages,
+    run_pages,
+    session_pages,
+)
 from ident_service.operations.acceptance import synchronise
 from ident_service.operations.deletion import remove_deleted
 from ident_service.registry.arms import know_shipped
@@ -55,6 +62,15 @@ from ident_service.registry.tokens import first_token
 _REFRESH = 1.0  # s between reads of tokens that were made or revoked at a terminal
 _CLEAN = 600.0  # s between searches for abandoned uploads
 _LOG = logging.getLogger("ident.serve")
+PAGES = (
+    session_pages.router,
+    arm_pages.router,
+    reidentification_pages.router,
+    maintenance_pages.router,
+    job_pages.router,
+    run_pages.router,
+)
+"""Routers of the pages, which are not in the API's description."""
 ROUTERS = (
     *(
         about.router,

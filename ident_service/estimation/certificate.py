@@ -33,7 +33,6 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 import scipy.linalg
-import scipy.sparse
 
 from ident_service.certificate_verifier import (
     Affine,
@@ -406,7 +405,8 @@ def _part(blocks: Sequence[Block], block: int, rows: tuple[int, ...]) -> Part:
 
 def _reduce(blocks: Sequence[Block], null: Array) -> list[Part]:
     """Drop rows on which a direction of the null space is diagonal and not negative, until there are none."""
-    from scipy.optimize import linprog  # loads for 0.1 s, and most parameters are feasible
+    from scipy.optimize import linprog  # loads for 0.3 s, and most parameters are feasible
+    from scipy.sparse import csr_array
 
     rows = [tuple(range(block.size or len(block.f))) for block in blocks]
     while True:
@@ -426,9 +426,9 @@ def _reduce(blocks: Sequence[Block], null: Array) -> list[Part]:
         count = len(owners)
         answer = linprog(
             np.append(np.zeros(null.shape[1]), -np.ones(count)),
-            A_ub=scipy.sparse.csr_array(np.hstack([-D, np.eye(count)])),
+            A_ub=csr_array(np.hstack([-D, np.eye(count)])),
             b_ub=np.zeros(count),
-            A_eq=scipy.sparse.csr_array(np.hstack([B, np.zeros((len(B), count))])) if len(B) else None,
+            A_eq=csr_array(np.hstack([B, np.zeros((len(B), count))])) if len(B) else None,
             b_eq=np.zeros(len(B)) if len(B) else None,
             bounds=[(-_LONGEST_DIRECTION, _LONGEST_DIRECTION)] * null.shape[1] + [(0.0, 1.0)] * count,
         )

@@ -248,7 +248,7 @@ def detect_change(first: ComparedEstimate, second: ComparedEstimate) -> Paramete
     deviations = np.where(seen, np.maximum(np.sqrt(np.where(seen, total, 0.0)), rounding), np.inf)
     singles = [difference_test(first, second, (place,)) for place in range(len(difference))]
     joint = difference_test(first, second, tuple(range(len(difference))))
-    groups = _groups(first.leading)
+    groups = parameter_groups(first.leading)
     tests = [difference_test(first, second, places) for places in groups.values()]
     corrected = holm([joint.p, *(test.p for test in tests)])
     effects = []
@@ -305,7 +305,12 @@ def relevant(shares: tuple[Array, Array] | None) -> bool:
     return bool(np.any((shares[0] >= RELEVANT_TORQUE) & (shares[1] >= RELEVANT_RESIDUAL)))
 
 
-def _groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
+def parameter_groups(leading: Sequence[str]) -> dict[tuple[Kind, int], tuple[int, ...]]:
+    """Return the places of each physical effect's parameters, by its kind and the number of its joint or link.
+
+    Args:
+        leading: the link parameter that each base parameter is named after.
+    """
     groups: dict[tuple[Kind, int], list[int]] = {}
     for place, name in enumerate(leading):
         symbol = name.rstrip("0123456789")

@@ -26,7 +26,7 @@ from ident_service.estimation.friction_fit import fit_friction, free_friction_nu
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
-from ident_service.estimation.shape_uncertainty import shape_covariance
+from ident_service.estimation.shape_uncertainty import shape_uncertainty
 from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.estimation.torque_delay import Delay, choose_delay, estimate_delay, with_delay
 from ident_service.estimation.uncertainty import uncertainty, widening
@@ -68,6 +68,7 @@ class Fit:
     Attributes:
         fit: the least squares whose factors constrained estimates use.
         equations: what it solves, with row weights where the method has them.
+        weighed: the same without row weights, rows near standstill multiplied by `shares`.
         covariance: from blocks of scores, with the doubt about fitted shapes of friction, shape (base, base).
         deviations: standard deviations on the careful side, shape (base,), see `uncertainty.py`.
         degrees: degrees of freedom of the deviations, shape (base,).
@@ -81,6 +82,7 @@ class Fit:
 
     fit: LeastSquares
     equations: Equations
+    weighed: Equations
     covariance: Array
     deviations: Array
     degrees: Array
@@ -201,19 +203,19 @@ def unconstrained(
     if not prepared.shapes:
         return found
     # The weights of Huber's rows are in his equations, not among those per joint.
-    weights = weighted_least_squares(prepared.equations.with_near(found.shares).total).weights
-    added = shape_covariance(
+    weights = weighted_least_squares(found.weighed.total).weights if found.method == "huber" else found.fit.weights
+    shape = shape_uncertainty(
         recordings,
         prepared.model,
         base,
         prepared.shapes,
         found.fit.beta,
-        weights if found.method == "huber" else found.fit.weights,
+        weights,
         prepared.torque_scales,
         found.shares,
     )
-    deviations = np.sqrt(found.deviations**2 + np.diag(added) * widening(found.degrees) ** 2)
-    return replace(found, covariance=found.covariance + added, deviations=deviations)
+    deviations, degrees = shape.joined(found.deviations, found.degrees)
+    return replace(found, covariance=found.covariance + shape.covariance, deviations=deviations, degrees=degrees)
 
 
 def _with_known_shape(
@@ -240,7 +242,7 @@ def _with_known_shape(
             return replace(_doubted("wls", fit, gathered, shares), choices=choices)
     if method != "iv":
         fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares)
-        found = _doubted("huber", fit, reweighted, shares)
+        found = replace(_doubted("huber", fit, reweighted, shares), weighed=gathered)
         return replace(found, choices=choices, remarks=_unsettled("Huber's weights", change, robust_regression.SETTLED))
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
@@ -249,7 +251,7 @@ def _with_known_shape(
     remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
     degrees = uncertainty(gathered, fit).degrees
     deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)
-    return Fit(moved, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
+    return Fit(moved, gathered, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
 
 
 def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
@@ -263,7 +265,9 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
 
 def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
     found = uncertainty(equations, fit)
-    return Fit(fit, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method)
+    return Fit(
+        fit, equations, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method
+    )
 
 
 def allowed_change(fit: LeastSquares, base: BaseParameters, deviations: Array, beta: Array) -> ChangeEllipsoid | None:

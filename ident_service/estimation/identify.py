@@ -235,8 +235,7 @@ def identify(
             for name, one in sets.items()
         }
         without = constrained_least_squares(found.fit, base, conditions, prior)
-        weighed = prepared.equations.with_near(found.shares).total
-        errors = (torque_error(weighed, one.beta) for one in (held[kind], without))
+        errors = (torque_error(found.weighed.total, one.beta) for one in (held[kind], without))
         knowledge = CustomKnowledge(custom, by.lower(), *(error.relative_percent for error in errors))
     deviations, as_zero = found.deviations, negligible(prepared.equations.everything)
     second = None
@@ -304,7 +303,7 @@ def identify(
         samples=prepared.equations.samples,
         prepared=prepared,
         fitted=found.equations,
-        information=prepared.equations.with_near(found.shares).total,
+        information=found.weighed.total,
         prior=prior,
         nearest_to=None if free else nearest_to,
         recordings=tuple((recording.path.name, recording.sha256) for recording in recordings),

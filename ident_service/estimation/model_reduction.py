@@ -22,7 +22,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
@@ -102,6 +101,8 @@ def essential_parameters(
     if not 0.0 < level < 1.0:
         raise ModelError(f"{level=} is no level of a test")
     covariance = block_covariance(equations, fit) if covariance is None else covariance
+    from scipy.special import fdtri  # loads for 0.2 s, and few ask for essential parameters
+
     # Of the transformed torques; the identity times the residual's variance where residuals are white.
     spread = fit.R1 @ covariance @ fit.R1.T
     total = equations.total
@@ -119,7 +120,7 @@ def essential_parameters(
         new_values, new_deviations = _refit(fit, spread, rest)
         removed = len(done) + 1
         lost = float(np.sum((fit.rho1 - fit.R1[:, rest] @ new_values) ** 2)) / removed
-        F, critical = lost / noise, float(scipy.special.fdtri(removed, samples - size, 1.0 - level))
+        F, critical = lost / noise, float(fdtri(removed, samples - size, 1.0 - level))
         step = Elimination(int(kept[weakest]), float(ratio[weakest]), F, critical)
         if critical < F:
             refused = step

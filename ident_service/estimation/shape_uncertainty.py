@@ -6,12 +6,15 @@ To first order it is a further column of the equations, the derivative of the pr
 logarithm. Its covariance C comes from the equations with these columns, blocks as everywhere, and how the parameters
 follow, A, from the same columns by least squares: A C A^T is added to their covariance. Under white noise the two parts
 are independent. No logarithm is less certain than any value of the search would be.
+
+A shape is often told by a few reversals alone, so by few blocks, and its covariance is then as uncertain as those few
+make it: the degrees of freedom of both parts are those of the equations with the further columns.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +22,7 @@ from numpy.typing import NDArray
 from ident_service.estimation.equations import Rows, equation_rows, equations_of
 from ident_service.estimation.friction_fit import searched, with_friction
 from ident_service.estimation.least_squares import ordinary_least_squares, unit_columns
-from ident_service.estimation.uncertainty import uncertainty
+from ident_service.estimation.uncertainty import jackknife, widening
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -30,7 +33,42 @@ _STEP = 1e-3  # of a number's logarithm
 _RANK_TOLERANCE = 1e-10
 
 
-def shape_covariance(
+@dataclass(frozen=True)
+class ShapeUncertainty:
+    """Uncertainty of base parameters by the doubt about the friction's shape.
+
+    Attributes:
+        covariance: to be added to theirs, shape (base, base), SI units.
+        degrees: degrees of freedom of its variances, shape (base,); infinite where a bound of the search is all that is
+            known.
+        known_degrees: degrees of freedom of the variances that take the shape for known, the fitted numbers counted
+            among the parameters, shape (base,).
+    """
+
+    covariance: Array
+    degrees: Array
+    known_degrees: Array
+
+    def joined(self, deviations: Array, degrees: Array) -> tuple[Array, Array]:
+        """Return deviations with the doubt about the shape, and the degrees of freedom of both together.
+
+        Each part is widened for its own degrees of freedom, none of which is more than the deviations have: beyond
+        first order, and over longer blocks, a shape is not known better than what it goes with. Together they have
+        Satterthwaite's (1946), or as many as before.
+
+        Args:
+            deviations: that take the shape for known, widened, shape (base,); may be infinite.
+            degrees: of freedom, shape (base,).
+        """
+        own, added = np.minimum(degrees, self.known_degrees), np.minimum(degrees, self.degrees)
+        variances = (deviations / widening(degrees)) ** 2, np.diag(self.covariance)
+        both = variances[0] + variances[1]
+        share = np.divide(variances[1], both, out=np.zeros_like(both), where=np.isfinite(both) & (both > 0.0))
+        wider = np.sqrt(variances[0] * widening(own) ** 2 + variances[1] * widening(added) ** 2)
+        return wider, np.minimum(degrees, 1.0 / ((1.0 - share) ** 2 / own + share**2 / added))
+
+
+def shape_uncertainty(
     recordings: Sequence[Recording],
     model: ArmModel,
     base: BaseParameters,
@@ -39,8 +77,8 @@ def shape_covariance(
     weights: Array,
     torque_scales: Array,
     shares: Array,
-) -> Array:
-    """Give the covariance of base parameters by the doubt about the friction's shape, shape (base, base), SI units.
+) -> ShapeUncertainty:
+    """Return what the doubt about the friction's shape adds to the uncertainty of base parameters.
 
     Args:
         recordings: that both were fitted to.
@@ -56,9 +94,10 @@ def shape_covariance(
         RecordingError: a recording cannot be used.
     """
     size, drives = base.size, model.chain.joints
+    none = ShapeUncertainty(np.zeros((size, size)), np.full(size, np.inf), np.full(size, np.inf))
     columns = _friction_columns(model, base)
     if not fitted or not len(columns):
-        return np.zeros((size, size))
+        return none
     others = [_moved(model, key) for key in fitted]
     own = replace(base, base=base.base[columns])
 
@@ -83,13 +122,27 @@ def shape_covariance(
     _, seen = unit_columns(fit.R1)
     used = seen[size:]
     if not used.any():
-        return np.zeros((size, size))
+        return none
     scale, _ = unit_columns(W)
     follow = -np.linalg.lstsq(W / scale, D[:, used], rcond=_RANK_TOLERANCE)[0] / scale[:, None]
     most = np.repeat([searched(key) for key in fitted], drives)[used]
-    found = uncertainty(gathered, fit).covariance[size:, size:][np.ix_(used, used)]
-    added = follow @ _at_most(found, most) @ follow.T
-    return np.asarray(0.5 * (added + added.T))
+    numbers = np.eye(len(seen))[:, size:][:, used]
+    found, _, blind = jackknife(gathered.clusters, fit, numbers)
+    told, white = np.sqrt(np.diag(found)), np.where(blind, 0.0, fit.standard_deviations[size:][used])
+    wider = np.maximum(white / np.where(told > 0.0, told, 1.0), 1.0)
+    found = found * np.outer(wider, wider)
+    found[blind, blind] = np.inf
+    bounded = _at_most(found, most)
+    added = follow @ bounded @ follow.T
+    # A bound of the search is certain; what data say of the other numbers is not.
+    by_data = np.sqrt(np.diag(found)) < most
+    through = numbers[:, by_data] @ follow[:, by_data].T
+    shape_known = np.eye(len(seen), size) - numbers @ follow.T
+    _, degrees, _ = jackknife(gathered.clusters, fit, np.column_stack([shape_known, through]))
+    part = np.diag(follow[:, by_data] @ bounded[np.ix_(by_data, by_data)] @ follow[:, by_data].T)
+    share = np.divide(part, np.diag(added), out=np.zeros(size), where=part > 0.0)
+    own = np.divide(np.maximum(degrees[size:], 1.0), share**2, out=np.full(size, np.inf), where=share > 0.0)
+    return ShapeUncertainty(np.asarray(0.5 * (added + added.T)), own, np.maximum(degrees[:size], 1.0))
 
 
 def _friction_columns(model: ArmModel, base: BaseParameters) -> NDArray[np.intp]:

@@ -95,6 +95,7 @@ def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = N
 def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
     count_mechanism(file, kind)
     if kind == "urdf":
+        require_urdf(file)
         from ident_service.model.mechanism_process import urdf_document
 
         document = urdf_document(file, part)
@@ -125,6 +126,154 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
     except expat.ExpatError as error:
         raise ModelError(f"{name}: not a {kind.upper()} that can be read: {error}") from None
     counter.finish()
+
+
+def require_urdf(file: TextFile) -> None:
+    """Refuse a URDF that its parser would refuse, in words and with lines; its elements were counted.
+
+    The parser, urdfdom, tells a terminal about its own source code, and its caller nothing.
+
+    Raises:
+        ModelError: what is wrong with robot, links and joints, each with its line.
+    """
+    reader = _Urdf()
+    parser = expat.ParserCreate("utf-8")
+    parser.StartElementHandler = lambda tag, attributes: reader.begin(tag, attributes, parser.CurrentLineNumber)
+    parser.EndElementHandler = reader.end
+    parser.Parse(file.text.encode("utf-8", "surrogatepass"), True)
+    if mistakes := sorted(reader.finish()):
+        told = "; ".join(f"{file.name}:{line}: {words}" for line, words in mistakes[:_MOST_TOLD])
+        more = len(mistakes) - _MOST_TOLD
+        raise ModelError(told + (f"; and {more} more" if more > 0 else ""))
+
+
+_MOST_TOLD: Final = 5
+_MOVES: Final = {"revolute": "limit", "prismatic": "limit", "continuous": "", "fixed": "", "floating": "", "planar": ""}
+_NUMBER: Final = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+# What the parser asks of each element of a joint: numbers that must be there, those that may be, and vectors of three.
+_JOINT_NUMBERS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]]] = {
+    "origin": ((), (), ("xyz", "rpy")),
+    "axis": ((), (), ("xyz",)),
+    "limit": (("effort", "velocity"), ("lower", "upper"), ()),
+    "dynamics": ((), ("damping", "friction"), ()),
+    "mimic": ((), ("multiplier", "offset"), ()),
+    "safety_controller": (("k_velocity",), ("soft_lower_limit", "soft_upper_limit", "k_position"), ()),
+    "calibration": ((), ("rising", "falling"), ()),
+}
+_UNITS: Final = {
+    "effort": "N m (N of a slide)",
+    "velocity": "rad/s (m/s of a slide)",
+    **dict.fromkeys(("lower", "upper"), "rad (m of a slide)"),
+}
+_LONGEST_TOLD: Final = 40  # characters of a name or value
+
+
+class _Urdf:
+    """Reader of a URDF's links and joints that finds what the parser would refuse."""
+
+    def __init__(self) -> None:
+        self._open: list[str] = []
+        self._links: dict[str, int] = {}
+        self._joints: dict[str, int] = {}
+        self._children: set[str] = set()
+        self._ends: list[tuple[int, str, str, str]] = []
+        self._joint: dict[str, str] = {}
+        self._at, self._type = 0, ""
+        self._mistakes: list[tuple[int, str]] = []
+
+    def begin(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        self._open.append(tag)
+        if len(self._open) == 1 and tag != "robot":
+            self._mistakes.append((line, f"<{tag}> is no robot; a URDF begins with <robot name=...>"))
+        elif len(self._open) == 1 and not attributes.get("name"):
+            self._mistakes.append((line, "the robot has no name; give <robot name=...>"))
+        elif self._open == ["robot", "link"]:
+            self._named("link", attributes, line, self._links)
+        elif self._open == ["robot", "joint"]:
+            self._named("joint", attributes, line, self._joints)
+            self._joint, self._at, self._type = {"name": attributes.get("name", "")}, line, attributes.get("type", "")
+            if self._type not in _MOVES:
+                said = self._type[:_LONGEST_TOLD]
+                self._mistakes.append((line, f"{self._where()}: type {said!r} is none of {', '.join(_MOVES)}"))
+        elif self._open[:-1] == ["robot", "joint"]:
+            self._of_a_joint(tag, attributes, line)
+
+    def end(self, tag: str) -> None:
+        if self._open == ["robot", "joint"]:
+            self._joint_ends()
+        self._open.pop()
+
+    def finish(self) -> list[tuple[int, str]]:
+        """Return line and words of each mistake."""
+        for line, where, role, link in self._ends:
+            if link not in self._links:
+                named = link[:_LONGEST_TOLD]
+                self._mistakes.append(
+                    (line, f'{where}: its {role} link {named!r} is declared nowhere; add <link name="{named}"/>')
+                )
+        roots = [name for name in self._links if name not in self._children]
+        if len(roots) > 1 and not self._mistakes:
+            named = ", ".join(f"{name[:_LONGEST_TOLD]!r} (line {self._links[name]})" for name in roots[:_MOST_TOLD])
+            self._mistakes.append(
+                (
+                    self._links[roots[1]],
+                    f"{len(roots)} links hang on no joint: {named}; a URDF is one tree: join them by fixed joints, or "
+                    "leave out what is not the arm's",
+                )
+            )
+        return self._mistakes
+
+    def _named(self, kind: str, attributes: dict[str, str], line: int, known: dict[str, int]) -> None:
+        name = attributes.get("name", "")
+        if not name:
+            self._mistakes.append((line, f"a {kind} without a name; give <{kind} name=...>"))
+        elif name in known:
+            self._mistakes.append(
+                (line, f"{kind} {name[:_LONGEST_TOLD]!r} is there already, in line {known[name]}; rename one of them")
+            )
+        else:
+            known[name] = line
+
+    def _of_a_joint(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        if tag in self._joint:
+            return  # the parser reads the first of each
+        self._joint[tag] = attributes.get("link", "")
+        needed, possible, vectors = _JOINT_NUMBERS.get(tag, ((), (), ()))
+        where = self._where()
+        if tag == "axis" and self._type == "fixed":
+            return
+        if tag in ("parent", "child") and attributes.get("link"):
+            self._ends.append((line, where, tag, attributes["link"]))
+            if tag == "child":
+                self._children.add(attributes["link"])
+        if tag == "mimic" and not attributes.get("joint"):
+            self._mistakes.append((line, f"{where}: mimic names no joint; give <mimic joint=...>"))
+        for key in (*needed, *possible, *vectors):
+            count = 3 if key in vectors else 1
+            if key not in attributes:
+                if key in needed:
+                    unit = f" in {_UNITS[key]}" if key in _UNITS else ""
+                    self._mistakes.append((line, f"{where}: its {tag} has no {key}; give it{unit}"))
+                continue
+            words = [word for word in attributes[key].split(" ") if word] if count > 1 else [attributes[key]]
+            numbers = [word for word in words if _NUMBER.fullmatch(word) and math.isfinite(float(word))]
+            if len(words) != count or len(numbers) != count:
+                should = "three numbers" if count > 1 else f"a number{f' of {_UNITS[key]}' if key in _UNITS else ''}"
+                said = attributes[key][:_LONGEST_TOLD]
+                self._mistakes.append((line, f"{where}: {tag} {key} is {said!r}; give {should}"))
+
+    def _where(self) -> str:
+        return f"joint {self._joint['name'][:_LONGEST_TOLD]!r}"
+
+    def _joint_ends(self) -> None:
+        where = self._where()
+        for role in ("parent", "child"):
+            if not self._joint.get(role):
+                self._mistakes.append((self._at, f"{where}: names no {role} link; give <{role} link=...>"))
+        if _MOVES.get(self._type) == "limit" and "limit" not in self._joint:
+            self._mistakes.append(
+                (self._at, f"{where}: is {self._type} and has no limit; give <limit lower= upper= effort= velocity=>")
+            )
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from typing import Final
 
 import coal  # type: ignore[import-untyped]
 import numpy as np
-import pinocchio as pin
 
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.motion_design import BASE, Capsule
@@ -58,8 +57,8 @@ def mesh_capsules(kinematics: Kinematics, chain: Chain, folder: Path) -> tuple[d
             if local is None:
                 unread.add(owner)
                 continue
-            placed = pin.SE3(rotation, translation) * origin_of(element.find("origin"), file.name)
-            there = local @ placed.rotation.T + placed.translation
+            own_rotation, own_translation = origin_of(element.find("origin"), file.name)
+            there = (local @ own_rotation.T + own_translation) @ rotation.T + translation
             if joint != WORLD:
                 there = (there - chain.link_translation[joint]) @ chain.link_rotation[joint]
             found.append(there)

@@ -49,6 +49,18 @@ _REVOLUTE_UNITS = {
 _PRISMATIC_UNITS = {"Ia": "kg", "fv": "N s/m", "fc": "N", "fo": "N", "fs": "N", "fq": "N s^2/m^2", "fa": "N s/m"}
 
 
+def about_center(parameters: Array) -> tuple[float, Array, Array]:
+    """Return mass [kg], centre of mass [m], (3,), and inertia about it [kg m^2], (3, 3), of a body.
+
+    Args:
+        parameters: of eq. 13, shape (10,), with a nonzero mass.
+    """
+    xx, xy, xz, yy, yz, zz, *first, m = parameters
+    center = np.array(first) / m
+    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return float(m), center, about_origin - m * (center @ center * np.eye(3) - np.outer(center, center))
+
+
 @dataclass(frozen=True)
 class Layout:
     """Order of the link parameters in delta.

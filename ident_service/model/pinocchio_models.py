@@ -80,15 +80,6 @@ def link_frame(chain: Chain, link: int) -> pin.SE3:
     return pin.SE3(chain.link_rotation[link], chain.link_translation[link])
 
 
-def joint_frame_inertias(chain: Chain, layout: Layout, delta: Array) -> list[pin.Inertia]:
-    """Return each link's inertia in its joint's frame, whatever frame delta is expressed in.
-
-    Raises:
-        ModelError: a link without positive mass.
-    """
-    return [inertia_from_delta(delta[layout.inertial(k)]).se3Action(link_frame(chain, k)) for k in range(chain.joints)]
-
-
 def pinocchio_model(chain: Chain, layout: Layout, delta: Array) -> pin.Model:
     """Return a pinocchio model of the chain with the inertias of `delta` and its drive inertias as armature.
 

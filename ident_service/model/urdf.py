@@ -13,7 +13,6 @@ import xml.etree.ElementTree as ET  # only writes here; reading goes through pin
 from collections.abc import Iterator
 
 import numpy as np
-import pinocchio as pin
 
 from ident_service.config.arm import Joint
 from ident_service.config.kinematics import Kinematics
@@ -22,7 +21,7 @@ from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.mechanism import read_mechanism
-from ident_service.model.parameter_layout import joint_drives
+from ident_service.model.parameter_layout import about_center, joint_drives
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, rotation_rpy
 
 BASE_LINK = "base_link"
@@ -85,12 +84,18 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 
 
 def _inertials(model: ArmModel, delta: Array) -> list[tuple[float, Array, Array]]:
-    from ident_service.model.pinocchio_models import joint_frame_inertias
-
-    return [
-        (float(inertia.mass), np.asarray(inertia.lever), np.asarray(inertia.inertia))
-        for inertia in joint_frame_inertias(model.chain, model.layout, delta)
-    ]
+    """Return mass [kg], centre of mass [m] and inertia about it [kg m^2] of each link, in its joint's frame."""
+    found = []
+    for link in range(model.chain.joints):
+        body = delta[model.layout.inertial(link)]
+        if not body[9] > 0.0:
+            raise ModelError(
+                f"a link of mass {body[9]:g} kg has no centre of mass; give the constrained estimate instead"
+            )
+        mass, center, inertia = about_center(body)
+        R, t = model.chain.link_rotation[link], model.chain.link_translation[link]
+        found.append((mass, R @ center + t, R @ inertia @ R.T))
+    return found
 
 
 def _root_name(model: ArmModel) -> str:
@@ -150,10 +155,9 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
             continue
         where = f"{file.name}: link {link.get('name')!r}"
         for element in elements:
-            placement = pin.SE3(rotation, translation) * origin_of(element.find("origin"), where)
-            bodies.append(
-                Body(owner, joint, solid_of(element, placement.rotation, placement.translation, owner, where))
-            )
+            own_rotation, own_translation = origin_of(element.find("origin"), where)
+            center = rotation @ own_translation + translation
+            bodies.append(Body(owner, joint, solid_of(element, rotation @ own_rotation, center, owner, where)))
     return bodies
 
 
@@ -186,11 +190,11 @@ def solid_of(collision: ET.Element, rotation: Array, center: Array, owner: str, 
     raise ModelError(f"{where}: collision geometry {shape.tag!r} is none of box, sphere, cylinder, capsule")
 
 
-def origin_of(origin: ET.Element | None, where: str) -> pin.SE3:
-    """Return the placement of an `<origin>`, the identity without one; ModelError where it cannot be read."""
+def origin_of(origin: ET.Element | None, where: str) -> tuple[Array, Array]:
+    """Return rotation and translation [m] of an `<origin>`, the identity without one; ModelError if unreadable."""
     if origin is None:
-        return pin.SE3.Identity()
-    return pin.SE3(
+        return np.eye(3), np.zeros(3)
+    return (
         rotation_rpy(*_attribute_numbers(origin.get("rpy", "0 0 0"), 3, where)),
         np.array(_attribute_numbers(origin.get("xyz", "0 0 0"), 3, where)),
     )

@@ -17,6 +17,10 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.pinocchio_models import InverseDynamics
 
 WEIGHS: Final = 1e-3  # of a torque limit; every drive that reaches this torque has more friction than that
+ONLY_BRAKED: Final = (
+    "drives that are given positions (driver.streams) cannot lower an arm by torque; give its joints brakes, and leave "
+    "control.after_stop out"
+)
 _POSTURES, _SEED = 64, 1
 # Faults after whose stop a held arm may be led home: they concern neither the arm nor its drives.
 HOME_AFTER: Final = frozenset({"lease_lost", "recorder_behind", "no_way_back", "late_cycles", "controls_failed"})

@@ -8,7 +8,7 @@ from typing import cast
 from drivers.arm import Arm
 from drivers.clock import Clock
 from ident_service.config.arm import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, UsageError
 
 GROUP = "ident_service.drivers"
 
@@ -21,10 +21,11 @@ def make_arm(config: ArmConfig, clock: Clock | None = None) -> Arm:
         clock: the loop's clock; by default the one the driver section asks for.
 
     Raises:
-        DriverError: no driver section, or nothing is registered under its kind.
+        UsageError: the description has no driver section.
+        DriverError: nothing is registered under its kind.
     """
     if config.driver is None:
-        raise DriverError(f"{config.name}: the arm has no driver section, so it cannot be moved")
+        raise UsageError(f"{config.name}: the arm has no driver section, so it cannot be moved")
     found = entry_points(group=GROUP, name=config.driver.kind)
     if not found:
         known = ", ".join(sorted(entry.name for entry in entry_points(group=GROUP)))

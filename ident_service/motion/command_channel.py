@@ -54,8 +54,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
+from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisStatus
+from drivers.can.bus_load import Budget
 from ident_service.errors import DriverError, UsageError
 
 LEASE_SECONDS = 2.0  # ARCHITECTURE.md: renewed every 0.5 s
@@ -543,6 +544,7 @@ class InterruptibleArm(Arm):
         """Wrap the given arm; `asked` returns whether it is to stop."""
         self._arm, self._asked = arm, asked
         self.clock = arm.clock
+        arm.still_wanted = lambda: not asked()
 
     def open(self) -> None:
         """Open the wrapped arm and use its clock."""
@@ -568,6 +570,11 @@ class InterruptibleArm(Arm):
             self._require_not_asked()
         return self._arm.exchange(torque)
 
+    def exchange_position(self, position: Vector) -> Sample:
+        """Exchange with the wrapped arm; raises DriverError instead of sending a position likewise."""
+        self._require_not_asked()
+        return self._arm.exchange_position(position)
+
     def watchdogs(self) -> tuple[Watchdog, ...]:
         """Return the wrapped arm's watchdogs."""
         return self._arm.watchdogs()
@@ -575,6 +582,19 @@ class InterruptibleArm(Arm):
     def withhold(self, kind: str) -> None:
         """Withhold what watchdogs of one kind watch from the wrapped arm's drives."""
         self._arm.withhold(kind)
+
+    def bus_budget(self, rate: float | None = None) -> Budget | None:
+        """Return the wrapped arm's bus budget."""
+        return self._arm.bus_budget(rate)
+
+    def setup_checks(self) -> tuple[SetupCheck, ...]:
+        """Return what the wrapped arm's drives say of their set-up."""
+        return self._arm.setup_checks()
+
+    @property
+    def operator_action(self) -> str:
+        """Return what a person must do to enable the wrapped arm."""
+        return self._arm.operator_action
 
     def drive_status(self) -> tuple[AxisStatus, ...]:
         """Return the wrapped arm's drive status."""

@@ -2,6 +2,11 @@
 
 exchange -> deadlines -> course -> guard.feedback -> control law -> guard.torque -> sink -> reaction -> controls
 
+Arms whose drives close the position loop (`ArmDescription.streams_position`) are given the reference itself, through
+`guard.position`. The control law is computed all the same, and not sent: what it would add for the following error
+tells a joint that stands still although it is pushed. No torque can lower such an arm: where the table says damped
+lowering, its drives quick-stop.
+
 Reactions that end torque are an `ArmFault` out of `Loop.run`; taking the torque away is `run.py`'s. After a stop the
 loop goes on until the arm has been measured at rest and held for a while, see `faults.py`; one without brakes until a
 person has confirmed that it is supported, or until it has been lowered (`after_stop.py`, `lowering.py`).
@@ -89,6 +94,7 @@ class Loop:
     peaks: Peaks
     after_stop: AfterStop = AfterStop.BRAKE
     floor_reached: Callable[[Vector], bool] = lambda position: False
+    gives_positions: bool = False
     ended_by: Fault | None = None
     lowered: bool = False
     last: deque[Sample] = field(default_factory=lambda: deque(maxlen=KEPT_SAMPLES))
@@ -101,28 +107,30 @@ class Loop:
         self._lowering: Lowering | None = None
         self._anchor: Anchor | None = None  # of an arm that is held for as long as it takes
         self._waiting = self._leading = False  # for a person's confirmation; for a trajectory home
+        self._explained: Vector | None = None  # the model's torque, of an arm that is given positions
         self._recorded = False  # all that is recorded of the run
         self._told: set[str] = set()
         self._rest_speed = REST_SPEED * self.limits.velocity
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
-    def run(self, torque: Vector) -> None:
+    def run(self, target: Vector) -> None:
         """Cycle until DONE, or until STOPPED and held.
 
         Args:
-            torque: of the first cycle, that holds the arm where it stands [N m or N], shape (joints,).
+            target: of the first cycle, that holds the arm where it stands, shape (joints,): torque [N m or N], or
+                position [rad or m] of an arm that is given positions.
 
         Raises:
             ArmFault: torque must end now.
         """
-        wanted: Vector | None = torque
+        wanted: Vector | None = target
         while wanted is not None:
             wanted = self._cycle(wanted)
 
-    def _cycle(self, torque: Vector) -> Vector | None:
-        """Run one cycle with the torque to send; returns the torque of the next cycle, or None at the end."""
+    def _cycle(self, target: Vector) -> Vector | None:
+        """Run one cycle with the target to send; returns that of the next cycle, or None at the end."""
         try:
-            sample = self.arm.exchange(torque)
+            sample = (self.arm.exchange_position if self.gives_positions else self.arm.exchange)(target)
         except DriverError as error:
             raise self._end(self.guard.findings.found("driver", str(error))) from error
         woken_ns, stamp_ns = self.arm.clock.now_ns(), sample.stamp_ns
@@ -133,7 +141,7 @@ class Loop:
         reference = self.course.at(stamp_ns)
         if self.states.state is State.DONE:
             return None
-        free = self._lowering is not None or self.states.state is State.STOPPED
+        free = not self.gives_positions and (self._lowering is not None or self.states.state is State.STOPPED)
         reference = rest(self.control.position) if free else reference  # no position is asked for
         usable, fault = self.guard.feedback(
             sample,
@@ -144,18 +152,24 @@ class Loop:
             self.deadlines.elapsed,
             self.control.feedforward,
             known=self.deadlines.known,
+            unexplained=sample.torque - self._explained if self._explained is not None else 0.0,
         )
-        torque, torque_fault = self.guard.torque(self._law(sample, usable, reference, free))
+        law = self._law(sample, usable, reference, free)
+        if self.gives_positions:
+            self._explained = law - self.control.correction
+        target, target_fault = (
+            self.guard.position(reference.position) if self.gives_positions else self.guard.torque(law)
+        )
         compute_ns = self.arm.clock.now_ns() - woken_ns
         kept = sample if fault is None or fault.code != "feedback_not_finite" else self._finite(sample)
-        for found in (fault, torque_fault, self._record(kept, reference, compute_ns)):
+        for found in (fault, target_fault, self._record(kept, reference, compute_ns)):
             if found is not None:
                 self._react(found, stamp_ns)
         self._remember(sample, usable, reference)
         if self._rests(stamp_ns):
             return None
         self._obey(woken_ns, stamp_ns)
-        return torque
+        return target
 
     def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
         """Return the torque that the control law asks for [N m or N], shape (joints,)."""
@@ -183,14 +197,15 @@ class Loop:
         if fault.reaction <= self._level or (self._lowering is not None and fault.code in MEANT):
             return
         self._level = fault.reaction
-        if fault.reaction >= Reaction.QUICK_STOP:
+        lowers = fault.reaction is Reaction.DAMPED_LOWERING
+        if fault.reaction >= Reaction.QUICK_STOP or (lowers and self.gives_positions):
             raise self._end(fault)
         if self.ended_by is None or not self.course.led:  # on the way home the first one stays the reason
             self.ended_by = fault
         self.latch.set(fault.code, fault.message, stamp_ns)
         self.course.stop(stamp_ns)
         self.tell(fault.severity, stamp_ns, f"{fault.code}: {fault.message}")
-        if fault.reaction is Reaction.DAMPED_LOWERING:
+        if lowers:
             self._needed = np.zeros_like(self._needed)
             self._lower(stamp_ns, LOWER_AFTER)
 

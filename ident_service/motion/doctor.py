@@ -23,7 +23,7 @@ from drivers.can.bus_state import BusError
 from drivers.can.socketcan_link import check_interface
 from drivers.clock import Clock, RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDriver
+from ident_service.config.can_bus import CanBus
 from ident_service.config.control import Realtime
 from ident_service.motion.cycle_timing import LATE, SUCCESS, longest_stall
 from ident_service.motion.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, asked, capable, core_numbers
@@ -132,9 +132,7 @@ def kernel_findings(settings: Realtime, root: Path = Path("/")) -> list[Finding]
 
 def bus_findings(config: ArmConfig, root: Path = Path("/")) -> list[Finding]:
     """Look at the CAN interfaces of the kernel that an arm names; none where it names none."""
-    if not isinstance(config.driver, CanopenDriver):
-        return []
-    return [_interface(bus, root) for bus in config.driver.buses if bus.medium == "kernel"]
+    return [_interface(bus, root) for bus in config.can_buses if bus.medium == "kernel"]
 
 
 def measure_wake_up(

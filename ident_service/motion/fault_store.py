@@ -3,6 +3,11 @@
 The process that moves the arm first marks that it does (`moving.json`), and removes the mark when the arm is without
 torque and every fault is in `faults.json`. A process that is killed in between, alone or with its children, thus leaves
 the mark; a mark without a process that holds the arm's control file is the fault `motion_process`.
+
+A disk may fill while the arm moves, so the mark has room for the faults: a JSON object, and after it `_ROOM` blanks,
+which are overwritten by a line of JSON for each. That takes no new block where files are overwritten in place (ext4,
+xfs, tmpfs); a file system that copies on write may refuse it, which leaves `motion_process`. They count as those in
+`faults.json` do, and move there when one of them is acknowledged.
 """
 
 from __future__ import annotations
@@ -13,9 +18,9 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.motion.command_channel import in_use
@@ -23,6 +28,10 @@ from ident_service.recordings.files import write_atomically
 
 CONTROLS: Final = "control"  # the arm's control file, in its folder
 UNFINISHED: Final = "motion_process"
+_ROOM: Final = 4096  # bytes of the mark for faults: ten and more
+_LONGEST: Final = 300  # characters of a cause there, so that none takes the room of all
+_ENDED: Final = {"ended": True}  # the mark's last line: all faults are stored, the arm is without torque
+_LAST_LINE: Final = 32  # bytes that are kept for it
 
 
 @dataclass(frozen=True)
@@ -38,6 +47,34 @@ class StoredFault:
     code: str
     cause: str
     since: float
+
+    def document(self) -> dict[str, Any]:
+        """Return the fault as JSON values."""
+        return {"code": self.code, "cause": self.cause, "written": self.since}
+
+    @classmethod
+    def from_document(cls, document: Any) -> Self:
+        """Return the fault of JSON values; raises KeyError, TypeError or ValueError."""
+        return cls(str(document["code"]), str(document["cause"]), float(document["written"]))
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """Represent the mark of a moving arm.
+
+    Attributes:
+        begun: the fault that it is when its process is gone without a word.
+        faults: that found no other room.
+        ended: whether these are all, and the arm was without torque.
+        free: offset of the first blank [bytes].
+        size: of the file [bytes].
+    """
+
+    begun: StoredFault
+    faults: tuple[StoredFault, ...]
+    ended: bool
+    free: int
+    size: int
 
 
 class FaultStore:
@@ -73,11 +110,22 @@ class FaultStore:
         self.require_none({one.code: one.cause for one in self._remembered(moving=False)})
         self._mark.parent.mkdir(parents=True, exist_ok=True)
         mark = {"pid": os.getpid(), "run": str(run), "began": time.time()}
-        write_atomically(self._mark, json.dumps(mark, indent=1) + "\n")
+        write_atomically(self._mark, json.dumps(mark) + "\n" + " " * _ROOM)
 
     def ended(self) -> None:
-        """Remove the mark of a moving arm: the arm is without torque, and its faults are stored."""
-        self._mark.unlink(missing_ok=True)
+        """Remove the mark of a moving arm: the arm is without torque, and its faults are stored.
+
+        A mark that stores faults itself stays until they are acknowledged.
+
+        Raises:
+            UsageError: a file is damaged, or cannot be written.
+        """
+        with self._alone():
+            mark = self._marked()
+            if mark is not None and mark.faults:
+                self._write_into_mark(mark, json.dumps(_ENDED), mark.size)
+            else:
+                self._mark.unlink(missing_ok=True)
 
     def require_none(self, faults: dict[str, str]) -> None:
         """Raise MotionRefused, which names the faults, if there are any."""
@@ -89,13 +137,24 @@ class FaultStore:
     def latch(self, code: str, cause: str) -> None:
         """Store a fault; one that is stored already keeps its first cause.
 
+        Where there is no room on the disk, it is stored in the mark of the moving arm, a long cause without its end.
+
         Raises:
-            UsageError: the file is damaged, or cannot be written.
+            UsageError: the file is damaged, or neither can be written.
         """
+        fault = StoredFault(code, cause, time.time())
         with self._alone():
-            rows = self._rows()
-            if all(row.code != code for row in rows):
-                self._write((*rows, StoredFault(code, cause, time.time())))
+            try:
+                rows = self._rows()
+                if all(row.code != code for row in rows):
+                    self._write((*rows, fault))
+            except UsageError:
+                if (mark := self._marked()) is None:
+                    raise
+                if all(one.code != code for one in mark.faults):
+                    short = cause if len(cause) <= _LONGEST else f"{cause[:_LONGEST]}..."
+                    line = json.dumps(replace(fault, cause=short).document())
+                    self._write_into_mark(mark, line, mark.size - _LAST_LINE)
 
     def acknowledge(self, code: str) -> str:
         """Remove a fault from the store; returns its cause.
@@ -117,9 +176,14 @@ class FaultStore:
                 f"{self._arm}: a process still controls the arm; stop and support it (`ident stop`, `ident "
                 "supported`), then acknowledge"
             )
-        self._write(tuple(row for row in self._rows() if row.code != code))
-        if code == UNFINISHED:
-            self.ended()
+        mark = self._marked()
+        self._write(tuple(row for row in self._stored(mark) if row.code != code))
+        if mark is None:
+            return faults[code]
+        if mark.ended or code == UNFINISHED:
+            self._mark.unlink(missing_ok=True)
+        elif mark.faults:  # they are in the other file now
+            write_atomically(self._mark, self._mark.read_text(encoding="utf-8").splitlines()[0] + "\n")
         return faults[code]
 
     @contextmanager
@@ -138,31 +202,72 @@ class FaultStore:
             os.close(fd)
 
     def _remembered(self, *, moving: bool) -> tuple[StoredFault, ...]:
-        rows = self._rows()
-        if moving or (mark := self._read(self._mark)) is None or any(row.code == UNFINISHED for row in rows):
+        mark = self._marked()
+        rows = self._stored(mark)
+        if moving or mark is None or mark.ended:
             return rows
+        return *rows, mark.begun
+
+    def _stored(self, mark: _Mark | None) -> tuple[StoredFault, ...]:
+        """Return the faults of both files, each with its first cause."""
+        rows = self._rows()
+        if mark is None or not mark.faults:
+            return rows
+        first: dict[str, StoredFault] = {}
+        for one in sorted((*rows, *mark.faults), key=lambda one: one.since):
+            first.setdefault(one.code, one)
+        return tuple(first.values())
+
+    def _marked(self) -> _Mark | None:
+        """Return the mark of a moving arm, None where there is none."""
+        if (text := self._text(self._mark)) is None:
+            return None
         try:
-            pid, run, began = int(mark["pid"]), str(mark["run"]), float(mark["began"])
+            document, end = json.JSONDecoder().raw_decode(text)
+            pid, run, began = int(document["pid"]), str(document["run"]), float(document["began"])
         except (KeyError, TypeError, ValueError) as error:
             raise self._damaged(self._mark, error) from None
-        return *rows, StoredFault(
-            UNFINISHED,
-            f"process {pid} died, or could not store why it stopped, while it had the arm, in the run {run}",
-            began,
-        )
+        faults: list[StoredFault] = []
+        ended, free = False, end + 1
+        for line in text[free:].split("\n"):
+            try:
+                row = json.loads(line)
+                ended = ended or row == _ENDED
+                if not ended:
+                    faults.append(StoredFault.from_document(row))
+            except (KeyError, TypeError, ValueError):
+                break  # blanks, or a line that a failing machine left in pieces: what it meant is `motion_process` then
+            free += len(line) + 1
+        cause = f"process {pid} died, or could not store why it stopped, while it had the arm, in the run {run}"
+        return _Mark(StoredFault(UNFINISHED, cause, began), tuple(faults), ended, free, len(text))
+
+    def _write_into_mark(self, mark: _Mark, line: str, end: int) -> None:
+        """Overwrite blanks of the mark with a line; raises UsageError where they do not reach up to `end` [bytes]."""
+        data = line.encode() + b"\n"
+        if mark.free + len(data) > end:
+            raise UsageError(f"{self._mark}: has no room left")
+        try:
+            fd = os.open(self._mark, os.O_WRONLY | os.O_CLOEXEC)
+            try:
+                os.pwrite(fd, data, mark.free)
+                os.fsync(fd)
+            finally:
+                os.close(fd)
+        except OSError as error:
+            raise UsageError(f"{self._mark}: cannot be written: {error.strerror}") from None
 
     def _rows(self) -> tuple[StoredFault, ...]:
-        content = self._read(self._faults)
+        if (text := self._text(self._faults)) is None:
+            return ()
         try:
-            rows = [] if content is None else content["faults"]
-            return tuple(StoredFault(str(row["code"]), str(row["cause"]), float(row["written"])) for row in rows)
+            return tuple(StoredFault.from_document(row) for row in json.loads(text)["faults"])
         except (KeyError, TypeError, ValueError) as error:
             raise self._damaged(self._faults, error) from None
 
-    def _read(self, path: Path) -> Any:
-        """Return the JSON content of a file, None when there is no file."""
+    def _text(self, path: Path) -> str | None:
+        """Return the content of a file, None when there is no file."""
         try:
-            return json.loads(path.read_text(encoding="utf-8"))
+            return path.read_text(encoding="utf-8")
         except FileNotFoundError:
             return None
         except (OSError, ValueError) as error:
@@ -173,5 +278,5 @@ class FaultStore:
 
     def _write(self, faults: tuple[StoredFault, ...]) -> None:
         self._faults.parent.mkdir(parents=True, exist_ok=True)
-        rows = [{"code": one.code, "cause": one.cause, "written": one.since} for one in faults]
+        rows = [one.document() for one in faults]
         write_atomically(self._faults, json.dumps({"faults": rows}, indent=1) + "\n")

@@ -97,7 +97,10 @@ FAULTS: dict[str, Rule] = {
     "encoder_jump": Rule(_WARN, "a reading was disturbed, and was not used"),
     "torque_saturated": Rule(_WARN, "the motion asks for more than the arm may give; the torque was limited"),
     "torque_rate": Rule(_WARN, "the torque jumped, from noise or a gain that is too high; its change was limited"),
-    "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores its target torque"),
+    # Of drives that are given positions, which alone limit their torque.
+    "torque_exceeded": Rule(_WARN, "it pushes against something, or is heavier than described", often=5),
+    "position_rate": Rule(_WARN, "cycles were late or lost; the target position caught up within the limits"),
+    "torque_not_applied": Rule(_WARN, "a drive limits, delays or ignores its target"),
     "drive_notice": Rule(_WARN, "information from the drive, which goes on; see the code in its manual", each=True),
     "drive_warning": Rule(_WARN, "temperature, voltage or current near its limit; see the drive's manual"),
     "torque_limited": Rule(_WARN, "the drive itself gives less torque than it was asked for"),
@@ -139,6 +142,10 @@ FAULTS: dict[str, Rule] = {
     "bus_silent": Rule(_QUICK, "the arm was not monitored in between"),
     "clock_jump": Rule(_QUICK, "time stamps cannot be trusted"),
     "torque_not_finite": Rule(_QUICK, "an error in the program or the model"),
+    # A controlled stop would go on pushing.
+    "torque_unexplained": Rule(_QUICK, "it pushes against something or somebody, or its encoder or model is wrong"),
+    "position_not_finite": Rule(_QUICK, "an error in the program or the model"),
+    "position_outside": Rule(_QUICK, "an error in the program or the motion"),
     "torque_absurd": Rule(_QUICK, "the arm is overloaded, or program or model are wrong"),
     "driver": Rule(_QUICK, "the bus or its adapter failed"),
     "program": Rule(_QUICK, "the program failed or was interrupted"),

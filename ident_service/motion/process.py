@@ -36,7 +36,7 @@ from ident_service.motion.fault_store import CONTROLS, FaultStore
 from ident_service.motion.faults import ActiveFaults, Severity
 from ident_service.motion.last_position import PositionFile
 from ident_service.motion.realtime import ask
-from ident_service.motion.run import RunReport, follow
+from ident_service.motion.run import WAITS_FOR, RunReport, follow
 from ident_service.motion.run_plan import Destination, ExcitationPlan, Plan, PointToPointPlan
 from ident_service.motion.state_machine import State
 from ident_service.motion.ticket import subject_of, ticket_from_json
@@ -80,6 +80,8 @@ class TimedSink:
             send_line({"state": message})
         elif message in (WAITS, LOWERS):
             send_line({"held": message})
+        elif message.startswith(WAITS_FOR):
+            send_line({"state": message})
         return self._sink.event(stamp_ns, level, message)
 
 

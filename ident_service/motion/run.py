@@ -28,7 +28,7 @@ from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import Contact
 from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.pinocchio_models import InverseDynamics
-from ident_service.motion.after_stop import after_stop
+from ident_service.motion.after_stop import ONLY_BRAKED, AfterStop, after_stop
 from ident_service.motion.clearance import ClearanceChecker
 from ident_service.motion.command_channel import Controls, StopCondition
 from ident_service.motion.control_loop import REST_CYCLES, REST_SPEED, Loop, Peaks
@@ -39,7 +39,7 @@ from ident_service.motion.encoder_observer import frozen_encoder_observer
 from ident_service.motion.faults import FAULTS, HOLD, ActiveFaults
 from ident_service.motion.lowering import lowest_point
 from ident_service.motion.run_plan import ExcitationPlan, Plan
-from ident_service.motion.safety_monitor import SafetyMonitor
+from ident_service.motion.safety_monitor import NOT_APPLIED, SafetyMonitor
 from ident_service.motion.sequencer import TrajectorySequencer
 from ident_service.motion.speed_scaling import require_factor, slowed_limits
 from ident_service.motion.state_machine import TRANSITIONS, State, StateMachine
@@ -129,6 +129,9 @@ def unhurried() -> Iterator[None]:
             os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
+WAITS_FOR: Final = "waiting for a person:"  # begins the line of the story that names what is waited for
+MOVED: Final = 0.01  # rad or m that an arm may have been moved by while a person is waited for
+_ENABLINGS: Final = 3  # times that a person is asked again because the arm was moved meanwhile
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 
 
@@ -238,16 +241,19 @@ class _Run:
         if self.latch.faults:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
             raise MotionRefused(f"unacknowledged faults: {waiting}")
-        loop, torque = self._prepared()
-        if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
-            raise MotionRefused("a stop was requested before the arm was energised; nothing has moved")
-        if not self.controls.lease_ok(self.arm.clock.now_ns()):
-            raise MotionRefused(
-                "the program that started the motion has ended or does not renew its lease; nothing has moved"
-            )
+        for _ in range(_ENABLINGS):
+            loop, torque = self._prepared()
+            if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
+                raise MotionRefused("a stop was requested before the arm was energised; nothing has moved")
+            if not self.controls.lease_ok(self.arm.clock.now_ns()):
+                raise MotionRefused(
+                    "the program that started the motion has ended or does not renew its lease; nothing has moved"
+                )
+            if self._enabled_where_planned(loop, torque):
+                break
+        else:
+            raise MotionRefused("the arm was moved each time while a person enabled it; it is without torque")
         try:
-            self.states.enter(State.CHECKED)
-            self.arm.enable()
             self.states.enter(State.ARMED)
             self.states.enter(loop.course.first)
             loop.run(torque)
@@ -276,14 +282,49 @@ class _Run:
             loop.deadlines.lost,
         )
 
+    def _enabled_where_planned(self, loop: Loop, torque: Vector) -> bool:
+        """Enable the arm; return whether it still stands where was planned from.
+
+        Only where a person enables it can it have been moved meanwhile; then it is without torque again.
+        """
+        try:
+            self.states.enter(State.CHECKED)
+            action = self.arm.operator_action
+            if action:
+                loop.tell(_INFO, self._stamp_ns, f"{WAITS_FOR} {action}")
+                self.arm.still_wanted = self._still_wanted
+            try:
+                self.arm.enable()
+            except DriverError:
+                if not action or self._still_wanted():
+                    raise
+                self.arm.stop(StopKind.QUICK_STOP)  # who looks next finds the stop, and refuses
+                return False
+            if not action or self.controls.stop:
+                return True
+            moved = np.abs(self.arm.exchange(torque).position - self._home)
+            if bool((moved <= MOVED).all()):
+                return True
+            self.arm.stop(StopKind.QUICK_STOP)
+            loop.tell(_INFO, self._stamp_ns, "the arm was moved while a person was waited for; planned again")
+        except BaseException as error:
+            self._halt(error, loop)
+            raise
+        return False
+
+    def _still_wanted(self) -> bool:
+        return not self.controls.stop and self.controls.lease_ok(self.arm.clock.now_ns())
+
     def _prepared(self) -> tuple[Loop, Vector]:
-        """Check and assemble the loop; returns it with the torque that holds the arm where it stands."""
+        """Check and assemble the loop; returns it with the target that holds the arm where it stands."""
         model, chain, arm = self.model, self.model.chain, self.arm
         limits, prior = motion_limits(model.config), control_model(model).prior
         if prior is None:
             raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         self.after_stop = after_stop(model, limits)
         described = arm.describe()
+        if described.streams_position and self.after_stop is not AfterStop.BRAKE:
+            raise MotionRefused(f"{model.config.name}: {ONLY_BRAKED}")
         if described.joint_names != chain.names:
             raise MotionRefused(
                 f"the drives have the joints {', '.join(described.joint_names)}, "
@@ -304,7 +345,7 @@ class _Run:
         self, dynamics: InverseDynamics, sample: Sample, limits: MotionLimits, described: ArmDescription
     ) -> tuple[Loop, Vector]:
         model, chain, period = self.model, self.model.chain, 1.0 / described.rate
-        home = sample.position.copy()
+        home = self._home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
         owed = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
@@ -318,10 +359,17 @@ class _Run:
             contact=contact,
             owed=owed,
             max_age=described.lost_cycles,
+            most_torque=(1.0 + NOT_APPLIED) * limits.torque if described.streams_position else None,
         )
         friction = friction_feedforward(model, limits)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home, friction)
-        torque, cannot_hold = guard.torque(control.torque(home, sample.valid, rest(home)))
+        holding = control.torque(home, sample.valid, rest(home))
+        if described.streams_position:
+            # A guard of its own: what drives are given is not compared with this torque.
+            _, cannot_hold = SafetyMonitor(chain.names, limits, period, home).torque(holding)
+            target = home
+        else:
+            target, cannot_hold = guard.torque(holding)
         if cannot_hold is not None:
             raise MotionRefused(f"the arm cannot be held where it stands: {cannot_hold.message}")
         self.states = StateMachine(self.latch, self._entered)
@@ -353,8 +401,9 @@ class _Run:
             Peaks(np.zeros_like(home), np.zeros_like(home)),
             self.after_stop,
             self._at_floor(),
+            described.streams_position,
         )
-        return loop, torque
+        return loop, target
 
     def _at_floor(self) -> Callable[[Vector], bool]:
         """Create the function that returns whether the arm's lowest point is at the floor of its description."""

@@ -52,6 +52,11 @@ FROZEN_CYCLES, FROZEN_EFFORT = 20, 0.2
 # Likewise one that moved at more than `SUDDEN_SPEED` of its velocity limit and then stands still to the last bit for
 # `SUDDEN_CYCLES`: only a hard stop does that. Behind light joints the push above may never come.
 SUDDEN_CYCLES, SUDDEN_SPEED = 10, 0.1
+# A position loop in the drive pushes far harder for the same distance: there these are times, of 1 kHz.
+_FROZEN_SECONDS, _SUDDEN_SECONDS, _LEAST_UNCHANGED = 0.020, 0.010, 3  # s; cycles
+# It also pushes at its limit long before the following error is large. Beside the model's torque no joint needs as much
+# as this share of its limit for longer than that: preflight allows the model a tenth, and friction.
+PUSHES = 0.4
 FOLLOWING_LOST = 2.0  # times the following error allowed
 # Towards a position limit no motion within the acceleration limit a is faster than sqrt(2 a d) at a distance d from it
 # (FIELDBUS.md). The arm may brake `ENVELOPE` times as hard, and be `ENVELOPE_SLACK` of its velocity limit faster.
@@ -59,6 +64,7 @@ ENVELOPE, ENVELOPE_SLACK = 1.5, 0.2
 # Share of the torque limit by which the acting torque may differ from the one asked for, and the measured one from
 # both. A healthy drive is within its current loop's offset and noise, some hundredths of its largest torque.
 NOT_APPLIED = 0.1
+_ROUNDING = 1e-9  # rad or m, of a position on a limit
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,7 @@ class MonitoredSample:
         max_age: cycles without an axis' feedback before it counts as gone.
         depths: how deep pairs of solids reach into each other [m].
         pairs: names for them.
+        most_torque: that drives which are given positions may measure [N m or N], shape (joints,); else None.
     """
 
     sample: Sample
@@ -115,6 +122,7 @@ class MonitoredSample:
     max_age: int
     depths: Vector
     pairs: tuple[str, ...]
+    most_torque: Vector | None = None
 
 
 def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
@@ -176,6 +184,10 @@ def _what_can_be_bridged(seen: MonitoredSample, limits: MotionLimits) -> Iterato
     jumped_to = seen.sample.position
     yield Check("encoder_jump", seen.jumped, "position jumped to {} {u} from {} {u}", (jumped_to, seen.position))
     yield Check("lost_feedback", ~seen.usable, "no feedback in this cycle")
+    if seen.most_torque is not None:
+        exceeds = np.abs(seen.sample.torque) > seen.most_torque
+        what = "the drive measures {} {f}, {} allowed"
+        yield Check("torque_exceeded", exceeds, what, (seen.sample.torque, seen.most_torque))
     if seen.sent is not None:
         differs = np.abs(seen.sample.torque - seen.sent) > NOT_APPLIED * limits.torque
         what = "the drive gives {} of the {} {f} commanded"
@@ -251,6 +263,7 @@ class SafetyMonitor:
         contact: Contact | None = None,
         owed: FrozenEncoderObserver | None = None,
         max_age: int = MAX_AGE,
+        most_torque: Vector | None = None,
     ) -> None:
         """Start with the arm standing at a position.
 
@@ -264,6 +277,8 @@ class SafetyMonitor:
             owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full
                 motion reveal frozen encoders.
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
+            most_torque: for drives that are given positions: the torque above which what they measure is a warning
+                [N m or N], shape (joints,); None for drives that are given torques.
         """
         joints = len(position)
         self.findings = FaultCounter()
@@ -284,6 +299,14 @@ class SafetyMonitor:
         self._all_fresh = self._none_still = self._all_change = True
         self._depths = np.zeros(len(self._pairs))
         self._sent: Vector | None = None
+        self._most_torque = most_torque
+        self._pushing: Counts = np.zeros(joints, dtype=np.int64)
+        self._frozen_after = FROZEN_CYCLES, SUDDEN_CYCLES
+        if most_torque is not None:
+            seconds = _FROZEN_SECONDS, _SUDDEN_SECONDS
+            frozen, sudden = (max(_LEAST_UNCHANGED, round(one / period)) for one in seconds)
+            self._frozen_after = frozen, sudden
+        self._target = position.copy()
         self._healthy: tuple[int, ...] = ()
         self._was_powered = np.zeros(joints, dtype=bool)
         self._jump = JUMP * limits.velocity * period
@@ -314,6 +337,7 @@ class SafetyMonitor:
         feedforward: Vector | float = 0.0,
         *,
         known: bool = True,
+        unexplained: Vector | float = 0.0,
     ) -> tuple[Flags, Fault | None]:
         """Check a sample against all thresholds; returns the usable positions and the most severe fault.
 
@@ -327,6 +351,8 @@ class SafetyMonitor:
             known: whether `elapsed` is the true time; if not, it is the longest that it may be.
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
                 against its own friction as the correction does.
+            unexplained: torque that drives which are given positions measure beside the model's [N m or N], shape
+                (joints,), by which they push a joint on their own.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
@@ -334,7 +360,7 @@ class SafetyMonitor:
         self.findings.cycle += 1
         self._elapsed, self._known = self._period if elapsed is None else elapsed, known
         answered = bool(sample.valid.all())
-        self._count_still(sample, correction + feedforward)
+        self._count_still(sample, np.maximum(np.abs(correction + feedforward), np.abs(unexplained)))
         self._count_unchanged(sample, velocity)
         if self._owed is not None and answer is not None:
             up, down = sample.position > self._shown, sample.position < self._shown
@@ -348,6 +374,9 @@ class SafetyMonitor:
         else:
             with np.errstate(all="ignore"):
                 usable, fault = self._judged(sample, reference.position, velocity)
+        if self._most_torque is not None:
+            pushes = self._count_pushes(unexplained)
+            fault = pushes if pushes is not None and (fault is None or fault.reaction < pushes.reaction) else fault
         if sample.events:
             event = fault_from_events(sample.events, self._names, self.findings)
             # Of equally severe faults, a drive's event tells more than its status word.
@@ -400,6 +429,34 @@ class SafetyMonitor:
         self._sent = leaves
         return leaves, fault
 
+    def position(self, wanted: Vector) -> tuple[Vector, Fault | None]:
+        """Check and limit the position that drives are given; the first is a step from where the arm stands.
+
+        Args:
+            wanted: by the trajectory [rad or m], shape (joints,).
+
+        Returns:
+            The position that may leave: no farther from the last one than the joints move in a cycle at `VELOCITY_STOP`
+            times their velocity limit; the last one when the fault ends motion.
+        """
+        finite = np.isfinite(wanted)
+        if not finite.all():
+            return self._target, self._found(
+                Check("position_not_finite", ~finite, "the position asked for is no number")
+            )
+        beyond, limit = _beyond(wanted, self._limits)
+        if (outside := beyond > _ROUNDING).any():
+            what = "a position of {} {u} was asked for, the limit is {} {u}"
+            return self._target, self._found(Check("position_outside", outside, what, (wanted, limit)))
+        step, most = wanted - self._target, VELOCITY_STOP * self._limits.velocity * self._period
+        fast, fault = np.abs(step) > most, None
+        if fast.any():
+            what = "the position was to change by {} {u} in a cycle, {} {u} allowed"
+            fault = self._found(Check("position_rate", fast, what, (step, most)))
+            wanted = self._target + np.clip(step, -most, most)
+        self._target = wanted
+        return wanted, fault
+
     def _slowed(self, before: Vector, wanted: Vector) -> Vector:
         """Return the torque on the way from the last one to the one wanted that the rate allows."""
         if self._limits.motors is None:
@@ -445,6 +502,8 @@ class SafetyMonitor:
         if sample.status is not self._healthy and not self._all_well(sample.status):
             return False
         if self._sent is not None and not bool((np.abs(sample.torque - self._sent) <= self._not_applied).all()):
+            return False
+        if self._most_torque is not None and not bool((np.abs(sample.torque) <= self._most_torque).all()):
             return False
         if sample.torque_difference is not None and not bool(
             (np.abs(sample.torque_difference) <= self._not_applied).all()
@@ -498,15 +557,27 @@ class SafetyMonitor:
             self._max_age,
             self._depths,
             self._pairs,
+            self._most_torque,
         )
         for check in checks(seen, self._limits):
             if check.hit.any():
                 return usable, self._found(check)
         return usable, None
 
-    def _count_still(self, sample: Sample, correction: Vector) -> None:
-        """Count for how many cycles each position has stood still while the controller pushed."""
-        pushed = np.abs(correction) > self._push
+    def _count_pushes(self, unexplained: Vector | float) -> Fault | None:
+        """Count for how many cycles each drive has pushed beside the model's torque; returns a fault after too many."""
+        hit = np.abs(unexplained) > PUSHES * self._limits.torque
+        self._pushing = np.where(hit, self._pushing + 1, 0)
+        if not (long := self._pushing >= self._frozen_after[0]).any():
+            return None
+        numbers = (np.broadcast_to(unexplained, long.shape), self._limits.torque)
+        return self._found(
+            Check("torque_unexplained", long, "the drive measures {} {f} beside the model's, of {}", numbers)
+        )
+
+    def _count_still(self, sample: Sample, pushes: Vector) -> None:
+        """Count for how many cycles each position has stood still while the controller, or the drive, pushed."""
+        pushed = pushes > self._push
         if pushed.any():
             changed = sample.valid & (sample.position != self._shown)
             self._still = np.where(pushed & ~changed, self._still + 1, 0)
@@ -530,7 +601,8 @@ class SafetyMonitor:
 
     def _frozen(self) -> Flags:
         """Return which encoders stand still although the joint cannot."""
-        return (self._still >= FROZEN_CYCLES) | (self._sudden & (self._unchanged >= SUDDEN_CYCLES)) | self._owes
+        frozen, sudden = self._frozen_after
+        return (self._still >= frozen) | (self._sudden & (self._unchanged >= sudden)) | self._owes
 
     def _found(self, check: Check) -> Fault:
         return self.findings.found(check.code, describe_check(check, self._names, self._units))

@@ -14,6 +14,7 @@ meanwhile.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import json
@@ -25,8 +26,8 @@ import stat
 import tarfile
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
@@ -34,10 +35,10 @@ from typing import Any, BinaryIO, Final
 from urllib.parse import quote
 
 from ident_service import __version__
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import DiskFull, MotionRefused, UsageError
 from ident_service.motion.fault_store import CONTROLS
 from ident_service.operations.moving_arms import moving_arms
-from ident_service.registry.database import FILE, Database, note
+from ident_service.registry.database import FILE, Database, note, registry_error, shortage
 from ident_service.registry.state_folder import LOCK, RESTORING, URL_FILE, require_whole, single_instance
 from ident_service.registry.tokens import TOKEN_FILE, revoke_first_tokens
 
@@ -84,6 +85,8 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
     Raises:
         UsageError: there is no registry or it is damaged, the file exists, or lies in the state folder, or cannot be
             written.
+        DiskFull: the disk of `file` has no room.
+        RegistryBusy: another process keeps the registry.
     """
     require_whole(state)
     if not (state / FILE).is_file():
@@ -109,12 +112,22 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
                 os.fsync(stream.fileno())
         partial.replace(file)
     except sqlite3.Error as error:
-        raise UsageError(f"{state / FILE}: cannot be copied: {error}") from None
+        if isinstance(
+            shortage(file, error), DiskFull
+        ):  # the copy is beside the file; nothing is written to the registry
+            raise _full(file) from None
+        raise registry_error(state / FILE, error) from None
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise _full(file) from None
         raise UsageError(f"{file}: cannot be written: {error.strerror or error}") from None
     finally:
         partial.unlink(missing_ok=True)
     return Backup(str(file), len(hashes), size, created, recordings)
+
+
+def _full(file: Path) -> DiskFull:
+    return DiskFull(f"{file}: cannot be written: its disk is full; make room there, or give another place")
 
 
 def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Backup:
@@ -132,7 +145,8 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
     """
     if not file.is_file():
         raise UsageError(f"{file}: no such file")
-    with single_instance(state):
+    missing = [path for path in (state / LOCK, state, *state.parents) if not path.exists()]
+    with single_instance(state), _removed_on_failure(missing):
         if moving := moving_arms(state):
             raise MotionRefused(f"{', '.join(moving)}: is being moved; stop it first")
         broken_off = (state / RESTORING).exists()
@@ -152,6 +166,18 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
         finally:
             shutil.rmtree(staging, ignore_errors=True)
     return Backup(str(file), files, size, head["created"], head["recordings"], replaced)
+
+
+@contextmanager
+def _removed_on_failure(paths: Sequence[Path]) -> Iterator[None]:
+    """Remove a file and the folders that it was in where the block fails; those with anything else in them stay."""
+    try:
+        yield
+    except BaseException:
+        for path in paths:
+            with suppress(OSError):
+                path.rmdir() if path.is_dir() else path.unlink()
+        raise
 
 
 def _copy_registry(registry: Path, snapshot: Path, *, recordings: bool) -> None:

@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.canopen.bus_load import Budget
+from drivers.can.bus_load import Budget
 from ident_service.config.load import config_error, load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ModelError, MotionRefused, ParameterError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
-from ident_service.motion.after_stop import AfterStop, after_stop
+from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
 from ident_service.operations.fieldbus import bus_lines, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
@@ -27,9 +27,10 @@ class CheckedDescription:
 
     Attributes:
         model: of its arm.
-        budget: of its buses; None for an arm without CANopen drives.
+        budget: of its buses; None for an arm without drives on CAN.
         gains: how stable they are; None for an arm that can be identified but not moved.
         after_stop: what follows a stop, or why nothing may move; None likewise.
+        falling: joints that gravity moves when their drives are off.
         warnings: what is allowed but probably a mistake, in words.
     """
 
@@ -38,6 +39,13 @@ class CheckedDescription:
     gains: StabilityReport | None
     after_stop: AfterStop | str | None
     warnings: tuple[str, ...] = ()
+    falling: tuple[str, ...] = ()
+
+    @property
+    def assumed_brakes(self) -> tuple[str, ...]:
+        """Return the joints that would fall but for a brake that only a simulated drive is taken to have."""
+        joints = self.model.config.joints
+        return tuple(name for name in self.falling if name not in joints or joints[name].brake is None)
 
     @property
     def good(self) -> bool:
@@ -73,7 +81,9 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         follows: AfterStop | str | None = None if model.prior is None else after_stop(model, limits)
     except MotionRefused as refusal:
         follows = str(refusal)
-    return CheckedDescription(model, budget, stability(model, limits, delay_of(model.config)), follows, warnings)
+    falling = () if model.prior is None else falling_joints(model, limits)
+    gains = stability(model, limits, delay_of(model.config))
+    return CheckedDescription(model, budget, gains, follows, warnings, falling)
 
 
 def _place(message: str) -> tuple[str, ...]:
@@ -114,6 +124,8 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
         "stability": None if report is None or gains is None else asdict(report) | gains,
         "after_stop": checked.after_stop.value if isinstance(checked.after_stop, AfterStop) else None,
         "objection": checked.after_stop if isinstance(checked.after_stop, str) else None,
+        "falling": list(checked.falling),
+        "assumed_brakes": list(checked.assumed_brakes) if checked.after_stop is AfterStop.BRAKE else [],
     }
 
 
@@ -128,13 +140,20 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
     head += "" if checked.budget is None else bus_lines(checked.budget)
     if checked.gains is None:
         return head + "gains: not checked; limits or gains are missing, so this arm can be identified but not moved\n"
-    return head + _after_stop_text(checked.after_stop) + _gains_text(checked.gains)
+    return head + _after_stop_text(checked) + _gains_text(checked.gains)
 
 
-def _after_stop_text(follows: AfterStop | str | None) -> str:
-    """Format what follows a stop as one line; empty for an arm without a model."""
+def _after_stop_text(checked: CheckedDescription) -> str:
+    """Format what follows a stop; empty for an arm without a model."""
+    follows, assumed = checked.after_stop, checked.assumed_brakes
+    held = f"its brakes hold {', '.join(checked.falling)}" if checked.falling else "gravity moves no joint"
+    if assumed:
+        held += (
+            f"\n  ASSUMED: brakes of {', '.join(assumed)}, because the drives are simulated; for real ones, each joint"
+            " that has one needs `brake: true`, or control.after_stop is hold or lower"
+        )
     words = {
-        AfterStop.BRAKE: "held for two seconds, then released to its brakes; nothing can fall",
+        AfterStop.BRAKE: f"held for two seconds, then released to its brakes; {held}",
         AfterStop.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
         AfterStop.LOWER: "lowered until it rests",
     }

@@ -6,27 +6,41 @@ are derived from the data sheet.
 
 from __future__ import annotations
 
+import json
+import platform
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
+from zipfile import ZIP_DEFLATED, ZipFile
 
+from drivers.can.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line
 from drivers.can.bus_state import BusError
 from drivers.can.can_link import Link, open_links
-from drivers.canopen.bus_load import MOST_TYPICAL, MOST_WORST, Budget, BusLoad, Cost, Line, budget
+from drivers.can.frame_log import SessionLog, logged_links
+from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
-from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, named, where
+from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, entry_of, named, where
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
 from drivers.canopen.drive_setup import IDENTITY, differences
 from drivers.canopen.pdo_mapping import bus_profiles
 from drivers.canopen.sdo import Objects
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDrive, CanopenDriver
+from ident_service.config.can_bus import CanBus
+from ident_service.config.canopen import CanopenDrive, CanopenDriver
 from ident_service.config.eds import data_sheet
 from ident_service.config.load import config_error
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
+from ident_service.motion.arm_factory import make_arm
+from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
+from ident_service.recordings.files import write_atomically
 
 _HEAD = f"  {'frames':<28}{'COB-IDs':<12}{'bytes':>6}{'Hz':>7}{'one of them, us':>24}{'load of all, %':>24}"
 _UNDER = f"  {'':<53}{'least':>8}{'typical':>8}{'worst':>8}{'least':>8}{'typical':>8}{'worst':>8}"
@@ -42,14 +56,15 @@ def bus_load(config: ArmConfig, rate: float | None = None) -> Budget:
     Raises:
         UsageError: the arm's driver has no bus that frames could be counted on.
     """
-    if not isinstance(config.driver, CanopenDriver):
+    found = make_arm(config).bus_budget(rate) if config.can_buses else None
+    if found is None:
         kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
-        raise UsageError(f"{config.name} has {kind}; a bus load is that of CANopen drives (driver.kind: canopen)")
-    return budget(config.driver, config.control.rate if rate is None else rate)
+        raise UsageError(f"{config.name} has {kind}; a bus load is that of drives on CAN (canopen, barrett)")
+    return found
 
 
 def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
-    """Return the bus budget of an arm with CANopen drives, which must fit; None for other arms.
+    """Return the bus budget of an arm with drives on CAN, which must fit; None for other arms.
 
     Args:
         arm: its file, or its name if it is shipped.
@@ -58,7 +73,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
     Raises:
         ConfigError: over budget; the mistake has the place of the driver, and the remedies.
     """
-    if not isinstance(config.driver, CanopenDriver):
+    if not config.can_buses:
         return None
     found = bus_load(config)
     if not found.fits:
@@ -69,7 +84,7 @@ def require_budget(arm: str | Path, config: ArmConfig) -> Budget | None:
 def bus_lines(found: Budget) -> str:
     """Format the verdict as one line per bus."""
     return "".join(
-        f"bus {bus.profile.number} ({bus.profile.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
+        f"bus {bus.number} ({bus.bus.channel}): {100 * bus.load.worst:.1f} % worst,"
         f" {100 * bus.load.typical:.1f} % typical at {found.rate:g} Hz; up to {bus.highest_rate} Hz\n"
         for bus in found.buses
     )
@@ -100,7 +115,7 @@ def bus_document(name: str, found: Budget) -> dict[str, Any]:
 
 def _bus_lines(bus: BusLoad) -> list[str]:
     cycle, load = bus.cycle, bus.load
-    lines = [f"bus {bus.profile.number}: {_described(bus.profile.bus)}", _HEAD, _UNDER]
+    lines = [f"bus {bus.number}: {_described(bus.bus)}", _HEAD, _UNDER]
     lines += [_row(line.name, _ids(line), f"{line.length}", f"{line.per_second:.4g}", line) for line in bus.lines]
     return [
         *lines,
@@ -131,13 +146,12 @@ def _ids(line: Line) -> str:
 
 
 def _bus_document(bus: BusLoad) -> dict[str, Any]:
-    profile = bus.profile
     return {
-        "number": profile.number,
-        "interface": profile.bus.interface,
-        "channel": profile.bus.channel,
-        "bitrate": profile.bus.bitrate,
-        "data_bitrate": profile.bus.data_bitrate,
+        "number": bus.number,
+        "interface": bus.bus.interface,
+        "channel": bus.bus.channel,
+        "bitrate": bus.bus.bitrate,
+        "data_bitrate": bus.bus.data_bitrate,
         "fits": bus.fits,
         "highest_rate": bus.highest_rate,
         "cycle_us": _values(bus.cycle, 1e6),
@@ -509,6 +523,9 @@ def _facts(one: Probed, found: Probe) -> dict[str, str]:
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"
     facts["torque_frames"] = f"{shares}, as far as its file and family know"
     facts["status_reports"] = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    if (brake := can.family.brake) is not None:
+        held = can.found.get(entry_of(brake, ""))
+        facts["brake"] = f"{named(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
     facts["proved"] = "on hardware" if can.family.proved else "not on hardware"
     return facts
 
@@ -536,6 +553,7 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
             "family": can.family.name,
             "proved": can.family.proved,
             "asked": can.found.asked,
+            "firmware": can.found.firmware,
             "identity": {name: can.found.get(entry) for name, entry in IDENTITY.items()},
             "mode": None if can.torque is None else can.torque.mode,
             "target": None if can.torque is None else can.torque.target,
@@ -552,3 +570,192 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
         },
         "facts": _facts(one, found),
     }
+
+
+FILE = "drives.json"  # in an arm's folder
+_KEPT_FORMAT = "ident-drives"
+
+
+def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
+    """Keep what a probe found of an arm's drives, and return what differs from the probe before, in words.
+
+    Args:
+        path: of the file, one for each arm.
+        document: `probe_document` of drives that were asked; those that did not answer keep what was known of them.
+
+    Raises:
+        UsageError: the file was damaged by somebody.
+    """
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        known = dict(before["drives"]) if before["format"] == _KEPT_FORMAT else {}
+    except FileNotFoundError:
+        known = {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UsageError(f"{path}: cannot be read ({error}); remove the file, and probe again") from None
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    words = list[str]()
+    for one in document["drives"]:
+        if one["silent"] or one["can"] is None:
+            continue
+        old, place = known.get(one["title"]), f"{one['title']}, node {one['node']}"
+        if old is not None:
+            words += [f"{place}: {what} (probe of {old['when']})" for what in _different(old["can"], one["can"])]
+        known[one["title"]] = {"when": now, "node": one["node"], "can": one["can"]}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, json.dumps({"format": _KEPT_FORMAT, "version": 1, "drives": known}, indent=1) + "\n")
+    return words
+
+
+# The rest of a probe is what the description makes of it.
+_OF_THE_DRIVE = (
+    "family",
+    "firmware",
+    "mode",
+    "target",
+    "count",
+    "torque_limit",
+    "speed_limit",
+    "watchdogs",
+    "status_timer",
+)
+
+
+# The rest of a probe is what the description makes of it.
+_OF_THE_DRIVE = (
+    *("family", "firmware", "mode", "target", "count"),
+    *("torque_limit", "speed_limit", "watchdogs", "status_timer"),
+)
+
+
+def _different(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
+    if old["identity"] != new["identity"]:
+        return ["another drive than at the last probe"]
+    return [f"{key} was {old.get(key)!r}, is {new.get(key)!r}" for key in _OF_THE_DRIVE if old.get(key) != new.get(key)]
+
+
+_PACKAGES = ("ident-service", "python-can", "canopen", "numpy")
+_OF_A_DRIVE = (
+    "node",
+    "bus",
+    "identity",
+    "counts",
+    "rated_torque",
+    "torque_scale",
+    "max_torque",
+    "max_speed",
+    "watchdog",
+)
+
+
+def bus_report(
+    config: ArmConfig,
+    path: Path,
+    ticket: Path | None = None,
+    frames: Path | None = None,
+    open_bus: Callable[[ArmConfig], list[Link]] = open_links,
+) -> list[str]:
+    """Write a ZIP file with what helps others to see why drives do not work: no secret, no name of a person or machine.
+
+    Drives are only read. Where they cannot be, the report says why.
+
+    Args:
+        config: of the arm.
+        path: of the file, which must not exist.
+        ticket: of the last preflight, left out where the file does not exist.
+        frames: a log of frames of a run, likewise.
+        open_bus: gives the links, in the order of the buses.
+
+    Returns:
+        The names of the files in it.
+
+    Raises:
+        UsageError: no CANopen drives, the file exists, or it cannot be written.
+    """
+    driver = config.driver
+    if not isinstance(driver, CanopenDriver):
+        raise UsageError(f"{config.name}: a report is of CANopen drives (driver.kind: canopen)")
+    if path.exists():
+        raise UsageError(f"{path} exists; give another name")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    found: dict[str, str] = {
+        "versions.json": _as_json(_versions()),
+        "description.json": _as_json(_description(config, driver)),
+    }
+    with TemporaryDirectory(prefix="ident-") as folder:
+        for name, text, document in _read(config, driver, Path(folder) / "probe.log", open_bus):
+            found[f"{name}.txt"] = text
+            if document is not None:
+                found[f"{name}.json"] = _as_json(document)
+        for name, file in (("probe.log", Path(folder) / "probe.log"), ("ticket.json", ticket), ("can.log", frames)):
+            if file is not None and file.is_file():
+                found[name] = file.read_text(encoding="utf-8", errors="replace")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with ZipFile(part, "x", ZIP_DEFLATED) as archive:
+            for name, text in found.items():
+                archive.writestr(name, text)
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
+    return sorted(found)
+
+
+def _read(
+    config: ArmConfig, driver: CanopenDriver, log: Path, open_bus: Callable[[ArmConfig], list[Link]]
+) -> Iterator[tuple[str, str, dict[str, Any] | None]]:
+    """Yield what the drives tell, by name, as text and document; the frames of the first reading are logged."""
+    logs: list[SessionLog] = []
+
+    def logged(config: ArmConfig) -> list[Link]:
+        one, links = logged_links(open_bus(config), log, [bus.data_bitrate is not None for bus in driver.buses])
+        logs.append(one)
+        return links
+
+    try:
+        probe = bus_probe(config, (), logged)
+        yield "probe", probe_text(config, probe), probe_document(config, probe)
+    except DriverError as error:
+        yield "probe", f"no probe: {error}\n", None
+    finally:
+        for one in logs:
+            one.close()
+    try:
+        planned = planned_configuration(config, open_bus)
+        yield "configuration", planned_text(config, planned), planned_document(config, planned)
+    except DriverError as error:
+        yield "configuration", f"nothing was read: {error}\n", None
+
+
+def _versions() -> dict[str, str]:
+    known = {}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):
+            known[name] = version(name)
+    return known | {"python": platform.python_version(), "kernel": platform.release(), "machine": platform.machine()}
+
+
+def _description(config: ArmConfig, driver: CanopenDriver) -> dict[str, Any]:
+    """Return what matters of a description: no options of interfaces, which may hold a password, and no path."""
+    drives = [drive.model_dump(mode="json", include=set(_OF_A_DRIVE)) for drive in driver.drives]
+    sheets = [driver.sheet_file(number) for number in range(len(drives))]
+    return {
+        "rate": config.control.rate,
+        "streams": driver.streams,
+        "torque_frames": driver.torque_frames,
+        "measured_torque": driver.torque_reports,
+        "buses": [{"interface": bus.interface, "bitrate": bus.bitrate, "fd": bus.data_bitrate} for bus in driver.buses],
+        "drives": [
+            drive | {"eds": {"name": Path(sheet.name).name, "sha256": sha256(sheet.text.encode()).hexdigest()}}
+            for drive, sheet in zip(drives, sheets, strict=True)
+        ],
+        "profiles": {Path(one.name).name: one.text for one in driver.profiles},
+    }
+
+
+def _as_json(document: dict[str, Any]) -> str:
+    return json.dumps(document, indent=1) + "\n"

@@ -120,10 +120,16 @@ def identify_files(
     """
     require_replaceable(folder)
     described = load_arm(request.arm)
-    model = arm_model(_config(described, request))
+    config, paths = _config(described, request), [*request.recordings, *request.validation]
+    model = arm_model(config)
     custom = custom_of(request.arm, described)
-    forms = own_formats(request.columns_of, [*request.recordings, *request.validation], model)
-    opened = open_together([*request.recordings, *request.validation], model, forms)
+    forms = own_formats(request.columns_of, paths, model)
+    if any(form.trim != config.recording.trim for form in forms.values()):
+        # Each is then trimmed when it is opened, and no more afterwards, where all are trimmed alike.
+        forms = dict.fromkeys(paths, config.recording) | forms
+        untrimmed = config.recording.model_copy(update={"trim": (0.0, 0.0)})
+        model = arm_model(config.model_copy(update={"recording": untrimmed}))
+    opened = open_together(paths, model, forms)
     recordings = opened.recordings[: len(request.recordings)]
     validation = opened.recordings[len(request.recordings) :]
     for recording in (*recordings, *validation):

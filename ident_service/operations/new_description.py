@@ -30,7 +30,7 @@ from ident_service.model.base_parameters import base_parameters, remarks_on_angl
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
 from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_urdf_bodies
-from ident_service.model.mechanism import count_mechanism, read_mechanism
+from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
 from ident_service.model.outline import mesh_capsules
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
@@ -204,10 +204,7 @@ kinematics: {_flow(draft.part)}
 gravity: [0, 0, -9.81] # m/s^2 in the base frame: the arm stands upright
 terms: [drive_inertia, viscous, coulomb, offset]
 """
-    units = (
-        "# rad, rad/s, rad/s^2, rad/s^3, N m; for slides m, m/s, m/s^2, m/s^3, N\n"
-        "# Accelerations, jerks, following errors, gains, home and the drives' inertias are guesses."
-    )
+    units = "# rad, rad/s, rad/s^2, rad/s^3, N m; for slides m, m/s, m/s^2, m/s^3, N"
     parts = [head]
     if draft.joints:
         rows = "".join(f"  {_flow(name)}:\n    {_flow(keys)}\n" for name, keys in draft.joints.items())
@@ -217,7 +214,11 @@ terms: [drive_inertia, viscous, coulomb, offset]
     if draft.total_mass:
         parts.append(f"constraints: {{total_mass: {{upper: {draft.total_mass:g}}}}} # kg, twice what its links have\n")
     cutoff = "" if draft.cutoff == 30.0 else f", velocity_cutoff: {draft.cutoff:g}"
-    parts.append(f"control: {{rate: {RATE:g}{cutoff}}} # Hz\n")
+    parts.append(
+        f"control: {{rate: {RATE:g}{cutoff}, after_stop: brake}} # Hz\n"
+        "# After a stop drives are switched off: simulated ones are taken to have brakes. Of a real arm say in\n"
+        "# the braces of each joint `brake: true` or `brake: false`; one without brakes has `after_stop: hold` above.\n"
+    )
     if draft.geometry:
         rows = "".join(f"  {_flow(name)}: {_flow(each)}\n" for name, each in draft.geometry.items())
         parts.append(f"geometry: # m, in the link frames; around the URDF's meshes\n{rows}")
@@ -323,6 +324,7 @@ def new_description(
         raise UsageError(f"{urdf}: cannot be read: {error}") from None
     file = TextFile(name=urdf.name, text=text)
     count_mechanism(file, "urdf")
+    require_urdf(file)
     draft = Draft(called, urdf.name, arm_part(text, file.name, base, tip))
     with tempfile.TemporaryDirectory() as staging:
         trial = Path(staging) / "arm.yaml"
@@ -343,12 +345,31 @@ def new_description(
         _gains(draft, loaded)
         _motions(draft, loaded)
         loaded()
-    draft.remarks.append("workspace: only the arm itself is avoided; add the obstacles around it")
+    draft.remarks += _always_guessed(draft)
     path.parent.mkdir(parents=True, exist_ok=True)
     if not beside.exists():
         write_atomically(beside, text)
     write_atomically(path, in_yaml(draft))
     return path, tuple(draft.remarks)
+
+
+def _always_guessed(draft: Draft) -> list[str]:
+    """Return remarks on what no URDF says."""
+    kp, kd = next(((joint["kp"], joint["kd"]) for joint in draft.joints.values()), _GAINS[0])
+    mass = f"constraints.total_mass: at most {draft.total_mass:g} kg, twice what the links have"
+    return [
+        "gravity: the base stands upright",
+        "terms: each joint has drive inertia, viscous and Coulomb friction, and an offset",
+        "joints: acceleration, jerk and following_error from the velocity and torque limits; drive_inertia from them, "
+        f"too; gains, kp {kp:g} and kd {kd:g}, for the simulated arm; home, where the arm is clear of itself",
+        *([mass] if draft.total_mass else []),
+        f"control: {RATE:g} Hz; after_stop: brakes hold the arm, because simulated drives are assumed to have brakes; "
+        "enter what the real ones have",
+        f"design.friction_guess: friction is {FRICTION_GUESS:.0%} of the torque limits",
+        f"motions: {draft.use:.0%} of the limits, {draft.frequency:g} Hz, about home",
+        "driver: a simulated arm; its links, drives and friction are drawn at random about the prior's",
+        f"workspace: clearance {CLEARANCE:g} m; only the arm itself is avoided; add the obstacles around it",
+    ]
 
 
 def _plain(name: str) -> str:

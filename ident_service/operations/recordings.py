@@ -16,7 +16,13 @@ from ident_service.errors import RecordingError, UsageError
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.state_machine import State
-from ident_service.recordings.adapters import MeasuredRecording, RangeRecording, first_stamp, without_standstill
+from ident_service.recordings.adapters import (
+    MeasuredRecording,
+    RangeRecording,
+    first_stamp,
+    without_ends,
+    without_standstill,
+)
 from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.files import split_range
 from ident_service.recordings.mcap_reader import McapRecording
@@ -28,7 +34,7 @@ from ident_service.recordings.recording import Recording
 # `_OF_ALL`: keys of a format about how all recordings become samples, not about the layout of one file.
 _STOPPING = 40  # level of events for a fault that stopped the arm (`motion/faults.py`)
 _ENDS = (State.STOPPED.value, State.FAULTED.value)
-_OF_ALL = ("trim", "gap", "stamps", "rate")
+_OF_ALL = ("gap", "stamps", "rate")
 
 
 def file_and_range(path: Path) -> tuple[Path, tuple[float, float] | None]:
@@ -120,7 +126,8 @@ def open_for_arm(
     Args:
         path: the file, or `FILE@START:END`.
         model: the arm.
-        form: how this file is laid out; as the arm's description says when None.
+        form: how this file is laid out, and what to trim; as the arm's description says when None. Its `trim` counts
+            where it is not the description's, which whatever reads the recording leaves out.
         torque: that is to be read, in place of the description's.
 
     Raises:
@@ -143,6 +150,8 @@ def open_for_arm(
         # Rows near the ends are not used anyway, for want of neighbours; standstill may remain there.
         edge = model.config.identification.edge
         recording = without_standstill(recording, EDGE / USUAL if edge == "choose" else edge)
+    if form.trim != model.config.recording.trim:
+        recording = without_ends(recording, form.trim)
     return recording
 
 
@@ -186,8 +195,8 @@ def own_formats(
             raise UsageError(f"{file}: {', '.join(shared)} is of all recordings; say it in the arm's description")
         general = model.config.recording
         form = form.model_copy(update={key: getattr(general, key) for key in _OF_ALL})
-        if "standstill" not in form.model_fields_set:
-            form = form.model_copy(update={"standstill": general.standstill})
+        of_arm = {key: getattr(general, key) for key in ("standstill", "trim") if key not in form.model_fields_set}
+        form = form.model_copy(update=of_arm)
         wrong = [message for _, message in disagreements(form, model.config.transmission, model.chain.names)]
         wrong += mismatched_units(form, model.chain.names, model.chain.revolute)
         if wrong:

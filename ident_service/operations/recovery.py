@@ -19,7 +19,6 @@ import numpy as np
 from drivers.arm import Arm, StopKind
 from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDriver
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import DriverError, MotionRefused, PositionUnknown, UsageError
 from ident_service.model.arm_model import arm_model
@@ -110,7 +109,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     tripped = {} if seen is None else _tripped(seen)
     out = [] if seen is None else position_limit_violations(seen.position, limits, seen.joint_names)
     support = _SUPPORT
-    if seen is not None and isinstance(config.driver, CanopenDriver) and any(w & AxisStatus.IDLE for w in seen.status):
+    if seen is not None and config.idle_drives_hold and any(w & AxisStatus.IDLE for w in seen.status):
         support = _HELD.format(called)
     before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits, support)
     usable = not before
@@ -252,7 +251,7 @@ def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
     Raises:
         UsageError: its description does not say `zero: at_home`, or has no home of every joint.
     """
-    if not isinstance(config.driver, CanopenDriver) or config.driver.zero != "at_home":
+    if not config.zeroed_at_home:
         raise UsageError(
             f"{config.name}: needs no home: only drives with `driver: {{zero: at_home}}`, whose encoders count "
             "from where they were when power came, need one"

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.arm import Arm, ArmDescription, Sample, Vector
+from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, Vector
 from drivers.axis_status import AxisStatus
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import AnotherDrive, ArmError, PositionUnknown
@@ -26,6 +26,8 @@ from ident_service.motion.ticket import (
     measures,
     skipped,
 )
+from ident_service.preflight.stability import delay_of
+from ident_service.preflight.static_checks import LONG_SILENCE_REMEDY, long_silence
 
 DRIFT = 0.05  # of the velocity limit, as at the beginning of a run
 LATE = 0.25  # of a period: a later cycle counts as late (FIELDBUS.md 5.2, after OWD)
@@ -101,6 +103,7 @@ def identities_check(
     limits: MotionLimits,
     expected: Sequence[str] | None,
     looked: IdleRecording,
+    setup: Sequence[SetupCheck] = (),
 ) -> Check:
     """Check that every axis answers, and is the drive that the description means.
 
@@ -110,6 +113,7 @@ def identities_check(
         limits: of the description; the driver must not clip below them, or what was proven of torques is not true.
         expected: identities from an earlier check, in the order of the axes; None accepts whatever answers.
         looked: at the arm.
+        setup: what the drives say of their set-up.
     """
     code, names = "identities", model.chain.names
     if described.joint_names != names:
@@ -130,6 +134,11 @@ def identities_check(
             "; ".join(changed) or "other drives than expected",
             "If a drive was exchanged on purpose, calibrate its zero and torque constant and accept the new identity.",
         )
+    if wrong := [one for one in setup if not one.good]:
+        remedies = dict.fromkeys(one.remedy for one in wrong if one.remedy)
+        return failed(code, "; ".join(map(str, wrong)), " ".join(remedies))
+    if too_long := long_silence(model, limits, described.watchdog):
+        return failed(code, too_long, LONG_SILENCE_REMEDY)
     last = looked.samples[-1]
     stopped = [
         f"{name}: {' and '.join(flag.name.lower().replace('_', ' ') for flag in flags if flag.name)}"
@@ -162,6 +171,9 @@ def identities_check(
             most=1.001 * model.config.control.rate,
         ),
     ]
+    if described.delay_cycles > 1:
+        what = "cycles from a sample to its torque"
+        found.append(measure(what, described.delay_cycles, "", most=delay_of(model.config)))
     # An infinite limit is no finite number, but clips nothing.
     found = [one for one in found if not (one.what.startswith("torque limit") and one.value is None)]
     return check_from_measures(

@@ -9,6 +9,9 @@ gravity torque: a wrong sign or a wrong scale then drives the arm no farther tha
 where it can be let go. So every end here, good or bad, is torque off; a drive's own quick stop would trust the very
 sign that has not been proven yet.
 
+Drives that are given positions close the loop by themselves, and no torque of ours is kept to a band: what they measure
+must stay within it instead, or the loop is ended. Their positions pass the same guard.
+
 While the torque is on nothing is worked out between two cycles, for drives give up within a few cycles without torque
 frames: what was recorded is evaluated when torque is off again.
 """
@@ -28,6 +31,7 @@ from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Elapsed
+from ident_service.motion.run import MOVED
 from ident_service.motion.safety_monitor import Reaction, SafetyMonitor
 from ident_service.motion.trajectory import Reference, Setpoint
 from ident_service.preflight.stability import INERTIA, known_drives
@@ -90,7 +94,9 @@ FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motio
 FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by far
 BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
 _CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
+MISSING = 2  # cycles in a row without its position, after which a joint's drive may have left on purpose
 RELEASE = 0.5  # s over which torque is led to zero
+MOVED_CODE = "moved_before_enabled"
 SUNK = 0.02  # rad or m: what sinks farther while torque fades has no support, and torque is taken off at once
 
 Rows = Sequence[tuple[Sample, Setpoint]]
@@ -153,6 +159,7 @@ class Session:
             modelled, and all of the described drive inertia.
         period: [s].
         torque_limit: of the description [N m or N], shape (joints,).
+        gives_positions: whether the drives are given positions.
     """
 
     def __init__(
@@ -194,12 +201,20 @@ class Session:
             following_error=np.minimum(limits.following_error, FARTHEST),
             velocity=np.minimum(limits.velocity, FASTEST),
         )
+        self.gives_positions = described.streams_position
         self._guard = SafetyMonitor(
-            model.chain.names, narrow, period, home, revolute=model.chain.revolute, max_age=described.lost_cycles
+            model.chain.names,
+            narrow,
+            period,
+            home,
+            revolute=model.chain.revolute,
+            max_age=described.lost_cycles,
+            most_torque=np.minimum(np.abs(self.gravity) + self._band, limits.torque) if self.gives_positions else None,
         )
         self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         self._since = Elapsed(period)
-        self._torque = self.gravity.copy()
+        self._target = home.copy() if self.gives_positions else self.gravity.copy()
+        self._explained: Vector | None = None  # the model's torque, where drives are given positions
         self._rows: list[tuple[Sample, Setpoint]] = []
         self._words: tuple[int, ...] = ()
         self._friction = still
@@ -212,13 +227,20 @@ class Session:
         self._most = (np.abs(to_drives) * self._band).max(axis=1)
 
     def energise(self) -> None:
-        """Enable the arm; the first cycle of `follow` sends the torque that holds it.
+        """Enable the arm; the first cycle of `follow` sends the target that holds it.
 
         Raises:
+            ArmFault: a person enabled the arm, and it had been moved meanwhile; it is without torque again.
             DriverError: the drives refuse.
         """
+        waits = bool(self._arm.operator_action)
         self._arm.enable()
-        self._torque = self._limited(self.gravity)
+        self._target = self._passed(self.home) if self.gives_positions else self._limited(self.gravity)
+        if waits:
+            sample = self.exchange()
+            if not bool((np.abs(sample.position - self.home) <= MOVED).all()):
+                self._arm.stop(StopKind.TORQUE_OFF)
+                raise ArmFault(MOVED_CODE, "the arm was moved while a person was waited for; check again", [sample])
 
     def follow(
         self, reference: Reference, seconds: float, learning: float = 0.0, shaking: tuple[Vector, float] | None = None
@@ -231,7 +253,8 @@ class Session:
             learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
                 of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
                 WAM's first joint takes 13 mrad of error.
-            shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top.
+            shaking: amplitude [N m or N], shape (joints,), and frequency [Hz] of a sinusoidal torque on top; of drives
+                that are given positions none can be.
 
         Returns:
             The cycles with their references, for `trace_of`.
@@ -244,7 +267,7 @@ class Session:
         learned: dict[bool, list[Vector]] = {}
         begin_ns: int | None = None
         while True:
-            sample = self._arm.exchange(self._torque)
+            sample = self.exchange()
             if begin_ns is None:
                 begin_ns = sample.stamp_ns
             elapsed = (sample.stamp_ns - begin_ns) * 1e-9
@@ -256,8 +279,11 @@ class Session:
                 # On its way only: a joint that sticks would look like one whose encoder does.
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
                 wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
-            self._torque = self._limited(wanted + self._against_friction(setpoint, learning))
-            if learning and setpoint.velocity.any():
+            if self.gives_positions:
+                self._target = self._passed(setpoint.position)
+            else:
+                self._target = self._limited(wanted + self._against_friction(setpoint, learning))
+            if learning and not self.gives_positions and setpoint.velocity.any():
                 learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
             if elapsed >= seconds:
                 if learned and self._averages:
@@ -267,56 +293,68 @@ class Session:
                     self._friction = np.mean(halves, axis=0)
                 return self._rows
 
-    @property
-    def torque(self) -> Vector:
-        """Return the torque that is sent next [N m or N], shape (joints,)."""
-        return self._torque
+    def exchange(self, *, sends: bool = True) -> Sample:
+        """Exchange one cycle with the target that the guard has let pass, or without any; raises DriverError."""
+        if not sends:
+            return self._arm.exchange(None)
+        return (self._arm.exchange_position if self.gives_positions else self._arm.exchange)(self._target)
 
     def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
-        """Check a cycle in which a signal is withheld from drives on purpose, and compute the next torque.
+        """Check a cycle in which a signal is withheld from drives on purpose, and compute the next target.
 
         What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
-        have given up torque, but for their position limits. Every other joint is held and guarded as before.
+        have given up torque, but for their position limits. Every other joint is held and guarded as before. A drive
+        that misses its host may leave `operational` and tell no position any more: its joints stand where they were
+        seen last, and the caller says how long that may go on.
 
         Args:
             sample: of this cycle.
             setpoint: for the joints that are held.
             given_up: which joints no longer are, shape (joints,).
-            sends: whether torque is sent; where it is what drives miss, the last one stays the last one.
+            sends: whether targets are sent; where they are what drives miss, the last one stays the last one.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.
         """
         self._rows.append((sample, setpoint))
-        undisturbed = replace(sample, status=self._words, events=(), torque=self._torque, torque_difference=None)
+        given_up = given_up | (sample.age >= MISSING)
+        undisturbed = replace(
+            sample,
+            status=self._words,
+            events=(),
+            torque=sample.torque if self.gives_positions else self._target,
+            torque_difference=None,
+            valid=sample.valid | given_up,
+            age=np.where(given_up, 0, sample.age),
+        )
         there = np.where(given_up, sample.position, setpoint.position)
         going = np.where(given_up, 0.0, setpoint.velocity)
         asked = Setpoint(there, going, np.where(given_up, 0.0, setpoint.acceleration))
         wanted = self._led(undisturbed, asked, given_up) + self._against_friction(asked, 0.0)
         if sends:
-            self._torque = self._limited(wanted)
+            self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
     def wait_in_silence(self) -> None:
-        """Repeat the torque that was sent last, through the guard, while drives report no positions.
+        """Repeat the target that was sent last, through the guard, while drives report no positions.
 
         Raises:
             ArmFault: the guard found something that is more than a warning.
         """
-        self._torque = self._limited(self._torque)
+        self._target = self._passed(self._target) if self.gives_positions else self._limited(self._target)
 
     def trace(self) -> Trace:
         """Return the cycles of the last `follow` as a trace, also of one that a fault ended."""
         return trace_of(self._rows, self.period)
 
     def release(self) -> None:
-        """Hand the arm back to its support: torque fades, then the drives are switched off."""
-        cycles = max(1, round(RELEASE / self.period))
-        held = self._torque
+        """Hand the arm back to its support, or to its brakes: torque fades, then the drives are switched off."""
+        cycles = 1 if self.gives_positions else max(1, round(RELEASE / self.period))
+        held = self._target
         for left in range(cycles - 1, -1, -1):
-            sample = self._arm.exchange(self._torque)
-            if not bool((np.abs(sample.position - self.home) <= SUNK).all()):
+            sample = self.exchange()
+            if self.gives_positions or not bool((np.abs(sample.position - self.home) <= SUNK).all()):
                 break
-            self._torque = self._limited(held * (left / cycles), band=False)
+            self._target = self._limited(held * (left / cycles), band=False)
         self._arm.stop(StopKind.TORQUE_OFF)
 
     def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
@@ -324,10 +362,22 @@ class Session:
         since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
         known = self._since.known
-        usable, fault = self._guard.feedback(sample, setpoint, velocity, correction, elapsed=since, known=known)
+        pushes = sample.torque - self._explained if self._explained is not None else np.zeros_like(velocity)
+        usable, fault = self._guard.feedback(
+            sample,
+            setpoint,
+            velocity,
+            correction,
+            elapsed=since,
+            known=known,
+            unexplained=np.where(given_up, 0.0, pushes),
+        )
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
-        return control.torque(sample.position, usable, setpoint, since if known else 0.0)
+        law = control.torque(sample.position, usable, setpoint, since if known else 0.0)
+        if self.gives_positions:
+            self._explained = law - control.correction
+        return law
 
     def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
         """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,).
@@ -339,6 +389,13 @@ class Session:
         lag = self._coupling @ (setpoint.position - self._control.position) * direction
         self._friction = np.clip(self._friction + learning * self.period * self._stiffness * lag, 0.0, self._most)
         return np.asarray(self._coupling.T @ (self._friction * np.clip(rate / _CREEP, -1.0, 1.0)))
+
+    def _passed(self, wanted: Vector) -> Vector:
+        """Return the position that the guard lets pass [rad or m], shape (joints,)."""
+        position, fault = self._guard.position(wanted)
+        if fault is not None and fault.reaction is not Reaction.WARN:
+            raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
+        return position
 
     def _limited(self, wanted: Vector, *, band: bool = True) -> Vector:
         if band:

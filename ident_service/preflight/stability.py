@@ -127,8 +127,7 @@ class StabilityReport:
 
 def delay_of(config: ArmConfig) -> int:
     """Return the cycles from a sample to its torque, where the driver states more than the contract's one."""
-    delay = getattr(config.driver, "delay_cycles", 1)
-    return delay if isinstance(delay, int) and delay > 1 else 1
+    return max(1, config.delay_cycles)
 
 
 def stability(

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.canopen.bus_load import budget
-from ident_service.config.canopen import CanopenDriver
+from drivers.can.bus_load import Budget
 from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import IdentError, ModelError, MotionRefused
 from ident_service.excitation.limit_proof import proof_of, violations
@@ -27,6 +26,7 @@ from ident_service.motion.ticket import (
     joint_units,
     measure,
     measures,
+    skipped,
 )
 from ident_service.motion.trajectory import PathReference, plan_trajectory, rest
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
@@ -34,14 +34,23 @@ from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_
 # What drives may take to notice that the host is gone where joints can fall: what falls freely has sunk 5 cm after it
 # and moves at 1 m/s, and others take no longer (moteus 0.1 s).
 LONGEST_SILENCE = 0.1
+LONG_SILENCE_REMEDY = (
+    "Shorten the drives' watchdog (torque_deadline, heartbeats.host_timeout, guarding, watchdog_time), or say "
+    "in driver.watchdog_reason why this arm may go on for longer."
+)
 NEAR_HOME = 0.1  # rad or m: people lead an arm home to a few hundredths
 HOLDABLE = 0.8  # of a torque limit: what holding may take, so that something is left to correct with
 _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
 @unhurried()
-def configuration_check(model: ArmModel) -> Check:
-    """Check that the description has all that motion needs: limits, gains, a prior of a real body, room on the bus."""
+def configuration_check(model: ArmModel, load: Budget | None = None) -> Check:
+    """Check that the description has all that motion needs: limits, gains, a prior of a real body, room on the bus.
+
+    Args:
+        model: of the arm.
+        load: of its buses; None for an arm on none.
+    """
     code, remedy = "configuration", "Complete the arm's description; `ident config check` names every place."
     try:
         limits = motion_limits(model.config)
@@ -58,22 +67,29 @@ def configuration_check(model: ArmModel) -> Check:
             "the prior's mass matrix at home is not positive definite: no real body has these parameters",
             "Give prior parameters of a feasible identification or of a CAD model.",
         )
-    seconds = getattr(model.config.driver, "watchdog", None)
-    reason = getattr(model.config.driver, "watchdog_reason", "")
-    long = isinstance(seconds, int | float) and seconds > LONGEST_SILENCE and not reason
-    if long and (falling := falling_joints(model, limits)):
-        return failed(
-            code,
-            f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
-            f"{LONGEST_SILENCE:g} s",
-            "Shorten the drives' watchdog (torque_deadline, heartbeats.host_timeout, guarding, watchdog_time), or say "
-            "in driver.watchdog_reason why this arm may go on for longer.",
-        )
-    if isinstance(model.config.driver, CanopenDriver):
-        load = budget(model.config.driver, model.config.control.rate)
-        if not load.fits:
-            return failed(code, load.reason, load.remedy)
+    if too_long := long_silence(model, limits, model.config.watchdog):
+        return failed(code, too_long, LONG_SILENCE_REMEDY)
+    if load is not None and not load.fits:
+        return failed(code, load.reason, load.remedy)
     return Check(code, Verdict.PASSED)
+
+
+def long_silence(model: ArmModel, limits: MotionLimits, seconds: float | None) -> str:
+    """Describe in words that joints can fall while drives go on without their host; empty where they do not for long.
+
+    Args:
+        model: of the arm, with a prior.
+        limits: of the arm.
+        seconds: after which the drives give up torque [s]; None where unknown.
+    """
+    if seconds is None or seconds <= LONGEST_SILENCE or model.config.watchdog_reason:
+        return ""
+    if not (falling := falling_joints(model, limits)):
+        return ""
+    return (
+        f"drives go on for {seconds:g} s when the host is gone, and {', '.join(falling)} can fall: at most "
+        f"{LONGEST_SILENCE:g} s"
+    )
 
 
 def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
@@ -119,7 +135,12 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
 
 @unhurried()
 def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitation | None) -> Check:
-    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion."""
+    """Check that the gains are stable at this rate and delay, at home, in the middle and along the motion.
+
+    Drives that are given positions close the loop by themselves, with gains of their maker's tool.
+    """
+    if getattr(model.config.driver, "streams", "torque") == "position":
+        return skipped("stability", "the drives close the position loop by themselves (driver.streams: position)")
     path = None if excitation is None or excitation.path.joints != model.chain.joints else excitation.path
     postures = np.vstack([limits.home, 0.5 * (limits.lower + limits.upper)])
     if path is not None:

@@ -30,7 +30,9 @@ _WORDS = {
     "rpdo_timer": "torque frames",
     "torque_frames": "torque frames",
     "sync_loss": "SYNC",
+    "bus_silence": "requests and torques",
 }
+_BLIND = ("sync_loss", "bus_silence")  # without these no position comes
 _ORDER = list(_WORDS)  # what leaves the most of the others alone comes first; without SYNC no position comes
 _LATER = 2.0  # times the configured time, plus some cycles and the report's delay, until a drive must have reported
 _CYCLES = 10
@@ -82,9 +84,8 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
 
 def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
     """Return the signal that each drive's watchdog watches; where the driver does not say, torque frames, by joint."""
-    seconds = getattr(model.config.driver, "watchdog", None)
-    most = float(seconds) if isinstance(seconds, int | float) else None
-    return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", most) for name in model.chain.names)
+    seconds = arm.describe().watchdog
+    return arm.watchdogs() or tuple(Watchdog(name, "torque_frames", seconds) for name in model.chain.names)
 
 
 def watchdog_check(
@@ -98,7 +99,7 @@ def watchdog_check(
 
     Args:
         arm: enabled, held by `session`.
-        model: for names, and the watchdog's time in the driver's section where the driver does not tell it.
+        model: for names.
         session: the loop that holds the arm; without torque frames the last torque acts until a drive ends it.
         setpoint_at: where the joints that are held should be, by the time since the silence began [s].
         moving: number of the joint that moves, whose travel is measured; None at standstill.
@@ -108,7 +109,7 @@ def watchdog_check(
     """
     period = session.period
     dogs = watchdogs_of(arm, model)
-    told = float(getattr(model.config.driver, "report_delay", 0.0))
+    told = arm.describe().report_delay
     where = "at rest" if moving is None else "in motion"
     gave_up: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
@@ -123,7 +124,7 @@ def watchdog_check(
                 arm.withhold(kind)
             begin_ns: int | None = None
             while True:
-                sample = arm.exchange(None if of_torque else session.torque)
+                sample = session.exchange(sends=not of_torque)
                 status = arm.drive_status() or tuple(AxisStatus(word) for word in sample.status)
                 if begin_ns is None:
                     begin_ns = sample.stamp_ns
@@ -144,7 +145,7 @@ def watchdog_check(
                         )
                 if strange:
                     break
-                if kind == "sync_loss":
+                if kind in _BLIND:
                     session.wait_in_silence()
                 else:
                     setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)

@@ -154,6 +154,29 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
     return part
 
 
+def without_ends(recording: Recording, trim: tuple[float, float]) -> RangeRecording:
+    """Leave out the first and the last seconds, as `resampling.trimmed` does.
+
+    Args:
+        recording: to be read through once.
+        trim: seconds to leave out at the start and at the end [s].
+
+    Raises:
+        RecordingError: nothing would be left; and whatever reading the blocks raises.
+    """
+    stamps = [(int(block.stamp_ns[0]), int(block.stamp_ns[-1])) for block in recording.blocks()]
+    file_ns, begins, ends = first_stamp(recording), stamps[0][0], stamps[-1][1]
+    start, end = begins + round(trim[0] * 1e9), ends - round(trim[1] * 1e9)
+    if start > end:
+        raise RecordingError(
+            recording.path,
+            f"nothing is left after trimming {trim[0]:g} s and {trim[1]:g} s of {(ends - begins) * 1e-9:.6g} s",
+        )
+    part = RangeRecording(recording, (start - file_ns) * 1e-9, (end + 1 - file_ns) * 1e-9)  # the last sample included
+    part.standstill = recording.standstill if isinstance(recording, RangeRecording) else part.standstill
+    return part
+
+
 class JointSideRecording:
     """Convert another recording's blocks from the motor side to the joint side.
 

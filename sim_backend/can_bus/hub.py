@@ -18,9 +18,9 @@ from threading import RLock
 from types import TracebackType
 from typing import Final, Self
 
+from drivers.can.bus_load import exact
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import MAX_PACKET_BYTES, MAX_PACKET_FRAMES, Frame, pack_frames, unpack_frames
-from drivers.canopen.bus_load import exact
 from ident_service.errors import DriverError
 from sim_backend.can_bus import link, packets
 from sim_backend.can_bus.medium import BusEndpoint, Medium, overflow

@@ -34,7 +34,6 @@ from drivers.can.can_frame import (
 )
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError
 from sim_backend.can_bus import packets
 
@@ -157,11 +156,11 @@ def from_config(config: ArmConfig, bus_number: int) -> WireLink:
 
     Raises:
         BusError: no process runs the wire, or it refuses.
-        DriverError: the driver section is not CANopen's, or an unknown option; `pace` is the host's.
+        DriverError: the driver section has no CAN bus, or an unknown option; `pace` is the host's.
     """
-    if not isinstance(config.driver, CanopenDriver):
-        raise DriverError(f"{config.name}: the driver is not CANopen's")
-    bus = config.driver.buses[bus_number]
+    if not config.can_buses:
+        raise DriverError(f"{config.name}: the driver has no CAN bus")
+    bus = config.can_buses[bus_number]
     if unknown := sorted(set(bus.options) - {"pace"}):
         raise DriverError(f"driver.buses.{bus_number}.options: ident_wire has only pace, found {', '.join(unknown)}")
     fd = bus.data_bitrate is not None

@@ -3,6 +3,10 @@
 2F70h says after how many periods (1006h) without SYNC, and 2F75h after how many milliseconds without a target torque,
 the drive takes its host for gone; 0 is never.
 
+In mode 8 (cyclic synchronous position) a loop of 1 ms follows 607Ah, between two targets on a straight line that takes
+the interpolation period (60C2h), by stiffness, damping and an integral part as a maker's tool would have tuned them.
+The torque that it tells is then the mean since the SYNC before.
+
 Demand is target plus offset, in counts of the target, cut off at the drive's limits (of CiA 402: thousandths of the
 rated torque, 6072h and 6073h). Above the speed limit (6080h) no torque acts that leads faster; the target is ignored
 then, and the statusword says so (bit 12). Software position limits (607Dh) are of the position modes: torque acts
@@ -27,6 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from enum import Enum, IntEnum
 
 from drivers.can.can_frame import Frame
@@ -82,6 +87,60 @@ class VendorWatchdogs:
 _RPM = 60.0 / (2.0 * math.pi)
 
 
+@dataclass(frozen=True)
+class Tuning:
+    """Hold the gains of a position loop at the motor: [N m/rad], [N m s/rad], [N m/(rad s)]."""
+
+    stiffness: float = 0.0
+    damping: float = 0.0
+    integral: float = 0.0
+
+
+_CSP, _LOOP, _LOOP_NS = 8, "position loop", 1_000_000
+
+
+class PositionLoop:
+    """Follow target positions of one motor."""
+
+    def __init__(self, objects: Objects, motor: Motor, tuning: Tuning) -> None:
+        """Start with a loop that is not closed."""
+        self._objects, self._motor, self._tuning = objects, motor, tuning
+        self._line: tuple[float, float, int] | None = None  # from [counts], to [counts], since [ns]
+        self._goal = 0
+        self._integral, self._last_ns = 0.0, 0
+
+    def release(self) -> None:
+        """Open the loop; it closes again where the motor is then."""
+        self._line, self._integral = None, 0.0
+
+    def torque(self, now_ns: int, most: float) -> float:
+        """Return the torque that the loop asks for [N m at the motor]; beyond `most` the integral part stands still."""
+        goal, per_radian = self._objects.number(0x607A), self._motor.counts_per_turn / (2.0 * math.pi)
+        actual = self._motor.encoder(now_ns)
+        if self._line is None:
+            self._line, self._last_ns = (actual, goal, now_ns), now_ns
+        elif goal != self._goal:
+            self._line = self._at(now_ns)[0], goal, now_ns
+        self._goal = goal
+        there, slope = self._at(now_ns)
+        away, seconds = (there - actual) / per_radian, (now_ns - self._last_ns) * 1e-9
+        lag = slope / per_radian - self._motor.speed(now_ns)
+        asked = self._tuning.stiffness * away + self._tuning.damping * lag + self._integral
+        if abs(asked) < most or asked * away < 0.0:
+            self._integral += self._tuning.integral * away * seconds
+        self._last_ns = now_ns
+        return asked
+
+    def _at(self, now_ns: int) -> tuple[float, float]:
+        """Return where the motor shall be [counts], and how fast [counts/s]."""
+        assert self._line is not None  # noqa: S101 - set by the caller
+        first, last, since_ns = self._line
+        number, power = self._objects.number(0x60C2, 1), self._objects.number(0x60C2, 2)
+        period = number * 10.0**power or 1e-3
+        share = (now_ns - since_ns) * 1e-9 / period
+        return (last, 0.0) if share >= 1.0 else (first + share * (last - first), (last - first) / period)
+
+
 class TorqueLoop:
     """Compute demand and limits of one motor.
 
@@ -90,14 +149,17 @@ class TorqueLoop:
         follows: whether the target acts (bit 12).
     """
 
-    def __init__(self, objects: Objects, motor: Motor, personality: DriveProperties) -> None:
+    def __init__(self, objects: Objects, motor: Motor, personality: DriveProperties, tuning: Tuning) -> None:
         """Start with a loop that is not closed."""
         self._objects, self._motor, self._personality = objects, motor, personality
+        self._position = PositionLoop(objects, motor, tuning)
+        self._acting, self._sum, self._told_ns = (0.0, 0), 0.0, 0  # torque [counts] and since when [ns]
         self.limited = self.follows = False
 
     def release(self) -> None:
         """End the torque loop; the power stage decides what the motor does now."""
-        self.limited = self.follows = False
+        self.limited = self.follows = self._motor.holds = False
+        self._position.release()
         for index in (0x6074, 0x6077, 0x6078):
             self._objects.values[index << 8] = 0
 
@@ -108,16 +170,39 @@ class TorqueLoop:
         cyclic = number(0x6061) in self._personality.modes
         target = self._personality.target
         asked = number(target >> 8, target & 0xFF) + number(0x60B2) if cyclic else 0
+        if follows := number(0x6061) == _CSP and 0x607A00 in self._objects.entries:
+            count = self._personality.torque(1.0, self._objects)
+            most, self._motor.holds = self._personality.reach(self._objects) * count, True
+            asked = round(self._position.torque(now_ns, most) / count) if count else 0
         reach = int(self._personality.reach(self._objects) * self._motor.defects.torque_share)
         demand = min(max(asked, -reach), reach)
-        self.follows = cyclic
+        self.follows = cyclic or follows
         self.limited = demand != asked
         if demand and self._leads_faster(demand, now_ns):
             demand, self.limited, self.follows = 0, True, False
         values[0x607400] = demand
         fraction = self._motor.defects.torque_fraction
-        values[0x607700] = values[0x607800] = round(fraction * demand)
+        if follows:
+            self._add(fraction * demand, now_ns)
+        else:
+            values[0x607700] = values[0x607800] = round(fraction * demand)
         self._motor.drive(self._personality.torque(fraction * demand, self._objects), now_ns)
+
+    def _add(self, acts: float, now_ns: int) -> None:
+        """Note the torque [counts] that acts from now on, for the mean that is told."""
+        acted, since_ns = self._acting
+        self._sum += acted * (now_ns - since_ns)
+        self._acting = acts, now_ns
+
+    def tell_mean(self, now_ns: int) -> None:
+        """Tell the mean torque since it was told last: a position loop changes it several times in a cycle."""
+        if not self._motor.holds:
+            return
+        self._add(self._acting[0], now_ns)
+        if now_ns > self._told_ns:
+            values = self._objects.values
+            values[0x607700] = values[0x607800] = round(self._sum / (now_ns - self._told_ns))
+        self._sum, self._told_ns = 0.0, now_ns
 
     def _leads_faster(self, demand: int, now_ns: int) -> bool:
         speed = self._motor.speed(now_ns)
@@ -326,6 +411,9 @@ BOOT_NS = 20_000_000  # from a reset to the boot-up message
 NO_HEARTBEAT, SYNC_LENGTH, NO_VOLTAGE, POWER_STAGE = 0x8130, 0x8240, 0x3220, 0x5400
 _PDO_PARAMETERS = {index for group in (*COMMUNICATION, *MAPPING) for index in group}
 _DRIVE_OBJECTS = 0x6000
+# CiA 301, 7.5.2.13 and 14: "save" and "load", little-endian.
+_STORE, _RESTORE, NOT_STORED = 0x1010, 0x1011, 0x08000020
+_SIGNATURES = {_STORE: 0x65766173, _RESTORE: 0x64616F6C}
 _FAULT = 1  # of 6007h
 _WARNING, _REMOTE, _LIMITED, _FOLLOWS, _VOLTAGE = 0x0080, 0x0200, 0x0800, 0x1000, 0x0010
 # Key of the position entry; a TPDO without it is no feedback.
@@ -346,7 +434,13 @@ class CanopenDrive:
     """
 
     def __init__(
-        self, eds: str, number: int, motor: Motor, own: dict[int, int] | None = None, like: DriveProperties = LIKE_NEW
+        self,
+        eds: str,
+        number: int,
+        motor: Motor,
+        own: dict[int, int] | None = None,
+        like: DriveProperties = LIKE_NEW,
+        tuning: Tuning = Tuning(),
     ) -> None:
         """Create a drive without power.
 
@@ -356,6 +450,7 @@ class CanopenDrive:
             motor: that it drives.
             own: numbers that its entries have instead of what the EDS says, by key.
             like: its properties that are not in the EDS.
+            tuning: of its position loop.
 
         Raises:
             DriverError: an EDS that cannot be read.
@@ -371,7 +466,7 @@ class CanopenDrive:
         )
         self.power = PowerStage(node, motor)
         self._pdos = Pdos(node, self.emergency, self._arrived, self._late)
-        self._torque = TorqueLoop(self.objects, motor, self._personality)
+        self._torque = TorqueLoop(self.objects, motor, self._personality, tuning)
         self._firmware = Firmware(node, self._personality, self._control)
         self._makers = VendorWatchdogs(node, self.emergency, self._late, there=like.shipped)
         self._failure = 0
@@ -458,6 +553,9 @@ class CanopenDrive:
             self._node.now_ns = max(timers.pop(name), self._node.now_ns)
             for part in (self.nmt, self._makers, self._pdos, self.power, self.emergency, self._firmware):
                 part.due(name)
+            if name == _LOOP and self.power.state is PowerState.OPERATION_ENABLED:
+                self._sample(self._node.now_ns)
+                self._torque.evaluate(self._node.now_ns)
             self._refresh()
             self._pdos.changes()
         self._node.now_ns = max(now_ns, self._node.now_ns)
@@ -543,6 +641,7 @@ class CanopenDrive:
         if self.nmt.state is State.OPERATIONAL:
             self._makers.synced()
         self._sample(self._node.now_ns)
+        self._torque.tell_mean(self._node.now_ns)
         self._evaluated = False
         self._pdos.sync()  # limits depend on where the motor is, whether a torque has come or not
         if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
@@ -642,6 +741,8 @@ class CanopenDrive:
             raise SdoAbort(WRONG_STATE)
         if key == 0x100300 and value:
             raise SdoAbort(WRONG_VALUE)
+        if index in _SIGNATURES and value != _SIGNATURES[index]:
+            raise SdoAbort(NOT_STORED)
         if index in (0x1005, 0x1014) and value & 0x7FFF_F800:
             raise SdoAbort(WRONG_VALUE)  # extended identifiers, and producing SYNC
 
@@ -651,7 +752,10 @@ class CanopenDrive:
         if index not in (0x1003, 0x1020) and not self.objects.entries[key].mappable:
             self.objects.put(0x1020, 0, 1)
             self.objects.put(0x1020, 0, 2)
-        if index in _PDO_PARAMETERS or index == 0x1005:
+        if index in _SIGNATURES:
+            self.objects.values[key] = self.objects.entries[key].default  # what it tells is what it can
+            (self.objects.store if index == _STORE else self.objects.restore)()
+        elif index in _PDO_PARAMETERS or index == 0x1005:
             self._configure()
         elif index == 0x1016:
             self.nmt.configure_consumers()
@@ -685,5 +789,8 @@ class CanopenDrive:
         if self.nmt.state is not State.INITIALISING:
             self._refresh()
             self._pdos.changes()
+        closed = self.power.state is PowerState.OPERATION_ENABLED and self.objects.number(0x6061) == _CSP
+        if closed and _LOOP not in self._node.timers:
+            self._node.after(_LOOP, _LOOP_NS)
         out, self._node.out = self._node.out, []
         return out

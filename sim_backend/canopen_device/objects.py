@@ -23,6 +23,8 @@ Value = int | bytes
 _FORMATS = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
 _BYTES = {0x08: 4, 0x11: 8, 0x15: 8, 0x1B: 8}  # of numbers that are none here
 _VISIBLE_STRING = 0x09
+# Store and restore themselves, the mark of a configuration, and commands.
+_NOT_STORED = (0x1010, 0x1011, 0x1020, 0x2030, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B2)
 _FIRST, _HEARTBEAT_CONSUMERS = 0x1000, 0x1016
 
 
@@ -104,6 +106,7 @@ class Objects:
             if (entry := entries.get(key)) is not None and entry.form is not None:
                 self.entries[key] = replace(entry, default=_cut(entry.form, value))
         self._indices = {key >> 8 for key in self.entries}
+        self._factory = dict(self.entries)
         self.values: dict[int, Value] = {}
         self.before_read: Callable[[int], None] = lambda key: None
         self.veto: Callable[[int, int], None] = lambda key, value: None
@@ -115,6 +118,16 @@ class Objects:
         for key, entry in self.entries.items():
             if first <= key >> 8 <= last:
                 self.values[key] = entry.default
+
+    def store(self) -> None:
+        """Keep what a host can write, and is no command, over resets."""
+        for key, entry in self.entries.items():
+            if entry.writable and key >> 8 not in _NOT_STORED:
+                self.entries[key] = replace(entry, default=self.values[key])
+
+    def restore(self) -> None:
+        """Take the values after power-up from the data sheet again, from the next reset on."""
+        self.entries.update(self._factory)
 
     def number(self, index: int, subindex: int = 0) -> int:
         """Return a value that is a number; 0 where the EDS has no such object."""

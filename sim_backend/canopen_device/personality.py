@@ -18,10 +18,11 @@ from sim_backend.canopen_device.node import Node
 from sim_backend.canopen_device.objects import Objects
 
 _MODE, _CONTROL = "mode of operation", "control word"
+_ON = (0x23, 0x27)  # of the statusword: switched on, operation enabled
 _LOOP_NS, _MODE_NS = 1_000_000, 20_000_000
 _SOME_CONSTANT = 0.05  # N m/A, of a motor whose description has none
 # Objects without which a mode makes no sense, by the mode's number (CiA 402-2).
-_MODES = {1: (0x607A,), 3: (0x60FF,), 4: (0x6071, 0x6087), 6: (0x6098,), 10: (0x6071,)}
+_MODES = {1: (0x607A,), 3: (0x60FF,), 4: (0x6071, 0x6087), 6: (0x6098,), 8: (0x607A, 0x60C2), 10: (0x6071,)}
 _SERVO = 0x0002_0192
 
 
@@ -43,6 +44,7 @@ class DriveProperties:
         shipped: whether it is the shipped data sheet's drive: it does at once what frames ask for, and has the
             watchdogs of `drive.py`.
         motor: values that its maker's tool has entered, by key.
+        mode_when_on: whether a mode of operation takes effect only while it is switched on.
     """
 
     modes: tuple[int, ...] = (10,)
@@ -52,6 +54,7 @@ class DriveProperties:
     scale: float = 1e-3
     shipped: bool = True
     motor: tuple[tuple[int, int], ...] = ()
+    mode_when_on: bool = False
 
     def reach(self, objects: Objects) -> int:
         """Return the largest torque that the drive's limits let through [counts]."""
@@ -101,6 +104,7 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
         scale=scale,
         shipped=False,
         motor=(*_unspecified(sheet, [key for key, _ in limits]), *motor.items()),
+        mode_when_on=family.mode_shown == "switched_on",
     )
 
 
@@ -133,6 +137,8 @@ class Firmware:
         number = self._node.objects.number
         if name == _CONTROL:
             self._control(number(0x6040))
+        elif name == _MODE and self._personality.mode_when_on and number(0x6041) & 0x6F not in _ON:
+            self._node.after(_MODE, _MODE_NS)
         elif name == _MODE:
             mode = number(0x6060)
             if mode in self._personality.modes or (1 <= mode <= 32 and number(0x6502) >> (mode - 1) & 1):

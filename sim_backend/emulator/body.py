@@ -9,7 +9,7 @@ This is written apart from the driver's conversion, so that one can be checked a
 Between two instants at which something changes, motors do the same, and the plant moves in one step; a longer silence
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
 position and speed can. A step of exactly the nominal period is the simulated arm's. The arm is supported until all
-motors are powered and one of them has been given torque: drives are enabled with none.
+motors are powered and one of them has been given torque, or holds a position: drives are enabled with no torque.
 """
 
 from __future__ import annotations
@@ -51,12 +51,17 @@ class Gears:
         self.ratios: Vector = np.array(transmission.ratios)
         self.matrix: Vector = self.ratios[:, None] * coupling
         self._offsets: Vector = np.zeros(joints) if transmission.offsets is None else np.array(transmission.offsets)
+        self._inverse = np.linalg.inv(self.matrix)
         self.ratios.setflags(write=False)
         self.matrix.setflags(write=False)
 
     def motor_position(self, position: Vector) -> Vector:
         """Return the motor angles [rad] of joint positions [rad or m], shape (motors,)."""
         return np.asarray(self.matrix @ (position - self._offsets))
+
+    def joint_position(self, angle: Vector) -> Vector:
+        """Return the joint positions [rad or m] of motor angles [rad], shape (joints,)."""
+        return np.asarray(self._inverse @ angle + self._offsets)
 
     def motor_velocity(self, velocity: Vector) -> Vector:
         """Return the motor speeds [rad/s] of joint velocities [rad/s or m/s], shape (motors,)."""
@@ -240,7 +245,8 @@ class Body:
         self._torque = self.gears.joint_torque(np.array([torque for _, torque in outputs]))
         self._torque.setflags(write=False)
         if self.supported:
-            self.supported = not (all(power is Power.TORQUE for power, _ in outputs) and self._torque.any())
+            acts = self._torque.any() or any(motor.holds for motor in self.motors)
+            self.supported = not (all(power is Power.TORQUE for power, _ in outputs) and acts)
         if [power for power, _ in before] == [power for power, _ in outputs]:
             return
         powered = np.array([power is Power.TORQUE for power, _ in outputs], dtype=float)

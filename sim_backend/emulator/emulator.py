@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 from sim_backend.emulator.body import Body
-from sim_backend.emulator.face import EmulatedDevice
+from sim_backend.emulator.face import Companion, EmulatedDevice, Traffic
 from sim_backend.emulator.faults import DriveFault, Injection, Sent
 from sim_backend.machine import Truth
 
@@ -29,6 +29,7 @@ class Emulator:
         body: the arm.
         faces: the drives' protocol implementations, in the order of the motors.
         names: of the joints.
+        companions: devices on the first bus that move no motor.
         observer: called with the truth at every SYNC, when the last bus has had it.
     """
 
@@ -39,6 +40,7 @@ class Emulator:
         buses: Sequence[int],
         names: Sequence[str],
         faults: Sequence[DriveFault] = (),
+        companions: Sequence[Companion] = (),
     ) -> None:
         """Assemble the emulator; nothing has power yet.
 
@@ -48,7 +50,9 @@ class Emulator:
             buses: index of each one's bus.
             names: of the joints.
             faults: to inject, counted from the first SYNC.
+            companions: devices on the first bus that move no motor.
         """
+        self.companions = tuple(companions)
         self.body, self.faces, self.names = body, tuple(faces), tuple(names)
         self.observer: Callable[[Truth], None] | None = None
         self._buses = tuple(buses)
@@ -78,7 +82,18 @@ class Emulator:
     @property
     def states(self) -> tuple[str, ...]:
         """Describe the state of each drive, in words."""
-        return tuple("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
+        drives = ("dead" if self._injection.dead(drive) else face.state for drive, face in enumerate(self.faces))
+        return (*drives, *(companion.state for companion in self.companions))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Return what each of `states` is the state of, in words."""
+        drives = (f"{name}, node {face.number}" for name, face in zip(self.names, self.faces, strict=True))
+        return (*drives, *(f"safety, node {companion.number}" for companion in self.companions))
+
+    def is_feedback(self, sent: Sent) -> bool:
+        """Return whether a frame on its way is a drive's position in a cycle."""
+        return sent.drive is not None and self.faces[sent.drive].traffic(sent.frame) is Traffic.FEEDBACK
 
     @property
     def active(self) -> tuple[DriveFault, ...]:
@@ -95,6 +110,7 @@ class Emulator:
             deadline = face.next_deadline_ns
             if deadline is not None and not self._injection.dead(drive):
                 times.append(deadline)
+        times += [due for one in self.companions if (due := one.next_deadline_ns) is not None]
         if not self.body.supported:
             times.append(self.body.now_ns + _IDLE_NS)
         self._deadline = (min(times, default=None),)
@@ -106,6 +122,8 @@ class Emulator:
         self.body.start(now_ns)
         for face in self.faces:
             face.power_up(now_ns)
+        for companion in self.companions:
+            companion.power_up(now_ns)
         self._deadline = None
 
     def receive(self, bus: int, frame: Frame, now_ns: int, sender: int | None = None) -> list[Sent]:
@@ -134,6 +152,10 @@ class Emulator:
                 self._deadline = None
                 is_sync = is_sync or frame.identifier == face.sync_identifier
                 sent += self._injection.on_the_way(drive, face.receive(frame, now_ns), now_ns)
+        for companion in self.companions if bus == 0 and sender is None else ():
+            if companion.listens(frame.identifier):
+                self._deadline = None
+                sent += [Sent(bus, None, answer, now_ns) for answer in companion.receive(frame, now_ns)]
         if not self.body.supported and all(face.released for face in self.faces):
             self.body.support(now_ns)
             self._deadline = None
@@ -158,9 +180,19 @@ class Emulator:
                 deadline = face.next_deadline_ns
                 if deadline is not None and deadline <= at and not self._injection.dead(drive):
                     sent += self._injection.on_the_way(drive, face.tick(at), at)
+            for companion in self.companions:
+                due = companion.next_deadline_ns
+                if due is not None and due <= at:
+                    sent += [Sent(0, None, frame, at) for frame in companion.tick(at) if not self._injection.cut_off]
             self._deadline = None
         self._now_ns = max(now_ns, self._now_ns)
         return sent
+
+    def press(self, key: str, now_ns: int) -> None:
+        """Press a key of the pendant, `activate` or `idle`; does nothing on an arm without one."""
+        for companion in self.companions:
+            companion.press(key, now_ns)
+        self._deadline = None
 
     def go_on(self, now_ns: int) -> None:
         """Advance the arm when the next cycle is late, by `Body.overdue_ns`, instead of when the cycle comes.

@@ -20,6 +20,37 @@ class Traffic(Enum):
     OTHER = "other"
 
 
+class Companion(Protocol):
+    """Define a device on the bus that moves no motor: a safety controller, with the pendant that belongs to it."""
+
+    @property
+    def number(self) -> int:
+        """Return the device's number on its bus."""
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """Return when `tick` has something to do [ns]; None for never."""
+
+    @property
+    def state(self) -> str:
+        """Describe the state in words, for people."""
+
+    def power_up(self, now_ns: int) -> None:
+        """Start the firmware."""
+
+    def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
+        """Process a frame of the host."""
+
+    def tick(self, now_ns: int) -> list[Frame]:
+        """Process the timers that are due."""
+
+    def listens(self, identifier: int) -> bool:
+        """Return whether a frame of this identifier means anything to the device."""
+
+    def press(self, key: str, now_ns: int) -> None:
+        """Press a key of its pendant: `activate` or `idle`."""
+
+
 class EmulatedDevice(Protocol):
     """Define one emulated motor controller; no call goes back in time, each returns the frames that follow in order."""
 

@@ -19,11 +19,10 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from drivers.can.bus_load import unstuffed
 from drivers.can.can_frame import Frame
-from drivers.canopen.bus_load import unstuffed
 from drivers.clock import VirtualClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError
 from sim_backend.emulator.build import build_emulator
 from sim_backend.emulator.faults import DriveFault, Sent
@@ -116,14 +115,13 @@ class LockStepArm:
         Raises:
             DriverError: as `build_emulator`, or a bus of another interface.
         """
-        driver = config.driver
-        if isinstance(driver, CanopenDriver) and any(bus.interface != INTERFACE for bus in driver.buses):
+        buses = config.can_buses
+        if any(bus.interface != INTERFACE for bus in buses):
             raise DriverError(f"{config.name}: either all buses are {INTERFACE!r} or none: one arm, one time")
         self.emulator = build_emulator(config, faults)
-        assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
         self.clock = VirtualClock() if clock is None else clock
-        self._wires = [LockStepBus(bus.bitrate, bus.data_bitrate) for bus in driver.buses]
-        self._heard: list[deque[Frame]] = [deque() for _ in driver.buses]
+        self._wires = [LockStepBus(bus.bitrate, bus.data_bitrate) for bus in buses]
+        self._heard: list[deque[Frame]] = [deque() for _ in buses]
         self._open: set[int] = set()
         self._now_ns = self.clock.now_ns()
         self.emulator.power_up(self._now_ns)
@@ -324,6 +322,6 @@ def from_config(config: ArmConfig, number: int) -> LockStepLink:
         if _begun is None or _begun[0] is not config:
             raise DriverError(f"{config.name}: bus {number} was opened before bus 0")
         arm = _begun[1]
-        if isinstance(config.driver, CanopenDriver) and number == len(config.driver.buses) - 1:
+        if number == len(config.can_buses) - 1:
             _begun = None
     return arm.link(number)

@@ -71,6 +71,7 @@ class Motor:
     Attributes:
         power: state of the power stage.
         torque: that acts when `power` is TORQUE, at the motor [N m].
+        holds: whether the drive closes a position loop over the torque.
         braking: damping when `power` is BRAKE [N m s/rad]; a thousand times that when it is HELD.
         defects: of the motor.
     """
@@ -110,6 +111,7 @@ class Motor:
         self.braking = braking
         self.power = unpowered
         self.torque = 0.0
+        self.holds = False
         self.defects = Defects()
 
     def power_up(self, now_ns: int) -> None:

@@ -5,7 +5,8 @@ the pace of its bit rates where the description says `options: {pace: true}`. Wh
 frames of drives are CAN FD's.
 
 The arm behind them goes on falling or braking when the host is gone. While it runs, lines on `commands` inject faults:
-a fault as `parse_fault` has it, `clear` to end all of them, `state` to be told everything again, `quit`.
+a fault as `parse_fault` has it, `clear` to end all of them, `state` to be told everything again, `quit`;
+`activate` and `idle` are keys of a pendant, where the arm has one.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ import numpy as np
 from drivers.can.can_frame import Frame
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanBus, CanopenDriver
-from ident_service.errors import DriverError
+from ident_service.config.can_bus import CanBus
+from ident_service.errors import DriverError, UsageError
 from sim_backend.can_bus.host import LocalPort
 from sim_backend.can_bus.hub import CanBusServer
 from sim_backend.emulator.build import build_emulator
@@ -239,7 +240,6 @@ class HostedBuses:
 
 
 _POLL_NS = 20_000_000  # commands, stop and states are looked at this often
-_POSITIONS = range(0x181, 0x200)  # TPDO1
 _GIVEN_UP = 0.9  # of a period after SYNC, when a host hardly waits for positions any more
 _AT_ONCE = 256  # frames handled before time is looked at again
 # Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
@@ -291,23 +291,26 @@ def emulate(
         The summary.
 
     Raises:
-        DriverError: as `build_emulator`, an interface that cannot be had or is lost, a malformed fault.
+        UsageError: drives that are no CANopen drives, or in the process that moves them; a malformed fault.
+        DriverError: as `build_emulator`, an interface that cannot be had or is lost.
     """
-    driver = config.driver
-    if isinstance(driver, CanopenDriver) and any(bus.interface == INTERFACE for bus in driver.buses):
-        raise DriverError(
+    buses = config.can_buses
+    if any(bus.interface == INTERFACE for bus in buses):
+        raise UsageError(
             f"{config.name}: {INTERFACE} drives live in the process that moves them; "
             "name an interface such as socketcan, udp_multicast or ident_wire"
         )
     emulator = build_emulator(config)
-    emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
-    assert isinstance(driver, CanopenDriver)  # noqa: S101 or there would be no emulator
-    ours = {bus.interface == WIRE_INTERFACE for bus in driver.buses}
+    try:
+        emulator.add_configured(parse_fault(text, emulator.names) for text in faults)
+    except DriverError as error:
+        raise UsageError(str(error)) from None
+    ours = {bus.interface == WIRE_INTERFACE for bus in buses}
     if len(ours) > 1:
         raise DriverError(
             f"{config.name}: either all buses are {WIRE_INTERFACE} or none is, for one loop to serve them"
         )
-    station = HostedBuses(driver.buses) if ours == {True} else PythonCanBuses(driver.buses)
+    station = HostedBuses(buses) if ours == {True} else PythonCanBuses(buses)
     try:
         return _Run(emulator, station, tell, commands).until(seconds, stop_requested)
     finally:
@@ -329,7 +332,7 @@ class _Run:
         self._clock = RealClock()
         self._later: list[tuple[int, int, Sent]] = []
         self._heard = self._sent = 0
-        self._told: tuple[str, ...] = ("",) * len(emulator.faces)
+        self._told: tuple[str, ...] = ("",) * len(emulator.labels)
         self._faults: tuple[DriveFault, ...] = ()
         self._rested = True
         self._stirred_ns = 0
@@ -398,7 +401,7 @@ class _Run:
         too_late = asked_ns is not None and now - asked_ns > self._given_up_ns
         ready = []
         for item in sent:
-            if too_late and item.frame.identifier in _POSITIONS:
+            if too_late and self._emulator.is_feedback(item):
                 continue  # a drive would have sent it in its own cycle; in this one it would be taken for its own
             if item.ready_ns <= now:
                 ready.append(item)
@@ -416,9 +419,9 @@ class _Run:
             self._obey(line.strip(), now_ns)
         emulator = self._emulator
         states = emulator.states
-        for drive, (state, told) in enumerate(zip(states, self._told, strict=True)):
+        for label, state, told in zip(emulator.labels, states, self._told, strict=True):
             if state != told:
-                self._tell(f"{emulator.names[drive]}, node {emulator.faces[drive].number}: {state}")
+                self._tell(f"{label}: {state}")
         self._told = states
         if emulator.active != self._faults:
             self._faults = emulator.active
@@ -448,6 +451,8 @@ class _Run:
                 self._emulator.clear(now_ns)
             case "state":
                 self._told = ("",) * len(self._told)
+            case "activate" | "idle":
+                self._emulator.press(line, now_ns)
             case _:
                 try:
                     self._emulator.inject([parse_fault(line, self._emulator.names)], now_ns)

@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import PATIENCE, arm_on_bus, content, end_of, frames, soon, wait_for
 
+from drivers.can.bus_load import exact
 from drivers.can.bus_state import BUS_OFF, BusError
 from drivers.can.can_frame import FD_LENGTHS, Frame, pack_frames, unpack_frames
 from drivers.can.can_link import open_links
-from drivers.canopen.bus_load import exact
 from ident_service.errors import DriverError
 from sim_backend.can_bus.host import WireThread
 from sim_backend.can_bus.hub import ERROR_BITS, CanBusServer

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from link_bench import frames
 
+from drivers.can.bus_load import exact
 from drivers.can.bus_state import BUS_OFF, CONTROLLER, COUNTERS, PASSIVE_RX, PASSIVE_TX, RESTARTED, WARNING_TX
 from drivers.can.can_frame import RECEIVE_FILTER, Frame
-from drivers.canopen.bus_load import exact
 from sim_backend.can_bus.hub import ERROR_BITS
 from sim_backend.can_bus.medium import INBOX, QUEUE, BusEndpoint, Medium, priority
 

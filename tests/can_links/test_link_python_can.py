@@ -18,7 +18,7 @@ from drivers.can.bus_state import BUS_OFF, RESTARTED, BusError
 from drivers.can.can_frame import MOST_AT_ONCE, Frame
 from drivers.can.can_link import Link, open_links
 from drivers.can.python_can_link import PythonCanLink, bus_error
-from ident_service.config.canopen import CanBus
+from ident_service.config.can_bus import CanBus
 from ident_service.errors import DriverError
 
 GROUP, PORT = "239.74.163.77", 43200 + os.getpid() % 2000
@@ -221,5 +221,5 @@ def test_a_bus_that_cannot_be_had_leaves_none_open() -> None:
 def test_an_arm_without_canopen_has_no_links() -> None:
     from ident_service.config.load import load_arm
 
-    with pytest.raises(DriverError, match="not CANopen's"):
+    with pytest.raises(DriverError, match="has no CAN bus"):
         python_can_link.from_config(load_arm("planar2"), 0)

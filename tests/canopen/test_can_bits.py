@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.can.bus_load import FD_LENGTHS, Bits, crc15, exact, padded, unstuffed, worst
 from drivers.can.can_frame import Frame
-from drivers.canopen.bus_load import FD_LENGTHS, Bits, crc15, exact, padded, unstuffed, worst
 
 # FIELDBUS.md 2.1: bytes, without stuffing, worst.
 TABLE = [(0, 47, 55), (1, 55, 65), (2, 63, 75), (3, 71, 85), (4, 79, 95), (6, 95, 115), (8, 111, 135)]

@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 from can_arms import EDS, wam_driver
 
+from drivers.can.bus_load import Budget, unstuffed, worst
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, Budget, budget, frame_cost, unstuffed, worst
+from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, budget, frame_cost
 from drivers.canopen.object_dictionary import Entry
 from drivers.canopen.pdo_mapping import HEARTBEAT, RPDO1, SYNC, TPDO1
-from ident_service.config.canopen import CanBus
+from ident_service.config.can_bus import CanBus
 
 Frames = list[tuple[int, tuple[Entry, ...]]]
 BUS = CanBus()

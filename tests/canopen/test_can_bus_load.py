@@ -17,6 +17,7 @@ from ident_service.config.load import disagreements, load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.ticket import Verdict
 from ident_service.preflight.static_checks import configuration_check, stability_check
 
@@ -99,9 +100,10 @@ def test_config_check_says_the_load_or_refuses_it(arms: Path, capsys: pytest.Cap
 
 
 def test_preflight_refuses_what_is_over_budget(arms: Path) -> None:
-    good = configuration_check(arm_model(load_arm(arms / "wam7_canopen.yaml")))
+    fits, over = load_arm(arms / "wam7_canopen.yaml"), load_arm(extended(arms, "torque_frames: single"))
+    good = configuration_check(arm_model(fits), make_arm(fits).bus_budget())
     assert good.verdict is Verdict.PASSED
-    bad = configuration_check(arm_model(load_arm(extended(arms, "torque_frames: single"))))
+    bad = configuration_check(arm_model(over), make_arm(over).bus_budget())
     assert bad.verdict is Verdict.FAILED
     assert "over budget" in bad.reason
     assert "500 Hz" in bad.remedy
@@ -143,6 +145,22 @@ def test_a_drive_that_would_take_its_torque_back_below_a_joints_velocity_limit_i
     (what,) = told(2.51)
     assert "node 4 would give no torque above max_speed 430" in what
     assert "its motor turns at 431" in what
+
+
+def test_a_joints_torque_limit_and_what_its_gears_give_are_not_units_apart() -> None:
+    """Before anything is energised: N m m for N m, or a gear left out, is a factor of 10 or 1000 somewhere."""
+    config = load_arm("wam7_canopen")
+    driver, names = config.driver, list(config.joints)
+    limits = [joint.torque for joint in config.joints.values()]
+
+    def told(factor: float) -> list[str]:
+        torques = [None if limit is None else factor * limit for limit in limits]
+        return [what for _, what in disagreements(driver, config.transmission, names, 500.0, torques=torques)]  # type: ignore[arg-type]
+
+    assert told(1.0) == []
+    for factor in (1e3, 1e-3):
+        assert len(told(factor)) == len(names)
+        assert "which is another unit or gear" in told(factor)[0]
 
 
 def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) -> None:

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from drivers.canopen.motor_units import Coordinates, coordinates, torque_limit_counts, unwrapped
+from drivers.canopen.motor_units import coordinates, torque_limit_counts
+from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.recording import Transmission
 from ident_service.errors import DriverError
 

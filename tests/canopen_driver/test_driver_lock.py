@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 
 from drivers.can.can_link import BusLock
-from ident_service.config.canopen import CanBus
+from ident_service.config.can_bus import CanBus
 from ident_service.errors import DriverError
 
 HOLDER = """
 import sys
 from drivers.can.can_link import BusLock
-from ident_service.config.canopen import CanBus
+from ident_service.config.can_bus import CanBus
 lock = BusLock(CanBus(interface=sys.argv[1], channel=sys.argv[2]))
 print("held", flush=True)
 sys.stdin.read()

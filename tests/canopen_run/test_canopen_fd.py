@@ -26,9 +26,9 @@ from canopen_run_bench import (
     write,
 )
 
+from drivers.can.bus_load import unstuffed
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link, open_links
-from drivers.canopen.bus_load import unstuffed
 from drivers.canopen.pdo_mapping import SDO_REPLY, SDO_REQUEST, SYNC
 from ident_service.cli import main
 from ident_service.config.load import load_arm

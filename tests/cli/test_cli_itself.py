@@ -128,6 +128,40 @@ def test_help_loads_no_large_library(words: list[str]) -> None:
     assert done.stderr == "[]\n"
 
 
+# What the common case may load: a quarter of its processor time is imports. Every other package waits for who needs it.
+IDENTIFY_LOADS = {
+    *("ident_service", "drivers", "numpy", "pinocchio", "coal", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
+    *("pydantic", "pydantic_core", "annotated_types", "typing_extensions", "typing_inspection"),  # configurations
+    *("mcap", "lz4", "zstandard"),  # recordings
+    # Clarabel takes LAPACK from scipy.linalg.
+    *("scipy", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),
+    *("scipy._cyutility", "scipy._distributor_init", "scipy._distributor_init_local"),
+    *("charset_normalizer", "cython_runtime"),  # numpy's, where it is there
+    *("cmeel_pth", "sitecustomize", "usercustomize", "distutils-precedence"),  # of environments
+}
+NOT_OF_PYTHON = {"urllib.request", "http.client", "ssl", "xml.sax", "sqlite3", "asyncio", "multiprocessing"}
+
+
+@pytest.mark.slow
+def test_identification_loads_what_it_needs(quick: Commissioned, tmp_path: Path) -> None:
+    words = ["identify", str(quick.folder / "identification.mcap"), "--arm", str(quick.arm), "--json"]
+    program = (
+        "import sys\n"
+        "from ident_service.cli import main\n"
+        f"code = main({[*words, '--out', str(tmp_path / 'result')]!r})\n"
+        "print(*sorted(sys.modules), file=sys.stderr)\n"
+        "sys.exit(code)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode in (0, 3), done.stderr
+    modules = done.stderr.splitlines()[-1].split()
+    packages = {name.split(".")[0] for name in modules} - set(sys.stdlib_module_names)
+    foreign = {name for name in packages - {"scipy"} if not name.startswith("_")}
+    foreign |= {".".join(name.split(".")[:2]) for name in modules if name.split(".")[0] == "scipy"}
+    assert foreign <= IDENTIFY_LOADS
+    assert not NOT_OF_PYTHON & set(modules)
+
+
 def test_foreign_packages_of_the_same_name_are_refused(
     ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

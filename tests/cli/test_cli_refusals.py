@@ -98,12 +98,12 @@ def identify(place: Path, quick: Commissioned, recording: Path) -> tuple[object,
 def test_wrong_joint_count(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
     wide = replace(samples, position=np.tile(samples.position, 3), torque=np.tile(samples.torque, 3))
     path = wide.write(place / "six.csv")
-    refused(place, ident, identify(place, quick, path), 1, f"{path}: has 6 joints but the arm has 2")
+    refused(place, ident, identify(place, quick, path), 2, f"{path}: has 6 joints but the arm has 2")
 
 
 def test_recording_of_another_arm(place: Path, quick: Commissioned, ident: Ident) -> None:
     words = ("identify", quick.folder / "identification.mcap", "--arm", "wam7", "--out", place / "out")
-    refused(place, ident, words, 1, str(quick.folder / "identification.mcap"))
+    refused(place, ident, words, 2, str(quick.folder / "identification.mcap"))
 
 
 @pytest.mark.parametrize(("column", "name"), [("position", "position"), ("torque", "torque")])
@@ -115,14 +115,14 @@ def test_samples_that_are_no_numbers(
     values[7000, 1] = value
     path = replace(samples, **{column: values}).write(place / "nan.csv")
     message = f"{path}: line 7002, 7.000000 s after the first: {name} of joint "
-    ended = refused(place, ident, identify(place, quick, path), 1, message)
+    ended = refused(place, ident, identify(place, quick, path), 2, message)
     assert f" is {value};" in ended.err
 
 
 def test_one_second(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
     short = Samples(samples.time[:1000], samples.position[:1000], samples.torque[:1000])
     path = short.write(place / "short.csv")
-    ended = refused(place, ident, identify(place, quick, path), 1, f"{path}: ")
+    ended = refused(place, ident, identify(place, quick, path), 2, f"{path}: ")
     assert "at least 1." in ended.err
 
 
@@ -131,28 +131,28 @@ def test_torn_last_row(place: Path, quick: Commissioned, samples: Samples, ident
     whole = path.read_text()
     path.write_text(whole[: whole.rindex(",")])
     lines = whole.count("\n")
-    refused(place, ident, identify(place, quick, path), 1, f"{path}: line {lines}: has 4 fields but the header has 5")
+    refused(place, ident, identify(place, quick, path), 2, f"{path}: line {lines}: has 4 fields but the header has 5")
 
 
 def test_time_that_stands_still(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
     time = samples.time.copy()
     time[500] = time[499]
     path = replace(samples, time=time).write(place / "stuck.csv")
-    refused(place, ident, identify(place, quick, path), 1, "line 502, 0.499000 s after the first: the stamp does not")
+    refused(place, ident, identify(place, quick, path), 2, "line 502, 0.499000 s after the first: the stamp does not")
 
 
 def test_a_joint_that_never_moves(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
     position = samples.position.copy()
     position[:, 1] = 0.5
     path = replace(samples, position=position).write(place / "still.csv")
-    refused(place, ident, identify(place, quick, path), 1, "elbow: never faster than")
+    refused(place, ident, identify(place, quick, path), 2, "elbow: never faster than")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello\n", b"\x00\x01\x02", b"t,q1,tau1\n"])
 def test_files_that_are_no_recordings(place: Path, quick: Commissioned, ident: Ident, content: bytes) -> None:
     path = place / "other.csv"
     path.write_bytes(content)
-    refused(place, ident, identify(place, quick, path), 1, str(path))
+    refused(place, ident, identify(place, quick, path), 2, str(path))
 
 
 @pytest.mark.slow
@@ -202,16 +202,16 @@ def test_parameter_files_that_do_not_fit(place: Path, ident: Ident) -> None:
     path.write_text("{}")
     message = f'{path}: not a parameter file: $: "format" is a required property; $: "version" is a required property; '
     for words in (("feasible", path), ("correct", path, "--out", place / "c.json")):
-        refused(place, ident, words, 1, message)
+        refused(place, ident, words, 2, message)
     path.write_text(json.dumps(TABLE).replace("-1.0", "NaN"))
-    refused(place, ident, ("feasible", path), 1, f"{path}: not JSON: NaN is not a number that JSON knows")
+    refused(place, ident, ("feasible", path), 2, f"{path}: not JSON: NaN is not a number that JSON knows")
     path.write_text(json.dumps(TABLE).replace("m1", "m9"))
-    refused(place, ident, ("feasible", path, "--arm", "planar2"), 1, "no parameter is called 'm9'")
+    refused(place, ident, ("feasible", path, "--arm", "planar2"), 2, "no parameter is called 'm9'")
 
 
 def test_a_file_about_another_arm(place: Path, quick: Commissioned, ident: Ident) -> None:
     words = ("feasible", quick.folder / "parameters.json", "--arm", "wam7")
-    refused(place, ident, words, 1, "is about the arm planar2 with other joints than wam7")
+    refused(place, ident, words, 2, "is about the arm planar2 with other joints than wam7")
 
 
 def test_a_correction_that_cannot_be_written(place: Path, ident: Ident) -> None:
@@ -227,7 +227,7 @@ def test_conditions_that_contradict_each_other(place: Path, ident: Ident) -> Non
     path.write_text(json.dumps(TABLE))
     assert ident("feasible", path, "--arm", arm).code == 3
     words = ("correct", path, "--arm", arm, "--out", place / "c.json")
-    refused(place, ident, words, 1, "feasibility correction: the solver stopped with status PrimalInfeasible")
+    refused(place, ident, words, 2, "feasibility correction: the solver stopped with status PrimalInfeasible")
 
 
 def test_an_existing_run_folder_is_not_touched_by_simulate(place: Path, quick: Commissioned, ident: Ident) -> None:
@@ -258,7 +258,7 @@ def test_identify_replaces_an_earlier_result_and_nothing_else(place: Path, quick
     # An unusable recording does not touch what is there.
     (place / "bad.csv").write_text("hello\n")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
-    assert ident(*identify(place, quick, place / "bad.csv")).code == 1
+    assert ident(*identify(place, quick, place / "bad.csv")).code == 2
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 

@@ -84,7 +84,7 @@ def test_a_changed_file_is_refused(folder: Path, ident: Ident) -> None:
     path = folder / "evidence.json"
     path.write_bytes(path.read_bytes()[:-100])
     ended = ident("report", folder)
-    assert ended.code == 1
+    assert ended.code == 2
     assert "evidence.json: not what the manifest names" in ended.err
 
 

@@ -71,7 +71,7 @@ def test_identify_refuses_what_is_torn_before_its_first_sample_in_one_sentence(
     torn = tmp_path / "run.mcap.partial"
     torn.write_bytes((quick.folder / "identification.mcap").read_bytes()[:size])
     ended = ident("identify", torn, "--arm", quick.arm, "--out", tmp_path / "found")
-    assert ended.code == 1
+    assert ended.code == 2
     assert ended.err.startswith(f"ident: {torn}: ")
     assert ended.err.count("\n") == 1
     assert not (tmp_path / "found").exists()
@@ -317,7 +317,7 @@ def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: 
         if covariance is None:
             del table["covariance"]
         refused = correct("none.json")
-        assert refused.code == 1
+        assert refused.code == 2
         assert reason in refused.err
         assert not (tmp_path / "none.json").exists()
 

@@ -184,6 +184,25 @@ def test_a_bad_body_is_named_and_the_good_one_kept(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
+def test_all_that_no_urdf_says_is_told_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, said = described(tmp_path, BARS, capsys)
+    text = (tmp_path / "bars.yaml").read_text()
+    for key in (
+        *("gravity", "terms", "acceleration", "jerk", "following_error", "drive_inertia", "kp 400", "home"),
+        *("total_mass", "500 Hz", "after_stop", "friction_guess", "motions", "driver", "workspace: clearance 0.02 m"),
+    ):
+        assert key in said
+    assert all(f"#   {line}\n" in text for line in said.splitlines())
+    # The simulated brakes are written down as a question about the real ones.
+    assert config.control.after_stop == "brake"
+    assert "Of a real arm say in\n# the braces of each joint `brake: true` or `brake: false`" in text
+    assert main(["config", "check", str(tmp_path / "bars.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert "after a stop: held for two seconds, then switched off; its brakes hold shoulder, elbow\n" in told
+    assert "  ASSUMED: brakes of shoulder, elbow, because the drives are simulated; for real ones" in told
+
+
+@pytest.mark.slow
 def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rounded = BARS.replace('xyz="0.4 0 0" rpy="0 0 0"', 'xyz="0.4 0 0" rpy="1.5708 0 0"')
     assert rounded != BARS
@@ -194,7 +213,7 @@ def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.Captu
 
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "bars.urdf").write_text(BARS.replace(BOUNDS, 'lower="-115" upper="115"'))
-    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 1
+    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 2
     assert "shoulder turns from -115 to 115 rad: limits of a URDF are radians" in capsys.readouterr().err
     assert not (tmp_path / "bars.yaml").exists()
 
@@ -210,9 +229,9 @@ def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize(
     ("text", "code", "words"),
     [
-        ("no xml", 1, "not a URDF that can be read"),
-        ('<robot name="x"><link name="a"/></robot>', 1, "no movable joint"),
-        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 1, "2 links hang on no joint"),
+        ("no xml", 2, "not a URDF that can be read"),
+        ('<robot name="x"><link name="a"/></robot>', 2, "no movable joint"),
+        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 2, "2 links have no parent joint"),
     ],
 )
 def test_a_file_that_holds_no_arm_leaves_nothing(

@@ -25,7 +25,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.identify import identify
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.pinocchio_models import InverseDynamics, joint_frame_inertias
+from ident_service.model.pinocchio_models import InverseDynamics, pinocchio_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.state_machine import State
 from ident_service.operations.commissioning import record_motion, true_parameters
@@ -138,7 +138,9 @@ def test_a_recording_is_readable_by_a_ros_2_reader(wam_run: WamRun) -> None:
 def test_the_urdf_has_the_identified_inertias(wam_run: WamRun) -> None:
     content = json.loads((wam_run.folder / "parameters.json").read_text())
     model = wam_run.model
-    wanted = joint_frame_inertias(model.chain, model.layout, np.array(content["link_parameters"]["values"]))
+    wanted = pinocchio_model(
+        model.chain, model.layout, np.array(content["link_parameters"]["values"])
+    ).inertias.tolist()[1:]
     loaded = pin.buildModelFromUrdf(str(wam_run.folder / "identified.urdf"))
     assert list(loaded.names)[1:] == list(model.chain.names)
     for inertia, meant in zip(list(loaded.inertias)[1:], wanted, strict=True):

@@ -5,10 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pinocchio
 import pytest
 from model.test_locked_joints import PANDA
 
 from ident_service.cli import main
+from ident_service.config.quantities import TextFile
+from ident_service.errors import ModelError
+from ident_service.model.mechanism import require_urdf
 
 ARM = """\
 format: ident-arm
@@ -115,3 +119,93 @@ def test_a_name_that_no_file_can_have_is_a_mistake(folder: Path, capsys: pytest.
 def test_without_a_mistake_it_is_good(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "arm.yaml").write_text(ARM)
     assert main(["config", "check", str(folder / "arm.yaml")]) == 0, capsys.readouterr().err
+
+
+BODY = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+URDF = f"""\
+<robot name="r">
+<link name="base">{BODY}</link>
+<link name="b">{BODY}</link>
+<joint name="j" type="revolute">
+<parent link="base"/>
+<child link="b"/>
+<origin xyz="0 0 1" rpy="0 0 0"/>
+<axis xyz="0 0 1"/>
+<limit lower="-1" upper="1" velocity="1" effort="10"/>
+</joint>
+</robot>
+"""
+LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="10"/>'
+REFUSED = [
+    (
+        '<link name="base">',
+        '<link name="ground">',
+        "5: joint 'j': its parent link 'base' is declared nowhere; add <link",
+    ),
+    ('effort="10"', 'effort="abc"', "9: joint 'j': limit effort is 'abc'; give a number of N m (N of a slide)"),
+    ('lower="-1"', 'lower="nan"', "9: joint 'j': limit lower is 'nan'; give a number of rad (m of a slide)"),
+    (' velocity="1"', "", "9: joint 'j': its limit has no velocity; give it in rad/s (m/s of a slide)"),
+    (LIMIT, "", "4: joint 'j': is revolute and has no limit; give <limit lower= upper= effort= velocity=>"),
+    ('axis xyz="0 0 1"', 'axis xyz="0 0"', "8: joint 'j': axis xyz is '0 0'; give three numbers"),
+    ('rpy="0 0 0"', 'rpy="0 90deg 0"', "7: joint 'j': origin rpy is '0 90deg 0'; give three numbers"),
+    (
+        "revolute",
+        "hinge",
+        "4: joint 'j': type 'hinge' is none of revolute, prismatic, continuous, fixed, floating, planar",
+    ),
+    ('<parent link="base"/>', "", "4: joint 'j': names no parent link; give <parent link=...>"),
+    ('<link name="b">', '<link name="base">', "3: link 'base' is there already, in line 2; rename one of them"),
+    ('<joint name="j"', "<joint", "4: a joint without a name; give <joint name=...>"),
+    ('<robot name="r">', "<robot>", "1: the robot has no name; give <robot name=...>"),
+    (LIMIT, f'{LIMIT}<mimic multiplier="two"/>', "9: joint 'j': mimic multiplier is 'two'; give a number"),
+    (LIMIT, f'{LIMIT}<dynamics damping="x"/>', "9: joint 'j': dynamics damping is 'x'; give a number"),
+    (
+        "</robot>",
+        '<link name="far"/></robot>',
+        "11: 2 links hang on no joint: 'base' (line 2), 'far' (line 11); a URDF is",
+    ),
+]
+TAKEN = [
+    ("revolute", "continuous"),
+    (LIMIT, '<limit velocity="+1.e0" effort=" 10"/>'),
+    (LIMIT, f'{LIMIT}<limit effort="x"/>'),
+    (LIMIT, f'{LIMIT}<dynamics damping="0.5"/><safety_controller k_velocity="1"/>'),
+    ("</robot>", '<gazebo><link name="x"/></gazebo><transmission name="t"><joint name="j"/></transmission></robot>'),
+    ("</link>", '<visual><geometry><box size="a"/></geometry></visual></link>'),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "said"), REFUSED)
+@pytest.mark.parametrize("verb", [("config", "check"), ("base",), ("new",)])
+def test_what_a_urdfs_parser_refuses_is_told_with_its_line_and_in_our_words(
+    tmp_path: Path, old: str, new: str, said: str, verb: tuple[str, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert old in URDF
+    (tmp_path / "r.urdf").write_text(URDF.replace(old, new))
+    arm = tmp_path / "arm.yaml"
+    arm.write_text("format: ident-arm\nversion: 1\nname: r\nkinematics: {urdf: r.urdf}\n")
+    given = [str(tmp_path / "r.urdf"), "--out", str(tmp_path / "o" / "x.yaml")] if verb == ("new",) else [str(arm)]
+    assert main([*verb, *given]) == 2
+    err = capfd.readouterr().err  # what libraries in C++ write as well
+    assert err.startswith("ident: r.urdf:" if verb == ("new",) else f"ident: {arm}:4:1: kinematics: r.urdf:")
+    assert f"r.urdf:{said}" in err
+    assert len(err.splitlines()) == 1
+    assert not (tmp_path / "o").exists()
+    with pytest.raises(ValueError, match="valid URDF"):
+        pinocchio.buildModelFromXML((tmp_path / "r.urdf").read_text())
+
+
+@pytest.mark.parametrize(("old", "new"), [("", ""), *TAKEN])
+def test_nothing_is_refused_that_the_parser_takes(old: str, new: str) -> None:
+    text = URDF.replace(old, new) if old else URDF
+    assert old in URDF
+    pinocchio.buildModelFromXML(text)
+    require_urdf(TextFile(name="r.urdf", text=text))
+
+
+def test_of_many_mistakes_the_first_are_told() -> None:
+    text = URDF.replace('"0 0 1"', '"x"').replace('lower="-1" upper="1" velocity="1" effort="10"', 'lower="y"')
+    text = text.replace('rpy="0 0 0"', 'rpy="z"').replace('"revolute"', f'"{"w" * 5000}"')
+    with pytest.raises(ModelError, match=r"^r\.urdf:4: .*r\.urdf:7: .*r\.urdf:7: .*; and 2 more$") as caught:
+        require_urdf(TextFile(name="r.urdf", text=text))
+    assert len(str(caught.value)) < 1000

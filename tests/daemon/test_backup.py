@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sqlite3
+import sys
 import tarfile
 import threading
 import time
@@ -17,6 +18,7 @@ import pytest
 from daemon.conftest import Asked, quick_text
 from daemon.served import daemon_process
 from helpers.forks import fork
+from helpers.small_disk import run_on_small_disk
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -150,7 +152,7 @@ def test_a_backup_harms_no_file_and_lies_outside(full: Path, tmp_path: Path) -> 
     with pytest.raises(UsageError, match="no registry"):
         back_up(tmp_path / "nothing", tmp_path / "b.tar")
     (full / FILE).write_bytes((full / FILE).read_bytes()[:5000])
-    with pytest.raises(UsageError, match="cannot be copied"):
+    with pytest.raises(UsageError, match=r"registry\.sqlite: is damaged"):
         back_up(full, tmp_path / "b.tar")
     assert not (tmp_path / "b.tar").exists()
 
@@ -232,9 +234,34 @@ def test_a_foreign_file_is_one_clear_error(tmp_path: Path, kind: str, capsys: py
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert str(file) in said or str(state) in said
-    assert content(state) == {}
-    assert [path.name for path in state.iterdir()] == ["serve.lock"]
+    assert not state.exists()
     assert not (tmp_path / "evil").exists()
+
+
+def test_a_refused_restore_leaves_what_was_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, above, empty = tmp_path / "b.tar", tmp_path / "above", tmp_path / "empty"
+    file.write_bytes(FOREIGN["text"])
+    empty.mkdir(mode=0o700)
+    for state in (above / "state", empty):
+        assert main(["restore", str(file), "--state", str(state)]) == 2
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["b.tar", "empty"]
+    (empty / "serve.lock").write_text("")  # of a daemon that served it once
+    assert main(["restore", str(file), "--state", str(empty)]) == 2
+    assert [path.name for path in empty.iterdir()] == ["serve.lock"]
+    assert "is no backup" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size", ["8k", "96k"])  # in the midst of the registry's copy, and of the other files
+def test_a_full_disk_of_the_backup_is_named_as_such(full: Path, tmp_path: Path, size: str) -> None:
+    (full / "runs" / "20261101T080000-quick" / "run.mcap").write_bytes(bytes(200_000))
+    disk = tmp_path / "disk"
+    script = f"$0 -m ident_service backup {disk}/b.tar --state {full}; echo $?; ls -A {disk}"
+    ended = run_on_small_disk(disk, size, script, sys.executable)
+    assert (
+        ended.stderr
+        == f"ident: {disk}/b.tar: cannot be written: its disk is full; make room there, or give another place\n"
+    )
+    assert ended.stdout == "1\n"  # and no file
 
 
 def test_a_state_that_is_in_use_is_left_alone(full: Path, tmp_path: Path, good: bytes) -> None:

@@ -231,12 +231,18 @@ def test_a_log_that_nobody_reads_keeps_nobody() -> None:
             log.info("line", extra={"number": k, "filler": "x" * 200})  # at all: a pipe holds 64 kB
         reading = threading.Thread(target=lambda: lines.extend(read))
         reading.start()
+        while not handler._lines.empty():  # `close` waits for a second at most, however busy the machine is
+            time.sleep(0.01)
         handler.close()
+        handler._thread.join()
         stream.close()
         reading.join()
     numbers = [json.loads(line)["number"] for line in lines]
-    assert numbers == list(range(len(numbers)))
-    assert 1000 <= len(numbers) < 5000
+    # The queue holds the first thousand. Then the pipe fills, line by line, whenever the writing thread gets its turn:
+    # which lines find room until both are full depends on when that is.
+    assert numbers[:1000] == list(range(1000))
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) < 5000
 
 
 def test_what_is_said_again_and_again_is_left_out_and_counted() -> None:

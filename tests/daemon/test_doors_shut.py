@@ -320,7 +320,11 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_challenge(daemon: Asked, view
     refusal(asked({"name": "planar2", "challenge": "made up"}), 409)
     refusal(asked({"name": "planar2", "challenge": daemon.challenge("sixaxis")}), 409)
     word = daemon.challenge("planar2")
-    refusal(asked({"name": "Planar2", "challenge": word}), 409)
+    refusal(
+        asked({"name": "Planar2", "challenge": word}),
+        409,
+        "planar2: the typed name 'Planar2' is not this arm's; nothing",
+    )
     refusal(asked({"name": "planar2", "challenge": word}), 409)  # the wrong name has used it up
     word = daemon.challenge("planar2")
     owner = dict(daemon.headers)

@@ -334,6 +334,16 @@ def test_parameters_are_identified_from_ones_own_data(
         assert recording["run"] == validation["run"]  # it was sent once
         assert answer["answer"]["relative_error_percent"] < 3.0
         _same_by_id(client, recording["run"])
+        # What they trim is left out as here.
+        (tmp_path / "trimmed.yaml").write_text(COLUMNS + "trim: [1.5, 0.5]\n")
+        arm, trimmed = tmp_path / "quick.yaml", f"--columns={tmp_path / 'trimmed.yaml'}"
+        arm.write_text(quick_text())
+        here = ["identify", str(table), "--arm", str(arm), trimmed, "--out", str(tmp_path / "here"), "--json"]
+        assert main(here) == 0
+        at_home = json.loads(capsys.readouterr().out)
+        assert main(["identify", str(table), "--arm", "quick", "--json", *there[:4], trimmed]) == 0
+        away = json.loads(capsys.readouterr().out)["answer"]
+        assert away["relative_error_percent"] == at_home["relative_error_percent"]
         # Its columns come with it; without them the arm's description does not fit.
         bare = client.upload("quick", table)
         ended = client.wait(client.begin("identify", arm="quick", recordings=[bare]).id)

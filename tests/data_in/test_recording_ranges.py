@@ -157,12 +157,39 @@ def test_a_columns_file_for_one_recording(tmp_path: Path) -> None:
     np.testing.assert_allclose(whole(read).torque[:, 1], -2.0 * whole(open_recording(ours)).torque[400:1800, 1])
     with pytest.raises(UsageError, match=r"other\.csv is none of the recordings"):
         own_formats({tmp_path / "other.csv": columns}, named, model)
-    columns.write_text("{trim: [1, 1], stamps: arrival, columns: {t: time, q1: a, tau1: c}}\n")
-    with pytest.raises(UsageError, match=r"theirs\.yaml: trim, stamps is of all recordings"):
+    columns.write_text("{gap: 4, stamps: arrival, columns: {t: time, q1: a, tau1: c}}\n")
+    with pytest.raises(UsageError, match=r"theirs\.yaml: gap, stamps is of all recordings"):
         own_formats({theirs: columns}, named, model)
     columns.write_text("{torque_side: motor, columns: {t: time, q1: a, tau1: c}}\n")
     with pytest.raises(UsageError, match=r"torque_side: motor, but there is no transmission; .* 1 joints, but the arm"):
         own_formats({theirs: columns}, named, model)
+
+
+@pytest.mark.parametrize("general", ["", "recording: {trim: [0.5, 0.25]}\n"])
+def test_what_is_trimmed_of_one_recording_is_what_is_trimmed_of_all(tmp_path: Path, general: str) -> None:
+    path, columns = written(tmp_path / "run.csv", header="time,a,b,c,d", still=(700, 460)), tmp_path / "own.yaml"
+    columns.write_text("{trim: [2, 1.5], columns: {t: time, q1: a, q2: b, tau1: c, tau2: d}}\n")
+    arm = Path(described(tmp_path))
+    arm.write_text(arm.read_text() + general)
+    wanted = identify_files(Request(str(arm), (path,), columns=columns), tmp_path / "all")
+    found = identify_files(Request(str(arm), (path,), columns_of={path: columns}), tmp_path / "one")
+    assert found.estimate.samples == wanted.estimate.samples
+    np.testing.assert_array_equal(found.estimate.beta, wanted.estimate.beta)
+    assert wanted.estimate.samples < 4160 - 3.5 / PERIOD
+
+
+def test_others_keep_the_trim_of_the_description(tmp_path: Path) -> None:
+    ours, theirs = written(tmp_path / "ours.csv"), written(tmp_path / "theirs.csv", header="time,a,b,c,d")
+    columns = tmp_path / "own.yaml"
+    columns.write_text("{trim: [2, 1], columns: {t: time, q1: a, q2: b, tau1: c, tau2: d}}\n")
+    arm = Path(described(tmp_path))
+    arm.write_text(arm.read_text() + "recording: {trim: [0.5, 0.25]}\n")
+    found = identify_files(Request(str(arm), (ours,), (theirs,), columns_of={theirs: columns}), tmp_path / "out")
+    alone = identify_files(Request(str(arm), (ours,)), tmp_path / "alone")
+    assert found.estimate.samples == alone.estimate.samples
+    columns.write_text("{trim: [10, 10], columns: {t: time, q1: a, q2: b, tau1: c, tau2: d}}\n")
+    with pytest.raises(RecordingError, match=r"theirs\.csv: nothing is left after trimming 10 s and 10 s of 14\.995 s"):
+        identify_files(Request(str(arm), (ours,), (theirs,), columns_of={theirs: columns}), tmp_path / "none")
 
 
 def test_words_that_cannot_be_meant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

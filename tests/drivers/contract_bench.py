@@ -119,9 +119,60 @@ def fd(faults: Sequence[dict[str, Any]] = ()) -> Bench:
     return canopen(faults, canopen_config(buses=[bus]))
 
 
+def pucks_config(*, firmware: int = 200, **driver: Any) -> ArmConfig:
+    """The bench behind two pucks with gears of 1, whose counts are whole parts of its limits; home on whole counts."""
+    content = bench_config().model_dump(mode="json", exclude={"driver"})
+    for joint, counts in zip(content["joints"].values(), (5216, 1044), strict=True):
+        joint["home"] = 2.0 * np.pi / 65536 * counts  # 0.5 and 0.1
+    emulation = {
+        "truth": bench_config().model_dump(mode="json")["driver"]["truth"],
+        "firmware": firmware,
+        "operator": 0.05,
+    }
+    section = {
+        "kind": "barrett",
+        "bus": {"interface": "lock_step", "channel": "bench"},
+        "pucks": [
+            {"node": 1, "cts": 65536, "ipnm": 512, "mt": 5120},
+            {"node": 5, "cts": 65536, "ipnm": 512, "mt": 2560},
+        ],
+        "emulation": emulation,
+    }
+    section |= driver | {"emulation": emulation | driver.get("emulation", {})}
+    transmission = {"ratios": [1.0, 1.0], "drive_terms": "joints"}
+    return ArmConfig.model_validate(content | {"transmission": transmission, "driver": section})
+
+
+def pucks(faults: Sequence[dict[str, Any]] = (), config: ArmConfig | None = None, *, zeroed: bool = True) -> Bench:
+    """Two emulated pucks, zeroed by a person; another one presses Shift-Activate whenever it is waited for."""
+    from drivers.barrett.driver import BarrettArm
+    from ident_service.config.simulation import SimulatedFault
+    from sim_backend.emulator.faults import configured
+    from sim_backend.emulator.lock_step import LockStepArm
+    from sim_backend.machine import Truth
+
+    config = config or pucks_config()
+    behind = LockStepArm(config)
+    truths: list[Truth] = []
+    behind.emulator.observer = truths.append
+    arm = BarrettArm(config, lambda _: [behind.link(0)])
+    wanted = [SimulatedFault.model_validate(fault) for fault in faults]
+    strike = configured(wanted, ("turn", "slide"), PERIOD_NS * 1e-9)
+    if zeroed:
+        arm.zero()
+    return Bench(arm, lambda: truths[-1].velocity, lambda: truths[-1].position, lambda: behind.inject(*strike))
+
+
+def old_pucks(faults: Sequence[dict[str, Any]] = ()) -> Bench:
+    """Pucks with firmware whose properties have other numbers."""
+    return pucks(faults, pucks_config(firmware=40))
+
+
 BACKENDS: dict[str, Callable[..., Bench]] = {
     "canopen": canopen,
     "fd": fd,
+    "old pucks": old_pucks,
+    "pucks": pucks,
     "relative": relative,
     "separate": separate,
     "simulated": simulated,

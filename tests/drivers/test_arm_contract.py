@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from contract_bench import BACKENDS, PERIOD_NS, canopen, relative_config
+from contract_bench import BACKENDS, PERIOD_NS, canopen, pucks, relative_config
 from helpers.forks import fork_plants
 
 from drivers.arm import StopKind
@@ -335,7 +335,7 @@ def test_leaving_closes_whatever_happened(bench):
 
 
 def test_what_zeroing_says_does_not_depend_on_the_arm_being_open(bench, request):
-    needs_it = request.node.callspec.params["bench"] == "relative"
+    needs_it = request.node.callspec.params["bench"] in ("relative", "pucks", "old pucks")
     if needs_it:
         assert len(bench.arm.zero()) == 2
     else:
@@ -352,8 +352,9 @@ def test_what_zeroing_says_does_not_depend_on_the_arm_being_open(bench, request)
         np.testing.assert_array_equal(after.torque, 0.0)
 
 
-def test_a_position_is_told_only_by_an_arm_that_knows_it():
-    bench = canopen(config=relative_config())
+@pytest.mark.parametrize("backend", ["relative", "pucks"])
+def test_a_position_is_told_only_by_an_arm_that_knows_it(backend):
+    bench = canopen(config=relative_config()) if backend == "relative" else pucks(zeroed=False)
     for act in (bench.arm.open, bench.arm.look().open):
         with pytest.raises(PositionUnknown):
             act()

@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from helpers.emulated_arms import weightless_config
@@ -23,7 +24,7 @@ from ident_service.config.drive_family import family_from
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, DriverError, UsageError
-from ident_service.operations.fieldbus import Probe, bus_probe, probe_document, probe_text
+from ident_service.operations.fieldbus import Probe, bus_probe, keep_outcome, probe_document, probe_text
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.process import emulate
 
@@ -175,7 +176,7 @@ def test_an_arm_without_a_bus_is_refused() -> None:
 def test_every_shipped_family_says_where_its_facts_are_from() -> None:
     families = shipped_families()
     assert families[-1].name == "generic402"
-    assert len({family.name for family in families}) == len(families) > 6
+    assert len({family.name for family in families}) == len(families) > 12
     for family in families:
         assert not family.proved  # nobody has run one on hardware yet
         assert family.match.vendor is not None or family is families[-1]
@@ -191,6 +192,63 @@ def test_families_are_found_by_vendor_and_product_and_the_users_come_first() -> 
     mine = family_from("mine.yaml", "{name: mine, proved: yes, match: {vendor: 0xFB}, sources: {match: my bench}}")
     assert family_of({"vendor": 0xFB, "product": 1}, [mine]).name == "mine"
     assert family_of({"vendor": 0xFB, "product": 1}, [mine]).torque_limit == shipped_families()[-1].torque_limit
+
+
+# Families of which no file is at hand: the vendor, and entries that only the family knows.
+UNSEEN = {
+    "ZeroErr eDriver": (0x5A65726F, {0x607200: 1000}),
+    "Copley": (0xAB, {0x607200: 1000}),
+    "Nanotec": (0x26C, {0x203B01: 2000, 0x607200: 0}),
+    "Synapticon SOMANET": (0x22D2, {0x607200: 1000, 0x200401: 7}),
+    "Kollmorgen AKD": (0x6A, {0x607300: 1000}),
+}
+
+
+@needs_sheets
+@pytest.mark.parametrize("name", UNSEEN)
+def test_makers_without_a_file_at_hand_are_emulated_by_what_their_family_says(name: str) -> None:
+    """An anonymous drive's file with the maker's number and entries: opened, enabled, given a torque that acts."""
+    vendor, own = UNSEEN[name]
+    text = sheet("e35.eds")["text"].replace("VendorNumber=101", f"VendorNumber={vendor:#x}")
+    head, tail = text.split("[1018sub1]")
+    text = head + "[1018sub1]" + tail.replace("DefaultValue=0xFF", f"DefaultValue={vendor:#x}", 1)
+    if 0x607200 not in own:
+        text = text.replace("[6072]", "[5FFE]")
+    for key, value in own.items():
+        if key >> 8 not in (0x6072, 0x6073):
+            index, sub = f"{key >> 8:04X}", key & 0xFF
+            text += f"\n[{index}]\nSubNumber=2\nObjectType=0x9\n[{index}sub0]\nDataType=5\nDefaultValue=1\n"
+            kind = 7 if key == 0x203B01 else 6
+            text += f"[{index}sub{sub:X}]\nDataType={kind}\nAccessType=rw\nDefaultValue={value}\n"
+    constant = {"torque_constant": 0.5} if name == "Nanotec" else {}
+    config = arm_of("e35.eds")
+    tree = config.model_dump(mode="json", by_alias=True)
+    file = {"name": "maker.eds", "text": text}
+    tree["driver"]["eds"], tree["driver"]["emulation"]["eds"] = file, [file]
+    for drive in tree["driver"]["drives"]:
+        drive.update({"eds": file} | constant)
+    config = ArmConfig.model_validate(tree)
+    bench = Bench(config)
+    found = bus_probe(config, (), bench.links)  # type: ignore[arg-type]
+    (first, _) = found.probed
+    assert first.can is not None
+    assert first.can.family.name == name
+    assert found.good, probe_text(config, found)
+    assert ("brake" in probe_document(config, found)["drives"][0]["facts"]) is (0x200401 in own)
+    with bench.arm as arm:
+        arm.enable()
+        for _ in range(20):
+            sample = arm.exchange(np.array([0.1, 0.05]))
+        np.testing.assert_allclose(sample.torque, [0.1, 0.05], atol=1.1e-3)
+        torques = bench.behind.emulator.body.truth(bench.behind.clock.now_ns()).torque
+        np.testing.assert_allclose(torques, sample.torque, rtol=1e-6, atol=1e-9)
+
+
+def test_an_ipos_is_refused_in_one_sentence_that_says_what_to_do() -> None:
+    family = family_of({"vendor": 0x1A3, "product": 1})
+    assert family.name == "Technosoft iPOS"
+    assert ". " not in family.refuse
+    assert "driver.streams to position" in family.refuse
 
 
 @pytest.mark.parametrize(
@@ -250,17 +308,22 @@ def arm_file(folder: Path, *, rated: float) -> Path:
 @needs_sheets
 @pytest.mark.slow
 def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    there, other = arm_file(tmp_path, rated=0.5), arm_file(tmp_path, rated=0.0005)
+    there, other, state = (
+        arm_file(tmp_path, rated=0.5),
+        arm_file(tmp_path, rated=0.05),
+        ["--state", str(tmp_path / "s")],
+    )
     end = threading.Event()
     thread = threading.Thread(target=lambda: emulate(load_arm(there), stop_requested=end.is_set))
     thread.start()
     try:
         until = time.monotonic() + 60.0
-        while main(["bus", "probe", str(there)]) != DONE:  # the drives are not there yet
+        while main(["bus", "probe", str(there), *state]) != DONE:  # the drives are not there yet
             assert "No SDO response received" in capsys.readouterr().out
             assert time.monotonic() < until
         assert capsys.readouterr().out.startswith("mixed: every drive can be driven; nothing was written\n")
-        assert main(["bus", "probe", str(other), "--json"]) == VERDICT_NO
+        first = json.loads((tmp_path / "s" / "arms" / "mixed" / "drives.json").read_text())
+        assert main(["bus", "probe", str(other), "--json", *state]) == VERDICT_NO
     finally:
         end.set()
         thread.join()
@@ -268,7 +331,31 @@ def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.C
     for drive in document["drives"]:
         (change,) = drive["can"]["changes"]
         assert change["where"] == "drives.rated_torque"
-        assert "wrong by 1000, which is another unit" in change["why"]
+        assert "wrong by 10, which is another unit" in change["why"]
+    assert [drive["can"]["identity"]["vendor"] for drive in first["drives"].values()] == [0xFB, 0xFF]
+    assert not [line for line in document["changed"] if "changes was" not in line]  # the drives are the same
+
+
+@needs_sheets
+def test_a_drive_that_cannot_keep_a_zero_is_told_so() -> None:
+    config = arm_of("maxon_epos4_50-8_0110h.eds")
+    at_home = config.model_copy(update={"driver": config.driver.model_copy(update={"zero": "at_home"})})  # type: ignore[union-attr]
+    text = probed(Bench(config), at_home)
+    assert "to change       driver.zero: at_home: it has no 1020h" in text
+
+
+def test_what_a_probe_found_is_kept_and_what_differs_is_told(tmp_path: Path) -> None:
+    path, can = tmp_path / "arms" / "a" / "drives.json", {"identity": {"vendor": 1}, "mode": 10, "asked": True}
+    drive = {"title": "drive 1", "node": 3, "silent": "", "can": can}
+    assert keep_outcome(path, {"drives": [drive]}) == []
+    assert keep_outcome(path, {"drives": [drive | {"silent": "no answer"}]}) == []
+    (line,) = keep_outcome(path, {"drives": [drive | {"can": can | {"mode": 4}}]})
+    assert line.startswith("drive 1, node 3: mode was 10, is 4 (probe of ")
+    (line,) = keep_outcome(path, {"drives": [drive | {"can": can | {"identity": {"vendor": 2}}}]})
+    assert "another drive than at the last probe" in line
+    path.write_text("{")
+    with pytest.raises(UsageError, match=r"cannot be read .*remove the file"):
+        keep_outcome(path, {"drives": [drive]})
 
 
 def test_emulated_drives_need_files_that_are_there(capsys: pytest.CaptureFixture[str]) -> None:

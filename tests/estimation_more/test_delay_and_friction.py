@@ -20,8 +20,9 @@ from ident_service.estimation.fit import prepare, unconstrained
 from ident_service.estimation.friction_fit import at_search_bounds, fit_friction, friction_trials, with_friction
 from ident_service.estimation.identify import identify
 from ident_service.estimation.least_squares import torque_error, weighted_least_squares
-from ident_service.estimation.shape_uncertainty import shape_covariance
+from ident_service.estimation.shape_uncertainty import ShapeUncertainty, shape_uncertainty
 from ident_service.estimation.torque_delay import Delay, estimate_delay, with_delay
+from ident_service.estimation.uncertainty import widening
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.friction_state import friction_direction
@@ -207,9 +208,10 @@ def rubbed(
     seconds: float = 40.0,
     noise: float = NOISE,
     seed: int = 2,
+    motion: Waves | None = None,
 ) -> SampledRecording:
     time = np.arange(round(seconds * RATE)) / RATE
-    q, dq, ddq = (slow_waves().derivative(time, order) for order in range(3))
+    q, dq, ddq = ((motion or slow_waves()).derivative(time, order) for order in range(3))
     s = friction_direction(dq, 1.0 / RATE, presliding)
     torque = np.einsum("jps,p->sj", joint_regressor(model.chain, model.layout, q, dq, ddq, direction=s), delta)
     return SampledRecording(
@@ -335,6 +337,61 @@ def test_deviations_of_friction_hold_where_its_shape_was_fitted(noise: float) ->
     assert wider[names.index("lx1")] < 1.02
 
 
+def test_degrees_of_freedom_of_both_parts_are_joined() -> None:
+    shape = ShapeUncertainty(np.diag([3.0, 0.0, 1.0]), np.array([2.0, np.inf, 5.0]), np.array([8.0, 8.0, 8.0]))
+    degrees = np.array([30.0, 5.0, 30.0])
+    deviations, joined = shape.joined(np.array([1.0, 2.0, np.inf]) * widening(degrees), degrees)
+    # Student's t has 97.5 % below 4.302653, 2.306004 and 2.570582 with 2, 8 and 5 degrees of freedom.
+    both = np.sqrt(2.306004**2 + 3.0 * 4.302653**2) / 1.959964
+    np.testing.assert_allclose(deviations, [both, 2.0 * 2.570582 / 1.959964, np.inf], rtol=1e-6)
+    np.testing.assert_allclose(joined, [16.0 / (1.0 / 8.0 + 9.0 / 2.0), 5.0, 8.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("slower", "noise", "seconds"), [(1.0, 0.3, 12.0), (0.5, 0.05, 24.0)])
+def test_two_deviations_are_95_percent_where_few_reversals_tell_the_shape(
+    slower: float, noise: float, seconds: float
+) -> None:
+    """The second drive turns round five times."""
+    model, base, delta = rubbing(FIT)
+    conditions = feasible_set("pseudo_inertia", base.names, model.config)
+    motion = slow_waves()
+    motion = replace(motion, frequency=motion.frequency * np.array([[1.0], [slower]]))
+    names = [base.names[column] for column in base.base]
+    friction = [names.index(name) for name in ("fv1", "fc1", "fs1", "fv2", "fc2", "fs2")]
+    within = []
+    for seed in range(25):
+        recording = rubbed(model, delta, PRESLIDING, seconds=seconds, noise=noise, seed=seed, motion=motion)
+        prepared = prepare([recording], model, base, conditions)
+        found = unconstrained("wls", [recording], prepared, base, conditions)
+        known = unconstrained("wls", [recording], replace(prepared, shapes=()), base, conditions)
+        assert np.all(found.deviations >= known.deviations)
+        assert np.all(found.degrees <= known.degrees)
+        within.append(np.abs(found.fit.beta - base.K @ delta)[friction] < 1.96 * found.deviations[friction])
+    assert np.mean(within) > 0.95
+    assert np.mean(within, axis=0).min() > 0.9
+
+
+@pytest.mark.slow
+def test_a_shape_told_by_few_reversals_has_few_degrees_of_freedom() -> None:
+    model, base, delta = rubbing(FIT)
+    conditions = feasible_set("pseudo_inertia", base.names, model.config)
+    names = [base.names[column] for column in base.base]
+    degrees = {}
+    often = slow_waves()
+    rarely = replace(often, frequency=often.frequency * np.array([[1.0], [0.35]]))
+    for name, motion in (("often", often), ("rarely", rarely)):
+        recording = rubbed(model, delta, PRESLIDING, seconds=16.0, motion=motion)
+        prepared = prepare([recording], model, base, conditions)
+        known = unconstrained("wls", [recording], replace(prepared, shapes=()), base, conditions)
+        shape = shape_uncertainty(
+            *([recording], prepared.model, base, prepared.shapes, known.fit.beta, known.fit.weights),
+            *(prepared.torque_scales, known.shares),
+        )
+        degrees[name] = shape.degrees[names.index("fc2")]
+    assert 1.0 <= degrees["rarely"] < 4.0 < degrees["often"]
+
+
 @pytest.mark.slow
 def test_friction_that_is_not_there_adds_no_doubt_of_its_shape() -> None:
     model, base, delta = rubbing(FIT)
@@ -343,7 +400,7 @@ def test_friction_that_is_not_there_adds_no_doubt_of_its_shape() -> None:
     prepared = prepare([recording], model, base, conditions)
     found = unconstrained("wls", [recording], prepared, base, conditions)
     beta = np.where([name in ("fc", "fs") for name in (base.names[c][:2] for c in base.base)], 0.0, found.fit.beta)
-    added = shape_covariance(
+    added = shape_uncertainty(
         [recording],
         prepared.model,
         base,
@@ -353,7 +410,8 @@ def test_friction_that_is_not_there_adds_no_doubt_of_its_shape() -> None:
         prepared.torque_scales,
         found.shares,
     )
-    np.testing.assert_array_equal(added, 0.0)
+    np.testing.assert_array_equal(added.covariance, 0.0)
+    assert np.isinf(added.degrees).all()
 
 
 def test_a_number_at_the_end_of_its_search_is_said() -> None:

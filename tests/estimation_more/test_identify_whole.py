@@ -293,7 +293,7 @@ def test_columns_of_a_foreign_header(setting: Setting, capsys: pytest.CaptureFix
     one, other = (parameters_of(folder)["base_parameters"]["values"] for folder in (out, plain_out))
     assert one == other
     refused = ident_json(capsys, *words, "--out", tmp_path / "none")
-    assert refused["exit_code"] == 1
+    assert refused["exit_code"] == 2
     assert not (tmp_path / "none").exists()
     columns.write_text("columns: {t: clock, q1: a}\n")
     mistake = ident_json(capsys, *words, "--columns", columns, "--out", tmp_path / "none")

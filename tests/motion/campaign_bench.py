@@ -154,6 +154,10 @@ def subject(name: str) -> Subject:
         from campaign_canopen import canopen_subject
 
         return canopen_subject(name)
+    if "pucks" in name:
+        from campaign_pucks import puck_subject
+
+        return puck_subject(name)
     if name == "bench":
         config, pause = bench_config(), 900
     else:

@@ -46,6 +46,7 @@ class Bench:
         measured: Array | None = None,
         elapsed: float | None = None,
         known: bool = True,
+        unexplained: Array = STILL,
         **other: Any,
     ) -> tuple[list[bool], Fault | None]:
         flags = np.array(valid)
@@ -54,7 +55,9 @@ class Bench:
         sample = replace(sample, **other)
         self.cycle += 1
         setpoint = rest(position if reference is None else reference)
-        usable, fault = self.guard.feedback(sample, setpoint, velocity, correction, answer, elapsed, known=known)
+        usable, fault = self.guard.feedback(
+            sample, setpoint, velocity, correction, answer, elapsed, known=known, unexplained=unexplained
+        )
         return usable.tolist(), fault
 
 

@@ -6,7 +6,7 @@ import pytest
 from motion_bench import bench_config
 
 from drivers.clock import VirtualClock
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, UsageError
 from ident_service.motion.arm_factory import make_arm
 from sim_backend.arm import SimulatedArm
 
@@ -25,7 +25,7 @@ def test_without_a_clock_the_driver_section_chooses() -> None:
 
 
 def test_an_arm_without_a_driver_cannot_be_made() -> None:
-    with pytest.raises(DriverError, match="no driver section"):
+    with pytest.raises(UsageError, match="no driver section"):
         make_arm(bench_config(driver=None))
 
 

@@ -23,6 +23,7 @@ from ident_service.motion.safety_monitor import (
     FROZEN_EFFORT,
     MAX_AGE,
     NOT_APPLIED,
+    PUSHES,
     TORQUE_RATE,
     TORQUE_RATE_SHARE,
     VELOCITY_OFF,
@@ -182,6 +183,35 @@ def repeated_warnings(joint: int) -> Fault | None:
     return Fault(fault.code, fault.reaction, f"{NAMES[joint]}: ")
 
 
+def of_positions() -> Bench:
+    """A guard of drives that are given positions."""
+    return Bench(most_torque=LIMITS.torque)
+
+
+def position_rate(joint: int) -> Fault | None:
+    return of_positions().guard.position(HOME + 1.01 * VELOCITY_STOP * LIMITS.velocity * PERIOD * unit(joint))[1]
+
+
+def position_outside(joint: int) -> Fault | None:
+    return of_positions().guard.position(np.where(unit(joint) > 0.0, LIMITS.upper + 1e-6, HOME))[1]
+
+
+def position_not_finite(joint: int) -> Fault | None:
+    return of_positions().guard.position(np.where(unit(joint) > 0.0, np.nan, HOME))[1]
+
+
+def torque_exceeded(joint: int) -> Fault | None:
+    return of_positions().see(HOME, torque=1.01 * LIMITS.torque * unit(joint))[1]
+
+
+def torque_unexplained(joint: int) -> Fault | None:
+    bench, fault = of_positions(), None
+    for number in range(FROZEN_CYCLES):
+        assert fault is None
+        fault = bench.see(HOME + number * 1e-5, unexplained=1.01 * PUSHES * LIMITS.torque * unit(joint))[1]
+    return fault
+
+
 TRIGGERS: dict[str, Callable[[int], Fault | None]] = {
     trigger.__name__: trigger
     for trigger in (
@@ -207,6 +237,11 @@ TRIGGERS: dict[str, Callable[[int], Fault | None]] = {
         drive_watchdog,
         emergency_stop,
         repeated_warnings,
+        position_rate,
+        position_outside,
+        position_not_finite,
+        torque_exceeded,
+        torque_unexplained,
     )
 }
 OTHER_TRIGGERS = {
@@ -245,7 +280,7 @@ def test_the_reactions_are_those_of_the_fault_table() -> None:
     by_reaction = {reaction: {code for code in FAULTS if FAULTS[code].reaction is reaction} for reaction in Reaction}
     assert by_reaction[WARN] == {
         *("torque_saturated", "torque_rate", "torque_not_applied", "encoder_jump", "lost_feedback", "late_cycle"),
-        *("drive_notice", "drive_warning", "torque_limited", "strange_frame"),
+        *("drive_notice", "drive_warning", "torque_limited", "strange_frame", "torque_exceeded", "position_rate"),
     }
     assert by_reaction[STOP] == {
         *("repeated_warnings", "late_cycles", "encoder_jumps", "position_envelope", "position_limit", "over_velocity"),

@@ -16,9 +16,9 @@ from daemon.conftest import URL, Asked, quick_text, serving
 from daemon.conftest import commissioned as commissioned
 from fastapi.routing import APIRoute
 
+from ident_service.daemon.app import PAGES
 from ident_service.daemon.maintenance.reidentification import enter_concluded
 from ident_service.daemon.web.render import STATIC, mark, static
-from ident_service.daemon.web.routes import PAGES
 from ident_service.operations.drift_alarms import Verdict, alarms
 from ident_service.operations.maintenance_schedule import DueRule, add_event, add_schedule, events, pending, schedules
 from ident_service.operations.run_archive import import_run

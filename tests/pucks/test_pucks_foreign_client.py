@@ -143,7 +143,7 @@ def test_an_unknown_interface_is_said_so(tmp_path: Path) -> None:
 def test_frames_are_of_the_kind_they_were_sent_as() -> None:
     """A bus that nobody listens on must not hinder the sender; python-can's virtual bus keeps kinds apart."""
     from drivers.can.can_frame import Frame
-    from ident_service.config.canopen import CanBus
+    from ident_service.config.can_bus import CanBus
     from sim_backend.emulator.process import PythonCanBuses
 
     with can.Bus(interface="virtual", channel="pucks-kinds") as other:

@@ -183,11 +183,11 @@ def test_a_fault_and_an_interface_are_checked_before_anything_runs(
 ) -> None:
     pucks_config(tmp_path)
     path = str(tmp_path / "pucks.yaml")
-    assert main(["emulate", path]) == 1
+    assert main(["emulate", path]) == USAGE
     assert "name an interface such as socketcan" in capsys.readouterr().err
-    assert main(["emulate", str(arm_file(tmp_path, 1)), "--fault", "earthquake"]) == 1
+    assert main(["emulate", str(arm_file(tmp_path, 1)), "--fault", "earthquake"]) == USAGE
     assert "no fault is called 'earthquake'" in capsys.readouterr().err
-    assert main(["emulate", "planar2"]) == 1
+    assert main(["emulate", "planar2"]) == USAGE
     assert "the driver is not CANopen's" in capsys.readouterr().err
     with pytest.raises(SystemExit) as wrong:
         main(["emulate", path, "--seconds", "0"])

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -67,6 +70,86 @@ def test_an_arm_that_moves_has_no_fault_yet_and_one_that_ended_has_none(folder: 
             faults.acknowledge("motion_process")
         faults.ended()
     assert faults.latched() == {}
+
+
+@contextmanager
+def files_grow_no_further(than: Path) -> Iterator[None]:
+    """In the block, no file of this process grows beyond the size of another, as on a disk that is full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (than.stat().st_size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_fault_that_finds_no_room_is_stored_in_the_mark(folder: Path) -> None:
+    faults, cause = FaultStore(folder), "the disk is full; " * 400
+    mark = folder / "moving.json"
+    with ControlFile.take(folder / CONTROLS, None):
+        faults.began(Path("runs/7"))
+        with files_grow_no_further(mark):
+            faults.latch("recorder_behind", cause)
+            faults.latch("recorder_behind", "another cause; " * 400)
+            assert not (folder / "faults.json").exists()
+            assert faults.latched() == {"recorder_behind": f"{cause[:300]}..."}  # while the arm is held, too
+            faults.ended()
+    assert faults.latched() == {"recorder_behind": f"{cause[:300]}..."}
+    with (
+        ControlFile.take(folder / CONTROLS, None),
+        pytest.raises(MotionRefused, match="edged: recorder_behind"),
+    ):
+        faults.began(Path("runs/8"))
+    assert faults.acknowledge("recorder_behind") == f"{cause[:300]}..."
+    assert faults.latched() == {}
+    assert not mark.exists()
+
+
+def test_faults_of_the_mark_and_of_the_file_are_one_list(folder: Path) -> None:
+    faults = FaultStore(folder)
+    with ControlFile.take(folder / CONTROLS, None):
+        faults.began(Path("runs/7"))
+        with files_grow_no_further(folder / "moving.json"):
+            faults.latch("recorder_behind", "full " * 2000)
+        faults.latch("recorder_behind", "again")
+        faults.latch("driver", "a cable")
+        faults.ended()
+    assert list(faults.latched()) == ["recorder_behind", "driver"]
+    assert faults.acknowledge("driver") == "a cable"
+    assert faults.latched() == {"recorder_behind": f"{('full ' * 2000)[:300]}..."}
+    assert not (folder / "moving.json").exists()
+
+
+def test_a_mark_with_faults_that_nobody_ended_is_a_process_that_died_as_well(folder: Path) -> None:
+    faults = FaultStore(folder)
+    with ControlFile.take(folder / CONTROLS, None):
+        faults.began(Path("runs/7"))
+        with files_grow_no_further(folder / "moving.json"):
+            faults.latch("recorder_behind", "full " * 2000)
+    assert list(faults.latched()) == ["recorder_behind", "motion_process"]
+    faults.acknowledge("recorder_behind")
+    assert list(faults.latched()) == ["motion_process"]
+    faults.acknowledge("motion_process")
+    assert faults.latched() == {}
+
+
+@pytest.mark.parametrize("cut", ["{", '{"code": "recorder_beh', '{"code": "a"}', "[]", "\0\0"])
+def test_a_line_of_the_mark_in_pieces_leaves_the_fault_of_a_process_that_died(folder: Path, cut: str) -> None:
+    faults, mark = FaultStore(folder), folder / "moving.json"
+    with ControlFile.take(folder / CONTROLS, None):
+        faults.began(Path("runs/7"))
+        first, blanks = mark.read_text().split("\n")
+        mark.write_text(f"{first}\n{cut}{blanks[len(cut) :]}")
+    assert list(faults.latched()) == ["motion_process"]
+
+
+def test_a_mark_of_earlier_software_has_no_room_and_says_that_it_has_none(folder: Path) -> None:
+    faults, mark = FaultStore(folder), folder / "moving.json"
+    folder.mkdir(parents=True)
+    mark.write_text('{\n "pid": 7,\n "run": "runs/7",\n "began": 1.5\n}\n')
+    assert list(faults.latched()) == ["motion_process"]
+    with files_grow_no_further(mark), pytest.raises(UsageError, match=r"moving\.json: has no room left"):
+        faults.latch("recorder_behind", "full " * 2000)
 
 
 @pytest.mark.parametrize("name", ["faults.json", "moving.json"])

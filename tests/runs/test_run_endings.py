@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.small_disk import run_on_small_disk
 from helpers.tickets import write_checked_ticket
 from kill_bench import TAG, VICTIMS, tagged, wait_for
 from runs.conftest import written
@@ -92,6 +93,50 @@ def test_a_full_disk_is_the_fault_that_it_is(
         assert document["faults"] == [{"code": code, "cause": cause}]
         assert document["files"] == names
         assert document["recording"] == str(run / "run.mcap.partial")
+
+
+FILLED = """
+import json, os, sys
+from pathlib import Path
+from ident_service.cli import main, motion_commands
+from ident_service.registry.state_folder import fault_file
+arm, disk = sys.argv[1], Path(sys.argv[2])
+
+def fill(_, line):
+    if line == "exciting":
+        with (disk / "other").open("wb", buffering=0) as other:
+            while other.write(bytes(4096)) == 4096:
+                pass
+
+def filled(answer, line):
+    try:
+        fill(answer, line)
+    except OSError:
+        assert os.statvfs(disk).f_bavail == 0
+
+motion_commands.tell = filled
+code = main(["run", arm, "--out", str(disk / "run"), "--state", str(disk / "state")])
+faults = fault_file(disk / "state", "planar2")
+latched = faults.latched()
+stored = (disk / "state/arms/planar2/faults.json").exists()
+(disk / "other").unlink()
+for fault in latched:
+    faults.acknowledge(fault)
+print("\\n" + json.dumps({"code": code, "latched": latched, "stored": stored, "left": faults.latched()}))
+"""
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_really_full_keeps_the_cause_of_the_fault(arm: Path, tmp_path: Path) -> None:
+    write_checked_ticket(load_arm(arm), tmp_path / "kept" / "state")
+    disk = tmp_path / "disk"
+    script = f'cp -r {tmp_path}/kept/state {disk} && exec "$0" -c "$1" {arm} {disk}'
+    ended = run_on_small_disk(disk, "4m", script, sys.executable, FILLED)
+    said = json.loads(ended.stdout.splitlines()[-1])
+    assert (said["code"], list(said["latched"])) == (4, ["recorder_behind"]), ended.stderr
+    assert "No space left on device" in said["latched"]["recorder_behind"]
+    assert not said["stored"]  # it was in the mark alone
+    assert said["left"] == {}
 
 
 @pytest.mark.slow

@@ -92,7 +92,12 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
     """
     # The challenge is used up first, so that a name cannot be tried again with it.
     good = confirm is not None and service.gate.confirm(confirm.challenge, arm, who)
-    if confirm is None or not good or confirm.name != arm:
+    if confirm is not None and confirm.name != arm:
+        raise MotionRefused(
+            f"{arm}: the typed name {confirm.name!r} is not this arm's; nothing moves. To move {arm}, type its name "
+            "(the challenge is used up, ask for a new one)"
+        )
+    if not good:
         raise MotionRefused(
             f"{arm}: a motion needs a fresh challenge of this arm (POST /api/v1/arms/{arm}/challenge), used once, "
             "and the arm's name as a person has typed it"

@@ -21,7 +21,7 @@ from typing import Literal
 
 import clarabel
 import numpy as np
-import scipy.sparse
+from numpy.typing import NDArray
 
 from ident_service.errors import SolverError
 from ident_service.model.chain import Array
@@ -302,8 +302,34 @@ class ConicProblem:
         return tuple(dual / scale for dual, scale in zip(pose.duals(np.split(z, ends)), self._scales, strict=True))
 
 
+@dataclass(frozen=True)
+class CompressedColumns:
+    """Sparse matrix as Clarabel reads it, by the attributes of scipy.sparse's `csc_matrix`, which loads for 0.15 s.
+
+    Attributes:
+        data: nonzero entries, column by column.
+        indices: row of each.
+        indptr: where each column begins, and the end of the last one, shape (columns + 1,).
+        shape: rows and columns.
+        has_canonical_format: rows of each column increase, and none stands twice.
+    """
+
+    data: Array
+    indices: NDArray[np.intp]
+    indptr: NDArray[np.intp]
+    shape: tuple[int, int]
+    has_canonical_format: bool = True
+
+    @staticmethod
+    def of(matrix: Array) -> CompressedColumns:
+        """Return the nonzero entries of a matrix."""
+        columns, rows = np.nonzero(matrix.T)
+        ends = np.searchsorted(columns, np.arange(matrix.shape[1] + 1))
+        return CompressedColumns(matrix[rows, columns], rows, ends, (matrix.shape[0], matrix.shape[1]))
+
+
 def _solve(pose: ScaledProblem, way: _SolverAttempt, tolerance: float) -> clarabel.DefaultSolution:
-    A = scipy.sparse.csc_matrix(-np.vstack([block.F for block in pose.rows]))
+    A = CompressedColumns.of(-np.vstack([block.F for block in pose.rows]))
     b = np.concatenate([block.f for block in pose.rows])
     hessian = np.diag(pose.hessian) if pose.hessian.ndim == 1 else np.triu(pose.hessian)
     settings = clarabel.DefaultSettings()
@@ -316,7 +342,7 @@ def _solve(pose: ScaledProblem, way: _SolverAttempt, tolerance: float) -> clarab
     settings.max_step_fraction = way.step
     settings.equilibrate_max_iter = way.equilibrations
     cones = [_cone(block) for block in pose.rows]
-    return clarabel.DefaultSolver(scipy.sparse.csc_matrix(hessian), pose.objective, A, b, cones, settings).solve()
+    return clarabel.DefaultSolver(CompressedColumns.of(hessian), pose.objective, A, b, cones, settings).solve()
 
 
 def _cone(rows: Rows) -> object:

@@ -7,6 +7,7 @@ import numpy as np
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
+from ident_service.model.parameter_layout import about_center
 
 
 def pseudo_inertia(parameters: Array) -> Array:
@@ -39,14 +40,6 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
     return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *J[:3, 3], J[3, 3]])
 
 
-def about_center(parameters: Array) -> tuple[float, Array, Array]:
-    """Return mass [kg], centre of mass [m], (3,), and inertia about it [kg m^2], (3, 3); needs a nonzero mass."""
-    xx, xy, xz, yy, yz, zz, *first, m = parameters
-    center = np.array(first) / m
-    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return float(m), center, about_origin - m * (center @ center * np.eye(3) - np.outer(center, center))
-
-
 def about_origin(mass: float, center: Array, inertia: Array) -> Array:
     """Return the ten parameters of a body, the inverse of `about_center`, shape (10,)."""
     L = inertia + mass * (center @ center * np.eye(3) - np.outer(center, center))
@@ -62,18 +55,6 @@ def is_real(parameters: Array) -> bool:
     _, _, inertia = about_center(parameters)
     moments = np.linalg.eigvalsh(0.5 * np.trace(inertia) * np.eye(3) - inertia)
     return bool(moments.min() > 1e-12 * max(moments.max(), 0.0))
-
-
-def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Return Rz(yaw) Ry(pitch) Rx(roll), the fixed-axis angles of URDF and SDF [rad], shape (3, 3)."""
-    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
 
 
 def joint_bodies(model: ArmModel, delta: Array) -> Array:

@@ -6,7 +6,8 @@ import numpy as np
 
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.results.export.bodies import about_center, joint_bodies
+from ident_service.model.parameter_layout import about_center
+from ident_service.results.export.bodies import joint_bodies
 from ident_service.results.export.identified_arm import IdentifiedArm
 
 _LEAST_MASS = 1e-3  # [kg]

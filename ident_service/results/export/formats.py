@@ -22,9 +22,9 @@ from ident_service.config.arm import Joint
 from ident_service.errors import ModelError, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.friction_state import presliding_ways
-from ident_service.model.parameter_layout import INERTIAL, Layout
+from ident_service.model.parameter_layout import INERTIAL, Layout, about_center
 from ident_service.model.regressor import joint_regressor
-from ident_service.results.export.bodies import about_center, about_origin, joint_bodies
+from ident_service.results.export.bodies import about_origin, joint_bodies
 from ident_service.results.export.bodies_said import body_notes
 from ident_service.results.export.c_header import c_header, c_prefix, turning_said
 from ident_service.results.export.identified_arm import IdentifiedArm, read_identified

@@ -16,8 +16,8 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array
-from ident_service.model.parameter_layout import JOINT_TERMS, joint_drives
-from ident_service.results.export.bodies import about_center, joint_bodies, require_real
+from ident_service.model.parameter_layout import JOINT_TERMS, about_center, joint_drives
+from ident_service.results.export.bodies import joint_bodies, require_real
 from ident_service.results.export.round_trip import (
     Carried,
     gravity_of,

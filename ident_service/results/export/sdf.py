@@ -20,16 +20,10 @@ from ident_service.config.arm import Joint, JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.parameter_layout import WrittenArm, joint_drives
+from ident_service.model.parameter_layout import WrittenArm, about_center, joint_drives
+from ident_service.model.solids import rotation_rpy
 from ident_service.model.urdf import roll_pitch_yaw
-from ident_service.results.export.bodies import (
-    about_center,
-    about_origin,
-    joint_bodies,
-    moved,
-    require_real,
-    rotation_rpy,
-)
+from ident_service.results.export.bodies import about_origin, joint_bodies, moved, require_real
 from ident_service.results.export.round_trip import (
     Carried,
     gravity_of,

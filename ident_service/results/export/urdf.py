@@ -15,9 +15,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape  # xml.sax.saxutils brings urllib and ssl
 from pathlib import Path
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -26,9 +26,10 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.parameter_layout import joint_drives
+from ident_service.model.parameter_layout import about_center, joint_drives
+from ident_service.model.solids import rotation_rpy
 from ident_service.model.urdf import urdf_text
-from ident_service.results.export.bodies import about_center, about_origin, is_real, moved, rotation_rpy
+from ident_service.results.export.bodies import about_origin, is_real, joint_bodies, moved
 from ident_service.results.export.round_trip import (
     Carried,
     gravity_of,
@@ -152,9 +153,12 @@ def edited(text: str, edits: Sequence[Edit]) -> str:
     return b"".join([*parts, data[at:]]).decode("utf-8")
 
 
+_WHITESPACE = str.maketrans({"\n": "&#10;", "\r": "&#13;", "\t": "&#9;"})  # a parser makes blanks of plain ones
+
+
 def start_tag(tag: str, attributes: Mapping[str, str], *, closed: bool = True) -> str:
     """Return a start tag, or a whole element without content."""
-    listed = "".join(f" {key}={quoteattr(value)}" for key, value in attributes.items())
+    listed = "".join(f' {key}="{escape(value).translate(_WHITESPACE)}"' for key, value in attributes.items())
     return f"<{tag}{listed}{'/' if closed else ''}>"
 
 
@@ -202,8 +206,6 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
         ModelError: a link without positive mass, or a file that cannot be edited.
     """
     from ident_service.model.mechanism import read_mechanism
-    from ident_service.model.mechanism_process import delta_from_inertia
-    from ident_service.model.pinocchio_models import joint_frame_inertias
 
     file = model.config.kinematics.urdf
     if file is None:
@@ -213,10 +215,9 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
     edits: list[Edit] = []
     notes: list[str] = []
     drives = joint_drives(model.chain, model.layout, delta)
-    for k, inertia in enumerate(joint_frame_inertias(model.chain, model.layout, delta)):
+    for k, whole in enumerate(joint_bodies(model, delta)):
         joint = robot.joints[model.chain.names[k]]
         link = _named(joint, "child", file.name)
-        whole = delta_from_inertia(inertia)
         bolted = [
             (name, inertial) for name, inertial in robot.bolted_to(link) if inertial is not None and inertial.any()
         ]

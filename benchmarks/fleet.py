@@ -1,0 +1,194 @@
+"""Fleets: recordings a second on one and two processes, a second call, the merge, the scheduler's cost per task.
+
+`python -m benchmarks.fleet`, half an hour with the data, which are made once: 200 recordings of 60 s at 1 kHz, seven
+joints, of 20 simulated arms, in `IDENT_BENCH_FLEET` (default: a temporary folder). `IDENT_BENCH_FLEET_ARMS` takes fewer
+arms. Making the data is not counted; starting the workers is.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import psutil
+from distributed import Client
+
+from benchmarks.harness import Row, table, write
+from ident_service import __version__
+from ident_service.config.load import load_arm
+from ident_service.fleet.factor import (
+    FACTORS,
+    FAN_IN,
+    Described,
+    Part,
+    Settled,
+    merge,
+    merge_stored,
+    missing,
+    reduce_recording,
+    settle,
+)
+from ident_service.fleet.identify import identify_fleet
+from ident_service.fleet.reduction import FleetRequest, connected, in_turn
+from ident_service.fleet.storage import Store, find
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+ARMS = int(os.environ.get("IDENT_BENCH_FLEET_ARMS", "20"))
+EACH, RATE, SECONDS, ARM = 10, 1000.0, 60.0, "wam7_sim"
+NEW = 0.05
+TASKS, STORED = 10_000, 10_000
+
+
+def make(folder: Path, arm: int, number: int) -> None:
+    """Write one recording, unless it is there."""
+    from helpers.fleets import BEGIN, WEEK, kind, write_recording
+
+    path = folder / f"arm{arm:02}" / f"week{number}.mcap"
+    if not path.exists():
+        of = kind(ARM, rate=RATE, seconds=SECONDS)
+        path.with_name(f"{path.name}.partial").unlink(missing_ok=True)
+        write_recording(of, path, of.individual(arm), seed=1000 * arm + number, at=BEGIN + number * WEEK)
+
+
+def recordings(folder: Path) -> None:
+    with ProcessPoolExecutor(os.cpu_count()) as pool:
+        made = [pool.submit(make, folder, arm, number) for arm in range(ARMS) for number in range(EACH)]
+        for one in made:
+            one.result()
+
+
+def whole(folder: Path, place: Path, store: str, workers: int) -> tuple[float, int, Any]:
+    """Identify the fleet; seconds, factors computed, and the result."""
+    request = FleetRequest(ARM, (f"{folder}/*/*.mcap",), store, workers=workers)
+    begin = time.perf_counter()
+    result = identify_fleet(request, place, _tell(begin))
+    return time.perf_counter() - begin, result.reduced.computed, result
+
+
+def _tell(begin: float) -> Any:
+    return lambda line: print(f"  {time.perf_counter() - begin:6.1f} s  {line}", flush=True)
+
+
+def memory(folder: Path, place: Path) -> float:
+    """Return the largest resident memory of a worker while it reduces recordings [MiB]."""
+    request = FleetRequest(ARM, (f"{folder}/arm00/*.mcap",), str(place / "memory"), workers=1)
+    with connected(request, lambda _: None) as client:
+        sources = find(request.patterns)
+        settled = client.submit(settle, sources[:3], load_arm(ARM).model_dump_json()).result()
+        if not isinstance(settled, Settled):
+            raise TypeError(settled)
+        described, store = Described(settled.description), Store(request.store)
+        client.restart()
+        largest = 0.0
+        for source in sources:
+            future = client.submit(reduce_recording, Part(source), described, store, __version__, pure=False)
+            (pid,) = client.run(os.getpid).values()
+            while not future.done():
+                largest = max(largest, psutil.Process(pid).memory_info().rss / 2**20)
+                time.sleep(0.02)
+            future.result()
+    return largest
+
+
+def merging(store: Store, result: Any) -> tuple[float, float]:
+    """Return seconds to merge 10,000 stored factors of one arm on two processes, and bytes of one factor."""
+    described = result.reduced.described
+    own = [one.row.key for one in result.reduced.arms["arm00"]]
+    many = Store(f"{store.url}-many")
+    size = 0.0
+    for number in range(STORED):
+        content = store.read(f"{FACTORS}/{own[number % len(own)]}.npz")
+        if content is None:
+            raise FileNotFoundError(own[0])
+        size = float(len(content))
+        many.write(f"{FACTORS}/{number:05}.npz", content)
+    request = FleetRequest(ARM, (), many.url, workers=2)
+    with connected(request, lambda _: None) as client:
+        begin = time.perf_counter()
+        keys = [f"{number:05}" for number in range(STORED)]
+        level = [
+            client.submit(merge_stored, keys[k : k + FAN_IN], described, many, True, pure=False)
+            for k in range(0, len(keys), FAN_IN)
+        ]
+        while len(level) > 1:
+            level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
+        if client.submit(missing, level[0], pure=False).result():
+            raise FileNotFoundError("factors")
+        spent = time.perf_counter() - begin
+    shutil.rmtree(many.url)
+    return spent, size
+
+
+def _nothing(number: int) -> int:
+    return number
+
+
+def overhead(client: Client) -> float:
+    """Return seconds a task that does nothing takes, of 10,000."""
+    begin = time.perf_counter()
+    done = sum(1 for _ in in_turn(client, _nothing, [(number,) for number in range(TASKS)], lambda number: number))
+    if done != TASKS:
+        raise ValueError(done)
+    return (time.perf_counter() - begin) / TASKS
+
+
+def measure(folder: Path, place: Path) -> list[Row]:
+    """All figures."""
+    recordings(folder)
+    total = ARMS * EACH
+    load = os.getloadavg()[0]
+    two, computed, result = whole(folder, place / "out2", str(place / "store2"), 2)
+    one, _, _ = whole(folder, place / "out1", str(place / "store1"), 1)
+    again, store = _again(folder, place, total)
+    peak = memory(folder, place)
+    merged, size = merging(Store(store), result)
+    with connected(FleetRequest(ARM, (), store, workers=2), lambda _: None) as client:
+        per_task = overhead(client)
+    label = f"{total} recordings of {SECONDS:g} s, 7 joints, {ARMS} arms"
+    return [
+        Row(f"{label}: two processes", computed / two, "1/s", ">= 2.5"),
+        Row(f"{label}: one process", total / one, "1/s"),
+        Row("two processes over one", one / two, "", ">= 1.8"),
+        Row("worker's memory while it reduces", peak, "MiB", "<= 500"),
+        Row("second call with 5 % new recordings, of the first", 100.0 * again / two, "%", "<= 10"),
+        Row(f"merge of {STORED} stored factors", merged, "s", "<= 60"),
+        Row("one factor", size / 1024.0, "KiB"),
+        Row(f"scheduler, per task of {TASKS}", 1e3 * per_task, "ms"),
+        Row("load of the machine before", load, ""),
+    ]
+
+
+def _again(folder: Path, place: Path, total: int) -> tuple[float, str]:
+    """Return seconds of a call in whose store one recording in twenty is missing, and the store."""
+    store = place / "store3"
+    shutil.copytree(place / "store2", store)
+    rows = sorted((store / "rows").iterdir())
+    step = round(1.0 / NEW)
+    for path in rows[::step]:
+        (store / "factors" / f"{path.stem}.npz").unlink()
+        path.unlink()
+    spent, computed, _ = whole(folder, place / "out3", str(store), 2)
+    if computed != len(rows[::step]):
+        raise ValueError(f"{computed} of {total} computed")
+    return spent, str(store)
+
+
+def main() -> None:
+    """Measure, print and write."""
+    with tempfile.TemporaryDirectory(prefix="ident-bench-") as temporary:
+        place = Path(temporary)
+        folder = Path(os.environ.get("IDENT_BENCH_FLEET", temporary)) / "recordings"
+        rows = measure(folder, place)
+    print(table(rows))
+    print(f"written to {write(rows, Path(__file__).parent / 'results', 'fleet')}")
+
+
+if __name__ == "__main__":
+    main()

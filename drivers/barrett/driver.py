@@ -1,0 +1,543 @@
+"""Drive an arm of Barrett's pucks: a WAM as it really speaks.
+
+A person enables it. The host never raises a MODE: it asks for positions, sends torques of zero, says that
+Shift-Activate is to be pressed, and waits; as soon as the safety puck says ACTIVE, the arm is enabled. An arm that
+somebody activates while nobody waits is taken back to IDLE at once, as nothing would hold it.
+
+Both kinds of stop are IDLE: the pucks short their windings and the arm sinks slowly, which is the best passive state of
+an arm without brakes; a stream of zero torques would let it fall. IDLE is asked for in every cycle until all say so.
+
+`Sample.torque` acts from the stamp of its cycle, to about 0.15 ms (`cycle.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
+from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
+from drivers.barrett import setup
+from drivers.barrett.bus_load import budget
+from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status
+from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
+from drivers.can.bus_load import Budget
+from drivers.can.bus_state import HOST, Event, EventCode
+from drivers.can.can_link import BusLock, Link, open_links
+from drivers.can.frame_log import SessionLog, logged_links, require_format
+from drivers.clock import Clock, RealClock, VirtualClock
+from drivers.motor_units import Coordinates, motor_coordinates, unwrapped
+from ident_service.config.arm import ArmConfig
+from ident_service.config.barrett import BarrettDriver
+from ident_service.errors import DriverError, PositionUnknown
+
+LOOK_RATE = 20.0  # Hz
+_SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+_AWAKE = 2.0  # s within which they must come
+_TRIES, _AGAIN = 75, 0.001  # s between two tries to stop
+_FAREWELL = 20  # cycles, at most, in which pucks report that they are idle
+_RAISED = 0.5  # s that all motors may take to follow the safety puck
+_RESET = 1.0  # s
+_LOWER_EVERY = 5  # cycles between two commands to an arm that is active while nobody drives it
+_EXPLAINED = 4  # cycles, at most, that news of an arm that is not active any more wait for the pendant's reason
+_SHIFT_IDLE = "find the cause, then press Shift-Idle on the pendant"
+
+_CODES: dict[EventCode, AxisEventCode] = {
+    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
+    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
+    EventCode.DRIVE_STATE: AxisEventCode.DRIVE_LEFT,
+    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
+    EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,
+    EventCode.LATE: AxisEventCode.STRANGE_FRAME,
+    EventCode.WRONG_LENGTH: AxisEventCode.STRANGE_FRAME,
+    EventCode.STRANGER: AxisEventCode.STRANGE_FRAME,
+    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
+    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
+    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
+    EventCode.OVERFLOW: AxisEventCode.STRANGE_FRAME,
+    EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
+}
+
+
+class BarrettArm(Arm):
+    """Implement an arm of pucks on one bus, behind one transmission."""
+
+    operator_action = (
+        "stand clear, then press Shift-Activate on the pendant (Shift-Idle before, where it shows a fault or blinks)"
+    )
+
+    def __init__(
+        self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links, *, looks: bool = False
+    ) -> None:
+        """Use the arm's description; nothing is opened.
+
+        Args:
+            config: with a driver of pucks and a transmission.
+            open_bus: gives the link.
+            looks: whether the arm is only looked at: no property is set, and no torque sent.
+
+        Raises:
+            DriverError: the description lacks the driver, the transmission, or joints.
+        """
+        if not isinstance(config.driver, BarrettDriver) or config.transmission is None:
+            raise DriverError(f"{config.name}: needs a driver of pucks (driver.kind: barrett) and a transmission")
+        self._config, self._driver, self._open_bus, self._looks = config, config.driver, open_bus, looks
+        self._period_ns = round(1e9 / (min(LOOK_RATE, config.control.rate) if looks else config.control.rate))
+        pucks = config.driver.pucks
+        self._coordinates: Coordinates = motor_coordinates(
+            config.transmission,
+            [puck.cts for puck in pucks],
+            [puck.torque_scale / puck.ipnm for puck in pucks],
+            [puck.mt for puck in pucks],
+        )
+        if len(config.joints) != len(pucks):
+            raise DriverError(f"{config.name}: joints must name all {len(pucks)} joints")
+        self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
+        self._home = [joint.home for joint in config.joints.values()]
+        joints = len(pucks)
+        self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
+        self._motors_of = self._coordinates.motors_of
+        joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
+        names = list(config.joints)
+        self._names = [
+            f"{' and '.join(names[j] for j in joints_of[k])}: puck {puck.node}" for k, puck in enumerate(pucks)
+        ]
+        self._joint_of = {puck.node: joints_of[k][0] for k, puck in enumerate(pucks)}
+        self.clock: Clock = VirtualClock() if config.driver.bus.interface == "lock_step" else RealClock()
+        self._bus: PuckBus | None = None
+        self._found: setup.FoundArm | None = None
+        self._lock: BusLock | None = None
+        self._log_path: Path | None = None
+        self._log: SessionLog | None = None
+        self._reset_state()
+
+    def _reset_state(self) -> None:
+        self._enabled = False
+        self._untold = False  # whether a stop is still to be sent
+        self._counts = [0] * len(self._limits)
+        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._unwrapped: list[int] = []
+        self._cycle = 0
+        self._stale: set[int] = set()
+        self._status: tuple[int, ...] = ()
+        self._checks: tuple[SetupCheck, ...] = ()
+
+    def look(self) -> Arm:
+        """Return an arm that asks pucks for positions and states, and sets nothing.
+
+        What it asks for is seen by the safety puck as well; so it asks no active arm, whose host may be the one that is
+        to be missed.
+        """
+        return BarrettArm(self._config, self._open_bus, looks=True)
+
+    def zero(self) -> tuple[str, ...]:
+        """Define the present position as the home of the description; as in the contract."""
+        if self._bus is not None:
+            raise DriverError("the arm is open; close it before it is zeroed")
+        if self._looks:
+            raise DriverError("an arm that is only looked at is not zeroed")
+        home = [value for value in self._home if value is not None]
+        if len(home) != len(self._home):
+            raise DriverError(f"{self._config.name}: zeroing needs the home of every joint")
+        port = self._open_port()
+        try:
+            found = setup.found_on(port, self._driver)
+            self._require_reachable(found)
+            return setup.zero(port, found, self._coordinates, home)
+        finally:
+            self.close()
+
+    def log_frames(self, path: Path) -> None:
+        """Log every frame of the next session; as in the contract."""
+        self._log_path = require_format(path)
+
+    def logged(self) -> str:
+        """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
+        return "" if self._log is None or self._log.report is None else str(self._log.report)
+
+    def open(self) -> None:
+        """Lock and open the bus, wake, check and limit the pucks, and find where the arm stands.
+
+        Raises:
+            DriverError: the bus is in use, by another host too, or cannot be had; pucks do not answer, or cannot be
+                reached by one frame. Nothing stays open.
+            PositionUnknown: the arm has not been zeroed since power came; likewise.
+        """
+        if self._bus is not None:
+            raise DriverError("the arm is already open")
+        self._reset_state()
+        self._log = None
+        try:
+            port = self._open_port()
+            found = setup.found_on(port, self._driver, wakes=not self._looks)
+            self._found = found
+            self._checks = setup.checks(found, self._driver)
+            self._require_reachable(found)
+            if not self._looks:
+                setup.lower(port.link, found)
+                setup.limit(port, found, self._driver)
+            if not setup.is_zeroed(port, found):
+                raise PositionUnknown(
+                    f"{self._config.name} has not been zeroed since its pucks have power (ZERO is 0): lead it home by "
+                    f"hand, then `ident set-home {self._config.name}`"
+                )
+            codec = PuckCodec(self._driver, found.motors, found.safety)
+            self._bus = PuckBus(port.link, codec, self._driver, self._period_ns)
+            self._bus.looks = self._looks
+            if not self._looks:
+                setup.ignore_jumps(port, found)
+            self._begin(self._bus)
+        except BaseException:
+            self.close()
+            raise
+
+    def describe(self) -> ArmDescription:
+        """Return the description of the open arm; raises DriverError when it is not open."""
+        self._require_open()
+        found = self._coordinates
+        pucks = () if self._found is None else self._found.pucks
+        return ArmDescription(
+            tuple(self._config.joints),
+            1e9 / self._period_ns,
+            np.minimum(found.torque_limit, self._limits),
+            found.torque_resolution,
+            found.position_resolution,
+            tuple(str(puck) for puck in pucks),
+            "drivers.barrett",
+            lost_cycles=self._driver.lost_cycles,
+            watchdog=self._driver.heartbeat,
+            report_delay=self._driver.report_delay,
+        )
+
+    def bus_budget(self, rate: float | None = None) -> Budget:
+        """Return the load of the bus, see `Arm`."""
+        return budget(self._driver, self._config.control.rate if rate is None else rate)
+
+    def setup_checks(self) -> tuple[SetupCheck, ...]:
+        """Return what the pucks say of themselves, see `Arm`."""
+        return self._checks
+
+    def watchdogs(self) -> tuple[Watchdog, ...]:
+        """Return the safety puck's watch over every puck, see `Arm`."""
+        seconds = self._driver.heartbeat
+        return tuple(Watchdog(name, "bus_silence", seconds, of_torque=False) for name in self._names)
+
+    def withhold(self, kind: str) -> None:
+        """Send neither torques nor requests for positions, which the safety puck watches; see `Arm`."""
+        self._require_open().silent = True
+
+    def drive_status(self) -> tuple[AxisStatus, ...]:
+        """Return the last reported status of each puck, see `Arm`."""
+        codec = self._require_open().codec
+        return tuple(axis_status(puck, codec.safety) for puck in codec.pucks)
+
+    def enable(self) -> None:
+        """Wait until a person activates the arm, with zero torque; what a lost heartbeat left behind ends with it.
+
+        Raises:
+            DriverError: not open, only looked at, a puck says something else of itself than the description, has a
+                fault, the pendant shows one, nobody activates the arm in time, or nobody wants it any more. The arm is
+                idle then.
+        """
+        bus = self._require_open()
+        self._require_driven()
+        self._no_torque()
+        try:
+            if wrong := [str(one) for one in self._checks if not one.good]:
+                raise DriverError(f"cannot be enabled: {'; '.join(wrong)}")
+            self._require_sound()
+            if not self._enabled:
+                self._wait_until_active(bus)
+        except BaseException:
+            self.stop(StopKind.TORQUE_OFF)
+            raise
+        bus.codec.forget_events()
+        self._enabled = True
+
+    def reset(self) -> None:
+        """Clear the errors of motor pucks; what the pendant shows only a person clears.
+
+        Raises:
+            DriverError: not open, enabled, an error stays because its cause does, or the pendant shows a fault.
+        """
+        bus = self._require_open()
+        self._require_driven()
+        if self._enabled:
+            raise DriverError("the arm is enabled; stop it before its faults are cleared")
+        self._refresh(bus)
+        stat = setup.PropertyPort(bus.link)
+        for puck in bus.codec.pucks:
+            if puck.stat == Status.ERROR and self._found is not None:
+                stat.link.send(put(puck.node, self._found.motors.number("STAT"), Status.READY))
+        until_ns = self.clock.now_ns() + round(_RESET * 1e9)
+        while any(puck.stat == Status.ERROR for puck in bus.codec.pucks) and self.clock.now_ns() < until_ns:
+            bus.cycle(None)
+        self._require_sound()
+        if bus.codec.safety.pendant.faults:
+            raise DriverError(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        """Exchange one cycle, as the contract says.
+
+        Raises:
+            DriverError: as in the contract; also an arm that is looked at and has been activated.
+        """
+        bus = self._require_open()
+        if torque is not None:
+            if not self._enabled:
+                raise DriverError("a torque was given, but the arm is not enabled")
+            wanted = np.asarray(torque, dtype=float)
+            if wanted.shape != self._limits.shape or not np.isfinite(wanted).all():
+                raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
+            wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)
+            self._counts, _ = self._coordinates.torque_counts(wanted)
+            self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+        if not self._enabled:
+            self._keep_idle(bus)
+        stamp_ns = bus.cycle(None if torque is None else self._counts)
+        sample = self._sample(bus, stamp_ns)
+        self._cycle += 1
+        return sample
+
+    def stop(self, kind: StopKind) -> None:
+        """Take all pucks to IDLE, whatever the kind; never raises. A stop that no frame could carry is sent again."""
+        self._enabled = False
+        self._no_torque()
+        if self._bus is None or self._found is None or self._looks:
+            return
+        self._bus.silent = False
+        self._untold = True
+        for _ in range(_TRIES):
+            self._lower(self._bus)
+            if not self._untold:
+                break
+            with suppress(Exception):
+                self.clock.sleep_until_ns(self.clock.now_ns() + round(_AGAIN * 1e9))
+
+    def close(self) -> None:
+        """Take all pucks to IDLE and close the bus; any number of times."""
+        self.stop(StopKind.TORQUE_OFF)
+        if self._bus is not None:
+            if not self._looks:
+                for _ in range(_FAREWELL):
+                    if self._is_idle(self._bus):
+                        break
+                    with suppress(Exception):
+                        self._lower(self._bus)
+                        self._bus.cycle(None, asks_safety=True)
+            self._bus.close()
+        elif self._port is not None:
+            with suppress(Exception):
+                self._port.link.close()
+        if self._lock is not None:
+            self._lock.close()
+        self._bus = self._found = self._lock = self._port = None
+        if self._log is not None:  # last: everybody is idle, and the file may take its time
+            self._log.close()
+
+    _port: setup.PropertyPort | None = None
+
+    def _open_port(self) -> setup.PropertyPort:
+        """Lock and open the bus, and listen whether another host drives this arm before anything is sent."""
+        if not self.clock.lock_step:
+            self._lock = BusLock(self._driver.bus)
+        links = self._open_bus(self._config)
+        if self._log_path is not None:
+            self._log, links = logged_links(links, self._log_path, [False])
+            self._log_path = None
+        self._port = setup.PropertyPort(links[0])
+        self.clock = links[0].clock
+        self._port.listen()
+        return self._port
+
+    def _begin(self, bus: PuckBus) -> None:
+        """Cycle until everybody answers every request in time and has said its state."""
+        until_ns = self.clock.now_ns() + round(_AWAKE * 1e9)
+        self._refresh(bus)
+        settled = 0
+        while settled < _SETTLED or self._is_unknown(bus):
+            if self.clock.now_ns() > until_ns:
+                bad = [puck.node for puck in bus.codec.pucks if not puck.answered or puck.mode is None]
+                raise DriverError(f"pucks {', '.join(map(str, bad)) or 'of all kinds'} do not answer in time")
+            bus.cycle(None)
+            settled = settled + 1 if bus.complete else 0
+        nearest = zip(self._coordinates.zero, bus.codec.pucks, strict=True)
+        self._unwrapped = [zero + puck.position for zero, puck in nearest]  # 22 bits are 512 turns: no arm wraps
+        bus.codec.forget_events()
+        bus.lost = 0
+
+    @staticmethod
+    def _is_unknown(bus: PuckBus) -> bool:
+        codec = bus.codec
+        return codec.safety.mode is None or any(
+            puck.mode is None or (puck.mode != Mode.TORQUE and puck.stat is None) for puck in codec.pucks
+        )
+
+    def _refresh(self, bus: PuckBus) -> None:
+        """Ask everybody for its state at once, while nothing streams, and hear the answers."""
+        for frame in bus.codec.questions():
+            bus.link.send(frame)
+            until_ns = self.clock.now_ns() + round(setup.TIMEOUT * 1e9)
+            while (heard := bus.link.receive(until_ns)) is not None:
+                bus.codec.receive(heard)
+                if heard.identifier & 0x1F == Group.PROPERTIES:
+                    break
+
+    def _wait_until_active(self, bus: PuckBus) -> None:
+        """Send zero torques until the safety puck says ACTIVE and all motors follow torques."""
+        codec, period = bus.codec, self._period_ns * 1e-9
+        zero = [0] * len(self._counts)
+        for _ in range(max(_FAREWELL, round(_RAISED / period))):
+            if self._is_idle(bus):
+                break
+            self._lower(bus)  # whoever has activated it has not seen that somebody waits
+            bus.cycle(None, asks_safety=True)
+        until_ns = self.clock.now_ns() + round(self._driver.activate_within * 1e9)
+        while codec.safety.mode != SafetyMode.ACTIVE:
+            if not self.still_wanted():
+                raise DriverError("nobody wants the arm to be enabled any more")
+            if self.clock.now_ns() > until_ns:
+                waited = self._driver.activate_within
+                raise DriverError(
+                    f"nobody pressed Shift-Activate for {waited:g} s; the pendant: {codec.safety.pendant}"
+                )
+            bus.cycle(zero, asks_safety=True)
+            self._require_sound()
+        if self._found is not None:
+            bus.link.send(get(Group.ARM, self._found.motors.number("MODE"), group=True))
+        for _ in range(max(_FAREWELL, round(_RAISED / period))):
+            if all(status & AxisStatus.POWERED for status in self.drive_status()):
+                return
+            bus.cycle(zero, asks_safety=True)
+            self._require_sound(active=True)
+        idle = [name for name, word in zip(self._names, self.drive_status(), strict=True) if not word]
+        raise DriverError(f"active, but these pucks do not take torques: {', '.join(idle) or 'some'}")
+
+    def _require_sound(self, *, active: bool = False) -> None:
+        """Raise DriverError where a puck has an error or the pendant shows what no heartbeat explains."""
+        codec = self._require_open().codec
+        bad = [name for name, p in zip(self._names, codec.pucks, strict=True) if p.stat == Status.ERROR]
+        if bad:
+            raise DriverError(f"{', '.join(bad)} has an error (STAT 1); `ident recover` clears it")
+        if codec.safety.mode == SafetyMode.ESTOP:
+            raise DriverError("the emergency stop is pressed, or has been: release it, then press Shift-Idle")
+        causes = [cause for cause in codec.safety.pendant.faults if cause not in ("heartbeat", "e-stop")]
+        if causes:
+            raise DriverError(f"the pendant shows {' and '.join(causes)} fault; {_SHIFT_IDLE}")
+        if active and codec.safety.mode != SafetyMode.ACTIVE:
+            raise DriverError(f"the arm left ACTIVE at once; the pendant: {codec.safety.pendant}")
+
+    def _is_idle(self, bus: PuckBus) -> bool:
+        return bus.codec.safety.mode != SafetyMode.ACTIVE and all(p.mode != Mode.TORQUE for p in bus.codec.pucks)
+
+    def _keep_idle(self, bus: PuckBus) -> None:
+        """Lower an arm that nobody drives and that says it is active; repeat a stop that no frame could carry."""
+        is_due = self._cycle % _LOWER_EVERY == 0
+        if not self._looks and (self._untold or (is_due and not self._is_idle(bus))):
+            self._lower(bus)
+
+    def _lower(self, bus: PuckBus) -> None:
+        """Send IDLE to everybody; never raises."""
+        try:
+            if self._found is not None:
+                setup.lower(bus.link, self._found)
+            self._untold = False
+        except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
+            self._untold = True
+
+    def _require_reachable(self, found: setup.FoundArm) -> None:
+        if lost := setup.unreachable(found):
+            wrong = [str(one) for one in setup.checks(found, self._driver) if not one.good]
+            nodes = ", ".join(map(str, lost))
+            raise DriverError(f"no group frame reaches pucks {nodes}: {'; '.join(wrong)}")
+
+    def _require_open(self) -> PuckBus:
+        if self._bus is None:
+            raise DriverError("the arm is not open")
+        return self._bus
+
+    def _require_driven(self) -> None:
+        if self._looks:
+            raise DriverError("an arm that is only looked at is neither enabled nor reset")
+
+    def _no_torque(self) -> None:
+        self._counts = [0] * len(self._limits)
+        self._acting = _frozen(np.zeros(len(self._limits)))
+
+    def _sample(self, bus: PuckBus, stamp_ns: int) -> Sample:
+        pucks, safety = bus.codec.pucks, bus.codec.safety
+        self._unwrapped = [
+            unwrapped(before, puck.position, POSITION_BITS) for before, puck in zip(self._unwrapped, pucks, strict=True)
+        ]
+        valid, age = self._all_fresh
+        if not bus.complete:
+            ages = [max(pucks[k].age for k in needed) for needed in self._motors_of]
+            valid = (age := np.array(ages, dtype=np.int64)) == 0
+        told: list[AxisEvent] = []
+        if bus.codec.unexplained is None or bus.codec.unexplained > _EXPLAINED:
+            words = self.drive_status()
+            self._status = tuple(int(_joined([words[k] for k in needed])) for needed in self._motors_of)
+            told = self._events(bus)
+        return Sample(
+            self._cycle,
+            stamp_ns,
+            self._coordinates.positions(self._unwrapped),
+            None,
+            self._acting,
+            valid,
+            age,
+            bus.lost,
+            self._status,
+            max(safety.status_age, *(puck.status_age for puck in pucks)),
+            tuple(told),
+            (f"pendant: {safety.pendant}",) if self._looks else (),
+            stamp_doubt_ns=bus.stamp_doubt_ns,
+        )
+
+    def _events(self, bus: PuckBus) -> list[AxisEvent]:
+        taken = [event for event in bus.codec.take_events() if event.code in _CODES]
+        if bus.codec.safety.mode != SafetyMode.ACTIVE:  # then no single puck has left it
+            taken = [event for event in taken if event.code is not EventCode.DRIVE_STATE]
+        found = [self._event(event) for event in taken]
+        stale = set(bus.stale)
+        for node in sorted(stale - self._stale):
+            words = f"puck {node} has not said its MODE for too long"
+            found.append(AxisEvent(AxisEventCode.STATUS_STALE, self._joint_of.get(node), words))
+        self._stale = stale
+        return found
+
+    def _event(self, event: Event) -> AxisEvent:
+        channel = self._driver.bus.channel
+        words = f"{channel}: {event.words}" if event.node == HOST else f"puck {event.node}: {event.words}"
+        return AxisEvent(_CODES[event.code], self._joint_of.get(event.node), words)
+
+
+def _joined(words: list[AxisStatus]) -> AxisStatus:
+    """Return the status of a joint that several pucks move: powered only where all of them are."""
+    found = AxisStatus(0)
+    for word in words:
+        found |= word
+    return found if all(word & AxisStatus.POWERED for word in words) else found & ~AxisStatus.POWERED
+
+
+def from_config(config: ArmConfig, clock: Clock | None = None) -> BarrettArm:
+    """Create the arm of a configuration with pucks, not open.
+
+    Args:
+        config: the arm's.
+        clock: ignored: time is that of the link, virtual in lock step.
+
+    Raises:
+        DriverError: the description lacks something.
+    """
+    return BarrettArm(config)
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array

@@ -1,0 +1,199 @@
+"""Describe Barrett's pucks: the motor controllers of a WAM and its safety puck, in their own protocol on one CAN bus.
+
+Keys of a puck are the names of its properties: `cts` counts a motor turn, `ipnm` torque counts per N m at the motor,
+`mt` the largest torque count, `poles` of the motor. Sources disagree about IPNM by a quarter, so that nothing is taken
+for granted: what each puck says of itself is read when the arm is opened, and must be what stands here.
+
+Gears and couplings are the section `transmission` of the arm, whose motors are the pucks here, in this order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Final, Literal
+
+from pydantic import Field, model_validator
+
+from ident_service.config.can_bus import CanBus
+from ident_service.config.quantities import (
+    Count,
+    NonNegative,
+    ParameterTable,
+    PerJoint,
+    Positive,
+    Section,
+    Seed,
+)
+from ident_service.config.recording import Transmission
+from ident_service.config.simulation import SimulatedFault
+
+LOWER: Final = range(1, 5)  # nodes whose torques share the first frame; 5 to 7 share the second
+UPPER: Final = range(5, 8)
+MOST_COUNTS: Final = 8191  # of a torque slot of 14 bits, either way: -8192 has no opposite
+WARNING: Final = 0.9  # of a fault's limit, as libbarrett has it
+VELOCITY_UNIT: Final = 4096  # counts of VL1 and VL2 per m/s (Q4.12)
+_LEAST_HEARTBEAT = 2.0  # cycles: one may be late
+_LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles, as for other drives
+Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]
+
+
+class Puck(Section):
+    """One motor puck.
+
+    `torque_scale` is how much torque the motor really gives for one that was asked for. `zero_angle` [rad] is the
+    calibrated angle of a motor with an absolute encoder when the arm is at home; without, the posture in which a person
+    zeroes the arm is all that is known.
+    """
+
+    node: Annotated[int, Field(strict=True, ge=1, le=7)]
+    cts: Count = 4096
+    ipnm: Annotated[Count, Field(le=0x7FFF)]
+    mt: Annotated[Count, Field(le=MOST_COUNTS)]
+    poles: Count | None = None
+    torque_scale: Positive = 1.0
+    zero_angle: Annotated[float, Field(strict=True, ge=0.0, le=2.0 * math.pi)] | None = None
+
+    @property
+    def max_torque(self) -> float:
+        """Return the largest torque that the puck lets through, at the motor [N m]."""
+        return self.mt / self.ipnm
+
+    @property
+    def group(self) -> int:
+        """Return the group whose torque frame has this puck's torque: 1 lower arm, 2 wrist."""
+        return 1 if self.node in LOWER else 2
+
+    @property
+    def slot(self) -> int:
+        """Return the place in that frame, from 1 (property PIDX)."""
+        return (self.node - 1) % 4 + 1
+
+
+class SafetyLimits(Section):
+    """Limits at which the safety puck takes the arm out of ACTIVE: tip and elbow speed [m/s], torque [counts].
+
+    It warns at 0.9 of them. They revert to its defaults when it loses power, and are written at each start.
+    """
+
+    velocity: Annotated[float, Field(strict=True, gt=0.0, le=7.9)] = 1.0
+    torque: Annotated[Count, Field(le=0x7FFF)] = 5204
+
+
+class PuckEmulation(Section):
+    """Simulated arm behind emulated pucks, with true parameters, noise and faults, and the person at the pendant.
+
+    `firmware` is the version (VERS) that every puck reports. `ipnm` is what pucks say where it differs from what the
+    description says. `operator` [s] is how long after torque frames begin a person presses Shift-Activate; left out,
+    nobody does. `heartbeat` [s] without positions or torques makes the safety puck leave ACTIVE. `zeroed` says whether
+    the arm has been zeroed since power came.
+    """
+
+    seed: Seed = 0
+    truth: ParameterTable | None = None
+    torque_noise: PerJoint = 0.0
+    braking: PerJoint | None = None
+    firmware: Annotated[Count, Field(le=0x7FFF)] = 200
+    ipnm: tuple[Count, ...] | None = None
+    operator: NonNegative | None = None
+    heartbeat: Positive = 0.05
+    zeroed: bool = False
+    faults: tuple[SimulatedFault, ...] = ()
+
+
+class BarrettDriver(Section):
+    """Motor pucks and a safety puck.
+
+    The host never raises MODE: a person does, by Shift-Activate on the pendant, within `activate_within` [s]. The
+    safety puck watches for positions and torques; `heartbeat` [s] is after how long without them it lets the arm go,
+    which no public source says and preflight proves. `status_period` [s] is how often every puck's MODE is read.
+    `joint_encoders` are the nodes that answer with a second position. `lost_cycles` in a row without its position make
+    a joint count as gone. `watchdog_reason` says why an arm that can fall may go on for longer than 0.1 s.
+    """
+
+    kind: Literal["barrett"]
+    bus: CanBus = CanBus()
+    pucks: Annotated[tuple[Puck, ...], Field(min_length=1, max_length=7)]
+    safety_node: Annotated[int, Field(strict=True, ge=8, le=31)] = 10
+    limits: SafetyLimits = SafetyLimits()
+    joint_encoders: tuple[int, ...] = ()
+    heartbeat: Seconds = 0.1
+    watchdog_reason: Annotated[str, Field(max_length=200)] = ""
+    lost_cycles: Annotated[int, Field(ge=3, le=20)] = 5
+    status_period: Seconds = 0.05
+    activate_within: Positive = 300.0
+    emulation: PuckEmulation = PuckEmulation()
+
+    @property
+    def watchdog(self) -> float:
+        """Return the longest time that pucks keep their torque after the host is gone [s]."""
+        return self.heartbeat
+
+    @property
+    def report_delay(self) -> float:
+        """Return the largest delay with which a change of status is seen [s]."""
+        return 2.0 * self.status_period
+
+    @model_validator(mode="after")
+    def _nodes_apart(self) -> BarrettDriver:
+        nodes = [puck.node for puck in self.pucks]
+        if twice := sorted({node for node in nodes if nodes.count(node) > 1}):
+            raise ValueError(f"node {', '.join(map(str, twice))} stands twice")
+        if foreign := sorted(set(self.joint_encoders) - set(nodes)):
+            raise ValueError(f"joint_encoders: {', '.join(map(str, foreign))} is none of the nodes")
+        if self.bus.data_bitrate is not None:
+            raise ValueError("pucks do not speak CAN FD; leave bus.data_bitrate out")
+        if trips := [puck.node for puck in self.pucks if puck.mt > self.limits.torque]:
+            raise ValueError(
+                f"the safety puck would trip on what node {', '.join(map(str, trips))} may be told: mt is above "
+                f"limits.torque {self.limits.torque}"
+            )
+        return self
+
+
+def disagreements(
+    driver: BarrettDriver,
+    transmission: Transmission | None,
+    joints: Sequence[str],
+    rate: float,
+    homeless: Sequence[str] = (),
+) -> Iterator[tuple[tuple[str | int, ...], str]]:
+    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
+
+    Args:
+        driver: the section `driver`.
+        transmission: the arm's.
+        joints: names of the arm's joints; none where the file does not name them.
+        rate: cycles per second.
+        homeless: those without a `home`.
+    """
+    if homeless:
+        yield (
+            ("driver",),
+            "pucks count from where they were when power came, and need every joint's home, the posture in which a "
+            "person zeroes the arm; missing: " + ", ".join(f"joints.{name}.home" for name in homeless),
+        )
+    if driver.heartbeat * rate < _LEAST_HEARTBEAT:
+        yield (
+            ("driver", "heartbeat"),
+            f"driver.heartbeat: {driver.heartbeat:g} s at {rate:g} Hz has no room for a late cycle; at least "
+            f"{_LEAST_HEARTBEAT:g} cycles are needed, {_LEAST_HEARTBEAT / rate:g} s",
+        )
+    if driver.lost_cycles > max(_MOST_LOST, _LONGEST_LOSS * rate):
+        yield (
+            ("driver", "lost_cycles"),
+            f"driver.lost_cycles: {driver.lost_cycles} at {rate:g} Hz is {1e3 * driver.lost_cycles / rate:g} ms without"
+            f" positions; at most {max(_MOST_LOST, int(_LONGEST_LOSS * rate))} cycles",
+        )
+    count = len(driver.pucks)
+    if transmission is None:
+        yield ("driver",), "pucks need the section transmission: gear ratios from joints to motors"
+    elif len(transmission.ratios) != count:
+        yield ("driver", "pucks"), f"{count} pucks but {len(transmission.ratios)} ratios in transmission"
+    if joints and len(joints) != count:
+        yield ("driver", "pucks"), f"{count} pucks for {len(joints)} joints"
+    if driver.emulation.ipnm is not None and len(driver.emulation.ipnm) != count:
+        yield (
+            ("driver", "emulation", "ipnm"),
+            f"driver.emulation.ipnm: {len(driver.emulation.ipnm)} values for {count} pucks",
+        )

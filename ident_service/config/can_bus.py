@@ -1,0 +1,36 @@
+"""Describe one CAN bus and the interface that gives access to it, for every driver that has one."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from ident_service.config.quantities import Count, Section
+
+_KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
+
+
+class CanBus(Section):
+    """One CAN bus, and the interface that gives access to it.
+
+    `interface` is python-can's name of an interface, or `raw` for a CAN socket of the kernel without python-can, or
+    `lock_step` for emulated drives in this process and in virtual time. `options` go to python-can as they are.
+    """
+
+    interface: Annotated[str, Field(min_length=1)] = "socketcan"
+    channel: str = "can0"
+    bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
+    data_bitrate: Count | None = None
+    options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+
+    @property
+    def medium(self) -> str:
+        """Return the namespace of `channel`: `kernel` for CAN interfaces of the kernel, else the interface."""
+        return "kernel" if self.interface in _KERNELS else self.interface
+
+    @model_validator(mode="after")
+    def _data_not_slower(self) -> CanBus:
+        if self.data_bitrate is not None and self.data_bitrate < self.bitrate:
+            raise ValueError(f"data_bitrate {self.data_bitrate} is below bitrate {self.bitrate}; CAN FD only speeds up")
+        return self

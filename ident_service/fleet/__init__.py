@@ -1,0 +1,1 @@
+"""Identify many arms from many recordings: map and reduce on Dask, a common model, trends, one page."""

@@ -1,0 +1,282 @@
+"""Identify a fleet and write its results: one table, parameters of each arm, alarms, one page.
+
+Everything that needs an arm's equations runs on the workers; here are the common model, the tests over the fleet and
+the files. A folder of results holds
+
+    fleet.json              what was found, for programs
+    fleet.html              the page
+    parameters.parquet      arm, recording, parameter, value, deviation, verdict, quality
+    problems.json           recordings that were left out, and why
+    arms/ARM/               as `ident identify` writes it, without a report
+    changes/ARM/            before/, after/ and their comparison.json, .txt and .html, as `ident compare` writes it
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from distributed import Client
+
+from ident_service.config.load import load_arm
+from ident_service.errors import UsageError
+from ident_service.estimation.least_squares import LeastSquares
+from ident_service.estimation.plausibility import reasons_against
+from ident_service.estimation.uncertainty import negligible
+from ident_service.fleet.factor import Described, Merged, merge_stored
+from ident_service.fleet.population import (
+    ArmFit,
+    HeldOut,
+    arm_estimate,
+    arm_fit,
+    held_out_errors,
+    pooled_fit,
+    population,
+    unlike,
+    variance_shares,
+)
+from ident_service.fleet.reduction import FleetRequest, Reduced, Tell, connected, reduce_fleet
+from ident_service.fleet.results import (
+    FLEET,
+    FORMAT,
+    PAGE,
+    PROBLEMS,
+    TABLE,
+    FleetResult,
+    fleet_document,
+    fleet_page,
+    write_table,
+)
+from ident_service.fleet.storage import Store
+from ident_service.fleet.trends import (
+    Change,
+    change_points,
+    dependences,
+    scatter_of,
+)
+from ident_service.model.chain import Array
+from ident_service.operations.drift_alarms import verdict_of
+from ident_service.operations.parameter_files import DOCUMENT, compare_files
+from ident_service.results.manifest import (
+    exchange_folders,
+    require_place,
+    staging_beside,
+    write_atomically,
+)
+from ident_service.results.run_folder import write_manifest, write_results
+
+
+def identify_fleet(request: FleetRequest, folder: Path, tell: Tell = lambda _: None) -> FleetResult:
+    """Identify a fleet and write the results.
+
+    Args:
+        request: what is asked for.
+        folder: where results go; an earlier result there is replaced as a whole.
+        tell: called with a line at each step.
+
+    Raises:
+        UsageError, ConfigError: the request or the description is not valid, or the folder holds anything else.
+        RecordingError: no recording can be used.
+        StorageError: storage cannot be reached.
+        Unavailable: no scheduler, or no worker.
+        SolverError: a solver stopped without an optimum.
+    """
+    _require_replaceable(folder)
+    with connected(request, tell) as client:
+        reduced = reduce_fleet(client, request, tell)
+        for arm in reduced.arms:
+            _require_file_name(arm)
+        result, written, splits = _analysed(client, request, reduced, folder, tell)
+    with staging_beside(folder) as staging:
+        _write(staging, result, written, splits, request)
+        _require_replaceable(folder)
+        place = folder.resolve()
+        if place.exists():
+            exchange_folders(staging, place)
+            shutil.rmtree(staging)
+        else:
+            staging.rename(place)
+    return result
+
+
+def _require_replaceable(folder: Path) -> None:
+    require_place(folder)
+    if not folder.exists():
+        return
+    try:
+        ours = json.loads((folder / FLEET).read_text(encoding="utf-8"))["format"] == FORMAT
+    except (OSError, ValueError, KeyError, TypeError):
+        ours = False
+    if not ours and any(folder.iterdir()):
+        raise UsageError(f"{folder}: holds what is no result of a fleet; give a folder that does not exist")
+
+
+def _require_file_name(arm: str) -> None:
+    if "/" in arm or "\0" in arm or arm.startswith(".") or len(arm.encode()) > 100:
+        raise UsageError(f"an arm cannot be called {arm!r:.60}; give --names with a shorter group (?P<arm>...)")
+
+
+Files = Mapping[str, bytes]
+
+
+def _analysed(
+    client: Client, request: FleetRequest, reduced: Reduced, folder: Path, tell: Tell
+) -> tuple[FleetResult, dict[str, tuple[Files, dict[str, Any]]], dict[str, tuple[Files, Files]]]:
+    described, arms = reduced.described, reduced.arms
+    groups, method = described.groups, described.config.identification.method
+    shares = variance_shares({arm: [one.row for one in recordings] for arm, recordings in arms.items()}, groups)
+
+    def submit(function: Any, *arguments: Any) -> Any:
+        return client.submit(function, *arguments, pure=False)
+
+    def between(arm: str, count: int) -> Array | None:
+        return None if reduced.trees[arm].by_recording else shares.recordings / count
+
+    tell(f"{len(arms)} arms: each alone, and all together")
+    fitting = {
+        arm: submit(arm_fit, tree.merged, method, between(arm, len(arms[arm]))) for arm, tree in reduced.trees.items()
+    }
+    training = {
+        arm: submit(arm_fit, tree.trained, method, between(arm, tree.count)) for arm, tree in reduced.trees.items()
+    }
+    fits = {arm: future.result() for arm, future in fitting.items()}
+    found = population(fits, groups)
+    told = population({arm: future.result() for arm, future in training.items()}, groups)
+    judged: dict[str, Any] = {}
+    for arm, tree in reduced.trees.items():
+        if tree.held is not None:
+            prior = told.other_arms(arm)
+            judged[arm] = (
+                submit(
+                    held_out_errors, tree.trained, tree.held, prior, told.scale, between(arm, tree.count), described
+                ),
+                submit(held_out_errors, tree.single, tree.held, prior, told.scale, shares.recordings, described),
+            )
+    errors = {arm: (several.result(), single.result()) for arm, (several, single) in judged.items()}
+    several, single = (
+        HeldOut({arm: one[k][0] for arm, one in errors.items()}, {arm: one[k][1] for arm, one in errors.items()})
+        for k in (0, 1)
+    )
+    leading = tuple(described.base.names[column] for column in described.base.base)
+    odd = unlike(fits, found, groups, leading)
+    scatter = scatter_of(arms, groups)
+    changes = change_points(arms, fits, groups, scatter)
+    depending = dependences(arms, groups, scatter)
+    tell("estimates inside the feasible set, with their proofs")
+    files_of: dict[str, Any] = {}
+    config = load_arm(request.arm).model_dump_json()
+    for arm, tree in reduced.trees.items():
+        helps = several.helps if len(arms[arm]) > 1 else single.helps
+        pooled = pooled_fit(fits[arm], found.other_arms(arm), found.scale) if len(arms) > 1 else None
+        names = [(one.name, one.row.sha256) for one in arms[arm]]
+        more = {"arm": arm, "pooled": helps and pooled is not None, "arms": len(arms)}
+        files_of[arm] = submit(_arm_files, fits[arm], tree.merged, names, described, pooled, config, more)
+    store = Store(request.store if "://" in request.store else str(Path(request.store).absolute()))
+    splits_of = {
+        arm: _split_files(
+            client, arm, [one for one in changes if one.changed and one.arm == arm], reduced, store, config
+        )
+        for arm in sorted({one.arm for one in changes if one.changed})
+    }
+    written = {arm: future.result() for arm, future in files_of.items()}
+    splits = {arm: (first.result()[0], second.result()[0]) for arm, (first, second) in splits_of.items()}
+    result = FleetResult(folder, reduced, found, shares, several, single, odd, changes, depending, scatter, {})
+    summaries = {arm: summary for arm, (_, summary) in written.items()}
+    result.document.update(fleet_document(result, summaries, load_arm(request.arm).sha256))
+    return result, written, splits
+
+
+def _arm_files(
+    alone: ArmFit,
+    merged: Merged,
+    recordings: Sequence[tuple[str, str]],
+    described: Described,
+    pooled: LeastSquares | None,
+    config: str,
+    more: dict[str, Any],
+) -> tuple[Files, dict[str, Any]]:
+    """Return the files of one arm's results, and what the fleet's own say of it."""
+    from ident_service.config.arm import ArmConfig
+
+    chosen = arm_estimate(alone, merged, recordings, described, pooled if more["pooled"] else None, more["arms"])
+    own = chosen.candidates[chosen.chosen]
+    unusable = reasons_against(chosen)
+    fleet = {
+        **more,
+        "alone": alone.fit.beta.tolist(),
+        "alone_deviations": [float(value) if np.isfinite(value) else None for value in alone.doubt.deviations],
+        "together": None if pooled is None else pooled.beta.tolist(),
+        "together_deviations": None if pooled is None else pooled.standard_deviations.tolist(),
+    }
+    torque = described.config.identification.torque or "recorded"
+    with tempfile.TemporaryDirectory(prefix="ident-fleet-") as name:
+        place = Path(name)
+        write_results(place, chosen, {"fleet": fleet}, unusable, ArmConfig.model_validate_json(config), torque)
+        write_manifest(place)
+        content = {path.name: path.read_bytes() for path in sorted(place.iterdir())}
+    summary = {
+        "feasible": chosen.feasible,
+        "margin": chosen.margin,
+        "pooled": more["pooled"],
+        "unusable": list(unusable),
+        "error_percent": own.identification.relative_percent,
+        "values": chosen.beta.tolist(),
+        "standard_deviations": [float(v) if np.isfinite(v) else None for v in chosen.standard_deviations],
+        "verdicts": list(chosen.verdicts),
+        "negligible": negligible(alone.total),
+    }
+    return content, summary
+
+
+def _split_files(
+    client: Client, arm: str, changes: Sequence[Change], reduced: Reduced, store: Store, config: str
+) -> tuple[Any, Any]:
+    """Return futures of the results before and after an arm's most significant change."""
+    change = min(changes, key=lambda one: (one.p, -one.statistic))
+    described, found = reduced.described, []
+    recordings = reduced.arms[arm]
+    for part in (recordings[: change.at], recordings[change.at :]):
+        keys = [one.row.key for one in sorted(part, key=lambda one: (one.row.sha256, one.row.label, one.row.key))]
+        merged = client.submit(merge_stored, keys, described, store, False, pure=False)
+        alone = client.submit(arm_fit, merged, described.config.identification.method, None, pure=False)
+        names = [(one.name, one.row.sha256) for one in part]
+        more = {"arm": arm, "pooled": False, "arms": len(reduced.arms)}
+        found.append(client.submit(_arm_files, alone, merged, names, described, None, config, more, pure=False))
+    return found[0], found[1]
+
+
+def _write(
+    staging: Path,
+    result: FleetResult,
+    written: Mapping[str, tuple[Files, dict[str, Any]]],
+    splits: Mapping[str, tuple[Files, Files]],
+    request: FleetRequest,
+) -> None:
+    for arm, (content, _) in written.items():
+        _put(staging / "arms" / arm, content)
+    alarms = []
+    for arm, (before, after) in splits.items():
+        place = staging / "changes" / arm
+        for name, content in (("before", before), ("after", after)):
+            _put(place / name, content)
+        compare_files([place / "before", place / "after"], place)
+        words = verdict_of(json.loads((place / DOCUMENT).read_text(encoding="utf-8")))
+        alarms.append(
+            {"arm": arm, "verdict": words.state, "what": words.words, "comparison": f"changes/{arm}/{DOCUMENT}"}
+        )
+    result.document["alarms"] = alarms
+    write_table(staging / TABLE, result, {arm: summary for arm, (_, summary) in written.items()})
+    write_atomically(staging / FLEET, json.dumps(result.document, indent=1, allow_nan=False) + "\n")
+    write_atomically(staging / PROBLEMS, json.dumps(result.document["left_out"], indent=1) + "\n")
+    write_atomically(staging / PAGE, fleet_page(result, request))
+
+
+def _put(folder: Path, content: Files) -> None:
+    folder.mkdir(parents=True)
+    for name, data in content.items():
+        (folder / name).write_bytes(data)

@@ -1,0 +1,548 @@
+"""Estimate the arms of a fleet, each alone and together: common base parameters and each arm's deviation from them.
+
+    beta_i = mu + u_i,    u_i ~ N(0, T),    beta_i^ = beta_i + e_i,    e_i ~ N(0, C_i)
+
+with T diagonal: tau_g^2 D_k^2 for the parameters k of group g (friction of a joint, drive inertia of a joint, first
+moments of a link, inertia of a link). D_k is the size of a parameter that makes a torque of 1 N m (root mean square);
+tau_g [N m] then is how far arms differ in the torque of that group. mu is the generalised least-squares estimate, tau_g
+the restricted maximum-likelihood one (Harville 1977), found by the MM iteration of Zhou, Hu, Zhou and Lange (2019).
+Given both, an arm's parameters minimise
+
+    |R_i (beta - beta_i^)|^2 + sum_g |D_g^-1 (beta - mu)_g|^2 / tau_g^2,    R_i^T R_i = C_i^-1
+
+inside the feasible set: where an arm's own recordings say much they decide, elsewhere the fleet does. C_i^-1 comes from
+the triangles, scaled by one number to the variances from blocks, and what differs from recording to recording is added
+to C_i.
+
+Shares of variance between arms, between recordings and noise are moment estimates per parameter (DerSimonian and Laird
+1986, twice). Whether pooling helps is decided on recordings that no estimate has seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ident_service.estimation.change_detection import ComparedEstimate, Kind, Motion, Test, difference_test, holm
+from ident_service.estimation.equations import Equations
+from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.problems import constrained_least_squares, feasibility_test
+from ident_service.estimation.fit import Prepared, allowed_change
+from ident_service.estimation.identify import Candidate, Estimate
+from ident_service.estimation.least_squares import (
+    LeastSquares,
+    TorqueError,
+    ordinary_least_squares,
+    torque_error,
+    weighted_least_squares,
+)
+from ident_service.estimation.uncertainty import Uncertainty, negligible, uncertainty, verdicts, widening
+from ident_service.fleet.factor import Described, Merged, Row
+from ident_service.model.blas_threads import one_blas_thread
+from ident_service.model.chain import Array
+from ident_service.model.information import Information
+from ident_service.model.likely_bodies import likely_bodies
+
+_ROUNDS = 200
+_SETTLED = 1e-4  # relative change of the largest tau
+_LEAST = 1e-4  # of the residual; arms that differ by less torque are as good as equal
+_WORTH = 0.99  # of the error of each arm alone; pooling that gains less is left
+
+Group = tuple[Kind, int]
+
+
+@dataclass(frozen=True)
+class ArmFit:
+    """Unconstrained estimate of one arm from its recordings alone.
+
+    Attributes:
+        fit: weighted least squares.
+        doubt: its covariance and deviations, from blocks or recordings.
+        clusters: that they come from.
+        precision: inverse of the covariance as the fleet weighs it, shape (base, base), singular where unseen.
+        total: information that it solves.
+        error: of its torque on all rows.
+    """
+
+    fit: LeastSquares
+    doubt: Uncertainty
+    clusters: int
+    precision: Array
+    total: Information
+    error: TorqueError
+
+    @property
+    def right(self) -> Array:
+        """Return the precision times the estimate, shape (base,)."""
+        return np.asarray(self.precision @ self.fit.beta)
+
+
+@one_blas_thread()
+def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit:
+    """Estimate one arm from merged factors.
+
+    Args:
+        merged: its information.
+        method: `ols` gives all joints the same weight.
+        between: variance of the arm's mean by what differs from recording to recording [SI^2], shape (base,); None
+            where recordings are the clusters, whose covariance has it already.
+    """
+    total = merged.fitted.total
+    fit = ordinary_least_squares(total) if method == "ols" else weighted_least_squares(total)
+    doubt = uncertainty(merged.fitted, fit)
+    degrees = max(int(total.rows.sum()) - total.base, 1)
+    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
+    white = fit.standard_deviations
+    known = np.isfinite(white) & np.isfinite(doubt.deviations) & (white > 0.0)
+    # One factor for all: factors of their own would turn the combinations that are known well into others.
+    wider = float(np.median((doubt.deviations[known] / white[known]) ** 2)) if known.any() else 1.0
+    precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * wider)
+    if between is not None:
+        precision = _widened(precision, between)
+    everything = merged.everything
+    return ArmFit(fit, doubt, len(merged.clusters), precision, total, torque_error(everything, fit.beta))
+
+
+def _widened(precision: Array, variances: Array) -> Array:
+    """Return (P^-1 + V)^-1, P singular or not, shape (base, base)."""
+    found = np.linalg.solve(np.eye(len(precision)) + precision * variances, precision)
+    return np.asarray(0.5 * (found + found.T))
+
+
+@dataclass(frozen=True)
+class Population:
+    """Common model of a fleet; arrays but `scale` are in units of it, so that all parameters are torques [N m].
+
+    Attributes:
+        arms: names, in the order of what is per arm.
+        scale: D, the size of each parameter that makes 1 N m (root mean square), shape (base,).
+        tau: standard deviation between arms of each group's torque [N m or N].
+        mean: base parameters that are common, mu, shape (base,).
+        covariance: of them, shape (base, base).
+        variances: T, between arms, shape (base,).
+        without: T as the other arms alone have it, per arm, shape (arms, base).
+        precisions: C_i^-1 of every arm, shape (arms, base, base).
+        right: C_i^-1 times the arm's estimate, shape (arms, base).
+    """
+
+    arms: tuple[str, ...]
+    scale: Array
+    tau: Mapping[Group, float]
+    mean: Array
+    covariance: Array
+    variances: Array
+    without: Array
+    precisions: Array
+    right: Array
+
+    @property
+    def common(self) -> Array:
+        """Return the common base parameters [SI], shape (base,)."""
+        return self.mean * self.scale
+
+    @property
+    def between(self) -> Array:
+        """Return the standard deviations between arms [SI], shape (base,)."""
+        return np.asarray(np.sqrt(self.variances) * self.scale)
+
+    def other_arms(self, arm: str) -> tuple[Array, Array, Array]:
+        """Return mean, its covariance and T from all arms but one, in units of `scale`; of all, where it is alone."""
+        if len(self.arms) == 1:
+            return self.mean, self.covariance, self.variances
+        place = self.arms.index(arm)
+        others = np.arange(len(self.arms)) != place
+        # With the spread of the others: one that the odd arm widens would make their mean seem less sure, too.
+        variances = self.without[place]
+        mean, covariance, *_ = _common(self.precisions[others], self.right[others], variances)
+        return mean, covariance, variances
+
+
+@one_blas_thread()
+def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]) -> Population:
+    """Estimate the common parameters and how far arms differ from them.
+
+    Args:
+        fits: of each arm, at least one.
+        groups: places of each group's parameters.
+    """
+    arms = tuple(fits)
+    scale, residual = _torque_scale(fits)
+    P = np.array([fits[arm].precision for arm in arms]) * np.outer(scale, scale)
+    right = np.array([fits[arm].right for arm in arms]) * scale
+    beta = np.array([fits[arm].fit.beta for arm in arms]) / scale
+    member = np.zeros((len(groups), len(scale)), dtype=bool)
+    for number, places in enumerate(groups.values()):
+        member[number, list(places)] = True
+    floor = (_LEAST * residual) ** 2
+    spread = np.median(np.abs(beta - np.median(beta, axis=0)), axis=0) ** 2
+    tau2 = np.array([max(float(np.mean(spread[one])), floor) for one in member])
+    if len(arms) == 1:
+        tau2[:] = floor  # one arm says nothing of how far arms differ
+    for _ in range(_ROUNDS if len(arms) > 1 else 0):
+        gained, expected = _moments(P, right, tau2 @ member, member)
+        seen = expected.sum(axis=0) > np.finfo(float).tiny
+        step = np.sqrt(np.where(seen, gained.sum(axis=0) / np.where(seen, expected.sum(axis=0), 1.0), 1.0))
+        before, tau2 = tau2, np.clip(tau2 * step, floor, None)
+        if np.max(np.abs(np.sqrt(tau2 / before) - 1.0)) < _SETTLED:
+            break
+    gained, expected = _moments(P, right, tau2 @ member, member)
+    # Without each arm by one step: an odd arm must not hide in the spread that it makes itself.
+    others = np.maximum(expected.sum(axis=0) - expected, np.finfo(float).tiny)
+    ratio = np.clip((gained.sum(axis=0) - gained) / others, 1e-6, 1.0) if len(arms) > 2 else np.ones_like(gained)
+    variances = tau2 @ member
+    mean, covariance, *_ = _common(P, right, variances)
+    return Population(
+        arms=arms,
+        scale=scale,
+        tau={group: float(np.sqrt(value)) for group, value in zip(groups, tau2, strict=True)},
+        mean=mean,
+        covariance=covariance,
+        variances=variances,
+        without=np.maximum(tau2 * ratio, floor) @ member,
+        precisions=P,
+        right=right,
+    )
+
+
+def _torque_scale(fits: Mapping[str, ArmFit]) -> tuple[Array, float]:
+    """Return D, shape (base,), and the root mean square of what is unexplained [N m]."""
+    squares, rows, left = np.zeros(len(next(iter(fits.values())).fit.beta)), 0.0, 0.0
+    for found in fits.values():
+        total = found.total
+        squares = squares + np.sum(total.stacked()[:, :-1] ** 2, axis=0)
+        rows += float(total.rows.sum())
+        left += float(total.squared_residuals(found.fit.beta).sum())
+    sizes = np.sqrt(squares / max(rows, 1.0))
+    # A parameter that no recording shows keeps a size, so that all are numbers.
+    largest = float(np.max(sizes, initial=0.0)) or 1.0
+    return 1.0 / np.maximum(sizes, 1e-9 * largest), float(np.sqrt(left / max(rows, 1.0)))
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.pinv(matrix, rcond=1e-12, hermitian=True))
+
+
+def _common(P: Array, right: Array, variances: Array) -> tuple[Array, Array, Array, Array]:
+    """Return mu, its covariance, and of every arm M_i = (C_i + T)^-1 and M_i beta_i."""
+    shrinking = np.eye(P.shape[1]) + P * variances
+    M = np.linalg.solve(shrinking, P)
+    M = 0.5 * (M + np.swapaxes(M, 1, 2))
+    weighted = np.linalg.solve(shrinking, right[:, :, None])[:, :, 0]
+    covariance = _inverse(M.sum(axis=0))
+    return np.asarray(covariance @ weighted.sum(axis=0)), covariance, np.asarray(M), np.asarray(weighted)
+
+
+def _moments(P: Array, right: Array, variances: Array, member: Array) -> tuple[Array, Array]:
+    """Return per arm and group |M r|^2 and its expectation tr(M) - tr(M C_mu M), shape (arms, groups) each."""
+    mean, covariance, M, weighted = _common(P, right, variances)
+    off = weighted - M @ mean
+    trace = np.einsum("akk->ak", M) - np.einsum("akj,ajk->ak", M @ covariance, M)
+    return off**2 @ member.T, trace @ member.T
+
+
+def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -> LeastSquares:
+    """Return an arm's estimate drawn to a fleet's, as least squares in units of its deviations.
+
+    Args:
+        alone: the arm's own.
+        prior: mean, its covariance and T, in units of `scale`.
+        scale: D, shape (base,).
+    """
+    mean, covariance, variances = prior
+    around = np.linalg.inv(covariance + np.diag(variances))
+    P = alone.precision * np.outer(scale, scale)
+    information = P + 0.5 * (around + around.T)
+    inverse = np.linalg.inv(np.linalg.cholesky(information))  # L^-1, and R1 = L^T
+    beta = inverse.T @ (inverse @ (alone.right * scale + around @ mean))
+    R1 = np.linalg.cholesky(information).T / scale
+    beta = beta * scale
+    return LeastSquares(
+        beta=beta,
+        R1=R1,
+        rho1=R1 @ beta,
+        rho2=0.0,
+        inverse=inverse.T * scale[:, None],
+        condition_number=float(np.linalg.cond(R1)),
+        rank=len(beta),
+        standard_deviations=np.linalg.norm(inverse.T * scale[:, None], axis=1),
+        weights=alone.fit.weights,
+    )
+
+
+def constrained(fit: LeastSquares, described: Described) -> Array:
+    """Return the estimate inside the arm's feasible set, shape (base,)."""
+    return constrained_least_squares(fit, described.base, _conditions(described)).beta
+
+
+def _conditions(described: Described) -> FeasibleSet:
+    config = described.config
+    return feasible_set(config.feasible_set, described.base.names, config)
+
+
+@one_blas_thread()
+def arm_estimate(
+    alone: ArmFit,
+    merged: Merged,
+    recordings: Sequence[tuple[str, str]],
+    described: Described,
+    pooled: LeastSquares | None = None,
+    arms: int = 1,
+) -> Estimate:
+    """Return one arm's estimate inside its feasible set, as `ident identify` has it.
+
+    Args:
+        alone: its unconstrained estimate.
+        merged: its information.
+        recordings: name and hash of each.
+        described: the arm.
+        pooled: its estimate drawn to the fleet's; that of the arm alone when None.
+        arms: of the fleet; how far they differ is known the less, the fewer they are.
+
+    Raises:
+        SolverError: the solver stopped without an optimum.
+    """
+    model, base, conditions = described.model, described.base, _conditions(described)
+    fit = alone.fit if pooled is None else pooled
+    held = constrained_least_squares(fit, base, conditions)
+    degrees = alone.doubt.degrees if pooled is None else np.full(base.size, max(arms - 2.0, 1.0))
+    deviations = alone.doubt.deviations if pooled is None else pooled.standard_deviations * widening(degrees)
+    covariance = alone.doubt.covariance if pooled is None else pooled.inverse @ pooled.inverse.T
+    likely = likely_bodies(model)
+    near = allowed_change(fit, base, deviations, held.beta) if held.tight and pooled is None else None
+    held = held.centred(base, conditions, likely, near)
+    everything, moving = merged.everything, merged.moving
+    found = [
+        Candidate(name, beta, margin, torque_error(everything, beta), torque_error(moving, beta), ())
+        for name, beta, margin in (
+            ("unconstrained", fit.beta, feasibility_test(fit.beta, base, conditions).margin),
+            (f"FBPE {conditions.kind}", held.beta, held.margin),
+        )
+    ]
+    as_zero = negligible(everything)
+    equations = Equations((merged.moving,), merged.samples, (merged.near,))
+    return Estimate(
+        model=model,
+        base=base,
+        method="ols" if model.config.identification.method == "ols" else "wls",
+        conditions=conditions,
+        constrained=True,
+        beta=held.beta,
+        delta=held.delta,
+        margin=held.margin,
+        tight=held.tight,
+        covariance=covariance,
+        standard_deviations=deviations,
+        white_standard_deviations=fit.standard_deviations,
+        degrees=degrees,
+        negligible=as_zero,
+        noise_deviations=None,
+        constrained_intervals=None,
+        verdicts=verdicts(held.beta, deviations, as_zero),
+        fit=fit,
+        samples=merged.samples,
+        prepared=Prepared(model, equations, None, np.ones(model.chain.joints)),
+        fitted=merged.fitted,
+        information=merged.fitted.total,
+        prior=None,
+        nearest_to=likely.source,
+        recordings=tuple(recordings),
+        candidates=tuple(found),
+        chosen=1,
+        standstill_shares=np.ones(model.chain.joints),
+    )
+
+
+@dataclass(frozen=True)
+class Unlike:
+    """Difference of one arm from all others in one group of parameters.
+
+    Attributes:
+        arm: name.
+        group: kind and number of joint or link.
+        test: that the arm is one of the others' population.
+        p: of it, after Holm over all arms and groups.
+        torque: root mean square of the difference's torque on the arm's motion, of the joint where it is most [N m].
+        joint: that joint, from 0.
+        share: of that joint's torque.
+    """
+
+    arm: str
+    group: Group
+    test: Test
+    p: float
+    torque: float
+    joint: int
+    share: float
+
+
+@one_blas_thread()
+def unlike(
+    fits: Mapping[str, ArmFit],
+    found: Population,
+    groups: Mapping[Group, Sequence[int]],
+    leading: tuple[str, ...],
+) -> list[Unlike]:
+    """Test of every arm and group whether the arm differs from the others by more than they do among themselves.
+
+    Args:
+        fits: of each arm alone.
+        found: the common model.
+        groups: places of each group's parameters.
+        leading: link parameter that each base parameter is named after.
+    """
+    every = []
+    if len(found.arms) < 3:
+        return []
+    for arm, alone in fits.items():
+        mean, covariance, variances = found.other_arms(arm)
+        D = np.outer(found.scale, found.scale)
+        others = ComparedEstimate(leading, mean * found.scale, (covariance + np.diag(variances)) * D, len(fits) - 1)
+        own_covariance = _variances_of(alone)
+        own = ComparedEstimate(leading, alone.fit.beta, own_covariance, max(alone.clusters, 2))
+        motion = Motion.of(alone.total, alone.fit.beta)
+        for group, places in groups.items():
+            test = difference_test(others, own, places)
+            only = np.zeros(len(mean))
+            seen = [k for k in places if np.isfinite(own_covariance[k, k])]
+            only[seen] = (own.values - others.values)[seen]
+            change = motion.change(only)
+            share = change / np.maximum(motion.torque, np.finfo(float).tiny)
+            joint = int(np.argmax(share))
+            every.append(Unlike(arm, group, test, 1.0, float(change[joint]), joint, float(share[joint])))
+    corrected = holm([one.test.p for one in every])
+    return [replace(one, p=p) for one, p in zip(every, corrected, strict=True)]
+
+
+def _variances_of(alone: ArmFit) -> Array:
+    """Return the covariance of an arm's own estimate, with what differs between recordings, shape (base, base)."""
+    unseen = ~np.isfinite(np.diag(alone.doubt.covariance))
+    sizes = np.sqrt(np.where(np.diag(alone.precision) > 0.0, np.diag(alone.precision), 1.0))
+    covariance: Array = _inverse(alone.precision / np.outer(sizes, sizes)) / np.outer(sizes, sizes)
+    covariance[unseen, :] = covariance[:, unseen] = 0.0
+    covariance[unseen, unseen] = np.inf
+    return covariance
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Variances of each base parameter by where they come from, SI units squared, shape (base,) each.
+
+    Attributes:
+        arms: between arms.
+        recordings: between recordings of one arm.
+        noise: of one recording's estimate.
+    """
+
+    arms: Array
+    recordings: Array
+    noise: Array
+
+    @property
+    def percent(self) -> Array:
+        """Return the shares of the three [percent], shape (base, 3); zero where nothing was seen."""
+        parts = np.column_stack([self.arms, self.recordings, self.noise])
+        total = parts.sum(axis=1, keepdims=True)
+        return np.asarray(100.0 * parts / np.where(total > 0.0, total, 1.0))
+
+
+def variance_shares(rows: Mapping[str, Sequence[Row]], groups: Mapping[Group, Sequence[int]]) -> Shares:
+    """Split the variance of each parameter over arms, recordings and noise.
+
+    Args:
+        rows: of each arm's recordings.
+        groups: places of each group's parameters.
+    """
+    size = len(next(iter(rows.values()))[0].beta)
+    found = np.zeros((3, size))
+    place = {k: (g, j) for g, places in enumerate(groups.values()) for j, k in enumerate(places)}
+    for k in range(size):
+        g, j = place[k]
+        arms = []
+        for recordings in rows.values():
+            pairs = np.array([(one.beta[k], one.covariances[g][j, j]) for one in recordings])
+            arms.append(pairs[np.isfinite(pairs[:, 1]) & (pairs[:, 1] > 0.0)])
+        arms = [pairs for pairs in arms if len(pairs)]
+        if not arms:
+            continue
+        between = _excess([pairs for pairs in arms if len(pairs) > 1])
+        means = np.array([_mean(pairs[:, 0], pairs[:, 1] + between) for pairs in arms])
+        found[:, k] = _excess([means]), between, np.median(np.concatenate([pairs[:, 1] for pairs in arms]))
+    return Shares(*found)
+
+
+def _mean(values: Array, variances: Array) -> tuple[float, float]:
+    weights = 1.0 / variances
+    return float(weights @ values / weights.sum()), float(1.0 / weights.sum())
+
+
+def _excess(sets: Sequence[Array]) -> float:
+    """Return the variance of values beyond their own, pooled over sets of (value, variance), by moments; at least 0."""
+    excess = degrees = 0.0
+    for pairs in sets:
+        weights = 1.0 / pairs[:, 1]
+        total = weights.sum()
+        excess += float(weights @ (pairs[:, 0] - weights @ pairs[:, 0] / total) ** 2) - (len(pairs) - 1)
+        degrees += float(total - weights @ weights / total)
+    return max(excess / degrees, 0.0) if degrees > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Torque errors on recordings that no estimate has seen [percent], inside the feasible set.
+
+    Attributes:
+        alone: of each arm's own estimate.
+        pooled: of its estimate drawn to the fleet's.
+    """
+
+    alone: Mapping[str, float]
+    pooled: Mapping[str, float]
+
+    @property
+    def totals(self) -> tuple[float, float]:
+        """Return the root mean squares over the arms [percent], alone and pooled; NaN where nothing was held out."""
+        if not self.alone:
+            return np.nan, np.nan
+        mean = [float(np.sqrt(np.mean(np.square(list(one.values()))))) for one in (self.alone, self.pooled)]
+        return mean[0], mean[1]
+
+    @property
+    def gain(self) -> float:
+        """Return by how much of the error of each arm alone pooling lowers it; negative where it raises it."""
+        alone, pooled = self.totals
+        return 1.0 - pooled / alone if alone > 0.0 else np.nan
+
+    @property
+    def helps(self) -> bool:
+        """Return whether pooling is worth it; not where nothing was held out."""
+        alone, pooled = self.totals
+        return bool(pooled < _WORTH * alone)
+
+
+@one_blas_thread()
+def held_out_errors(
+    trained: Merged,
+    unseen: Merged,
+    prior: tuple[Array, Array, Array],
+    scale: Array,
+    between: Array | None,
+    described: Described,
+) -> tuple[float, float]:
+    """Return the torque errors of an arm alone and pooled on recordings held out [percent].
+
+    Args:
+        trained: information of the recordings that are fitted to.
+        unseen: of those that are held out.
+        prior: mean, its covariance and T of the other arms, in units of `scale`.
+        scale: D, shape (base,).
+        between: as of `arm_fit`.
+        described: the arm.
+    """
+    alone = arm_fit(trained, described.config.identification.method, between)
+    errors = [
+        torque_error(unseen.everything, constrained(fit, described)).relative_percent
+        for fit in (alone.fit, pooled_fit(alone, prior, scale))
+    ]
+    return errors[0], errors[1]

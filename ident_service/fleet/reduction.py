@@ -1,0 +1,471 @@
+"""Reduce the recordings of a fleet on Dask: one task a recording, then a tree of merges per arm.
+
+Nothing here distributes: `distributed` schedules the tasks, on processes of this machine or a cluster's, and runs those
+again whose worker died. What comes out does not depend on who finished first: the leaves of an arm's tree are sorted by
+the hash of their recording, and each task merges the same sixteen neighbours whatever happens.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from distributed import Client, KilledWorker, LocalCluster, as_completed
+
+from ident_service import __version__
+from ident_service.config.load import load_arm
+from ident_service.errors import RecordingError, StorageError, Unavailable, UsageError
+from ident_service.fleet.factor import (
+    FACTORS,
+    FAN_IN,
+    SETTLED,
+    STRETCHES,
+    Described,
+    Outcome,
+    Part,
+    Problem,
+    Row,
+    Settled,
+    merge,
+    merge_stored,
+    missing,
+    reduce_recording,
+    require_mergeable,
+    settle,
+    stored_row,
+)
+from ident_service.fleet.storage import Source, Store, find
+
+_Result = TypeVar("_Result")
+Tell = Callable[[str], None]
+
+PIECE_BYTES: Final = 256 * 2**20  # of a file, beyond which it is cut into pieces of time
+MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
+_ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
+_CONNECT_S: Final = 10.0
+_WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
+_PILOTS_TRIED, _ARMS_TRIED = 20, 5  # recordings of an arm that choices may be settled with, and arms
+
+
+@dataclass(frozen=True)
+class FleetRequest:
+    """Request for the identification of a fleet.
+
+    Attributes:
+        arm: description of every arm, file or name of a shipped one.
+        patterns: of recordings: files, folders, globs, or URLs that fsspec knows.
+        store: URL of the factors.
+        names: regular expression whose group `arm` is the arm's name in a recording's URL; its group `date`, an ISO
+            date or time, is when it was recorded. The name of the recording's folder when None.
+        scheduler: address of a Dask scheduler; an embedded one when None.
+        workers: processes of an embedded scheduler; one per core when None.
+        memory: limit of each of them, as Dask writes it.
+        piece_bytes: of a file, beyond which it is cut into pieces.
+        settle_again: whether choices are made anew although the store has them.
+    """
+
+    arm: str
+    patterns: tuple[str, ...]
+    store: str
+    names: str | None = None
+    scheduler: str | None = None
+    workers: int | None = None
+    memory: str = MEMORY
+    piece_bytes: int = PIECE_BYTES
+    settle_again: bool = False
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Recording, or piece of one, that was reduced.
+
+    Attributes:
+        url: of its file.
+        row: its own estimate.
+        at: when it was recorded [s since 1970].
+    """
+
+    url: str
+    row: Row
+    at: float
+
+    @property
+    def name(self) -> str:
+        """Return the file's name with its piece."""
+        return self.url.rpartition("/")[2] + self.row.label
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Futures of one arm's information (`factor.Merged`), which stays on the workers.
+
+    Attributes:
+        single: of the first recording, in the order of hashes.
+        trained: of those that are not held out.
+        held: of those held out to judge, a third; None where there is one recording only.
+        merged: of all.
+        by_recording: whether each recording is a cluster of the uncertainty.
+        count: recordings that are not held out.
+    """
+
+    single: Any
+    trained: Any
+    held: Any | None
+    merged: Any
+    by_recording: bool
+    count: int
+
+
+@dataclass
+class Reduced:
+    """Fleet whose recordings are reduced.
+
+    Attributes:
+        described: the arms, with numbers for all that could be chosen.
+        pilot: URLs of the recordings that chose them; empty where there was nothing to choose.
+        arms: recordings of each arm, by time.
+        trees: information of each arm, on the workers.
+        problems: why recordings were left out.
+        computed: factors that were computed, the others having been in the store.
+    """
+
+    described: Described
+    pilot: str
+    arms: dict[str, list[Recorded]] = field(default_factory=dict)
+    trees: dict[str, Tree] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+    computed: int = 0
+
+
+@contextmanager
+def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
+    """Yield a client of the scheduler that was asked for, or of an embedded one, after comparing versions.
+
+    Raises:
+        Unavailable: no scheduler answers there, or it has no worker.
+        UsageError: a worker has another version of this package.
+    """
+    if request.scheduler is not None:
+        try:
+            client = Client(request.scheduler, timeout=_CONNECT_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            reason = f"no Dask scheduler answers at {request.scheduler}: {error}"
+            raise Unavailable(
+                f"{reason}; `dask scheduler` starts one, `dask worker {request.scheduler}` its workers"
+            ) from None
+        with client:
+            _require_workers(client, request.scheduler, tell)
+            yield client
+        return
+    count = request.workers or os.cpu_count() or 1
+    # Numbers as text: a name that Dask does not know as bytes is the caller's mistake.
+    try:
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            memory_limit=request.memory,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            silence_logs=50,
+        )
+    except ValueError as error:
+        raise UsageError(f"--memory {request.memory}: {error}") from None
+    with cluster, Client(cluster, set_as_default=False) as client:
+        tell(f"{count} workers of {request.memory} each on this machine, dashboard {cluster.dashboard_link}")
+        yield client
+
+
+def _require_workers(client: Client, address: str, tell: Tell) -> None:
+    try:
+        client.wait_for_workers(1, timeout=_CONNECT_S)
+    except TimeoutError:
+        raise Unavailable(f"{address}: the scheduler has no worker; `dask worker {address}` starts one") from None
+    versions = client.get_versions(packages=["ident_service", *_ALIKE])
+    own = versions["client"]["packages"]
+    for worker, told in versions["workers"].items():
+        theirs = told["packages"]
+        if theirs.get("ident_service") != __version__:
+            has = theirs.get("ident_service") or "no version"
+            raise UsageError(
+                f"{worker} has {has} of ident-service, this client {__version__}: install the same on every worker"
+            )
+        for package in _ALIKE:
+            if theirs.get(package) != own.get(package):
+                tell(f"{worker} has {package} {theirs.get(package)}, not {own.get(package)}: last bits may differ")
+    tell(f"{len(versions['workers'])} workers of {address}, dashboard {client.dashboard_link}")
+
+
+def in_turn(
+    client: Client, function: Callable[..., _Result], tasks: Sequence[tuple[Any, ...]], failed: Callable[[int], _Result]
+) -> Iterator[tuple[int, _Result]]:
+    """Run a function on each tuple of arguments and yield number and result as they come.
+
+    Args:
+        client: of the scheduler.
+        function: to run; running it twice does nothing more.
+        tasks: its arguments.
+        failed: gives the result of a task whose every worker died.
+    """
+    workers = max(len(client.scheduler_info(n_workers=-1)["workers"]), 1)
+    waiting = iter(range(len(tasks)))
+    numbers = {}
+
+    def submit(number: int) -> Any:
+        future = client.submit(function, *tasks[number], pure=False)
+        numbers[future.key] = number
+        return future
+
+    first = [submit(number) for _, number in zip(range(_WAITING * workers), waiting, strict=False)]
+    completed = as_completed(first, loop=client.loop)
+    for future in completed:
+        number = numbers.pop(future.key)
+        try:
+            result = future.result()
+        except KilledWorker:
+            result = failed(number)
+        except ModuleNotFoundError as error:
+            raise UsageError(
+                f"a worker lacks what this package needs: {error}; install ident-service[fleet] there"
+            ) from None
+        future.release()
+        if (following := next(waiting, None)) is not None:
+            completed.add(submit(following))
+        yield number, result
+
+
+def reduce_fleet(client: Client, request: FleetRequest, tell: Tell) -> Reduced:
+    """Reduce recordings and merge those of each arm.
+
+    Args:
+        client: of the scheduler.
+        request: what to reduce.
+        tell: called with a line at each step.
+
+    Raises:
+        UsageError, ConfigError: the request or the description is not valid, or workers have other versions.
+        RecordingError: no recording can be used.
+        StorageError: the store, or the list of recordings, cannot be reached.
+    """
+    config = load_arm(request.arm)
+    require_mergeable(config)
+    named = _naming(request.names)
+    sources = find(request.patterns)
+    whose = {source.url: named(source.url) for source in sources}
+    store = Store(_absolute(request.store))
+    arm_of = {url: arm for url, (arm, _) in whose.items()}
+    described, pilot = _settled(client, sources, arm_of, config.model_dump_json(), config.sha256, store, request, tell)
+    parts = [
+        Part(source, number, count)
+        for source in sources
+        for count in [max(1, -(-source.size // request.piece_bytes))]
+        for number in range(count)
+    ]
+    reduced = Reduced(described, pilot)
+    outcomes = _mapped(client, parts, described, store, tell)
+    seen: dict[tuple[str, str], str] = {}
+    for outcome in outcomes:
+        source, row = outcome.part.source, outcome.row
+        if row is None:
+            if outcome.problem is not None:
+                reduced.problems.append(outcome.problem)
+            continue
+        reduced.computed += outcome.computed
+        if (first := seen.setdefault((row.sha256, row.label), source.url)) != source.url:
+            text = f"holds the same as {first}; twice, it would make the uncertainty too small"
+            reduced.problems.append(Problem(source.url, row.label, "recording", text))
+            continue
+        arm, date = whose[source.url]
+        reduced.arms.setdefault(arm, []).append(Recorded(source.url, row, row.stamp if date is None else date))
+    if not reduced.arms:
+        reasons = "; ".join(f"{one.url}{one.label}: {one.message}" for one in reduced.problems[:3])
+        raise RecordingError(sources[0].url, f"no recording of {len(sources)} can be used: {reasons}")
+    reduced.arms = {arm: sorted(reduced.arms[arm], key=_by_time) for arm in sorted(reduced.arms)}
+    _merge_arms(client, reduced, store, parts, tell)
+    return reduced
+
+
+def _by_time(one: Recorded) -> tuple[float, str, str]:
+    return one.at, one.row.sha256, one.row.label
+
+
+def _absolute(url: str) -> str:
+    """Return a URL that workers elsewhere on this machine understand."""
+    return url if "://" in url or "::" in url else str(Path(url).absolute())
+
+
+def _naming(pattern: str | None) -> Callable[[str], tuple[str, float | None]]:
+    """Return the function that finds an arm's name and a date in a URL."""
+    if pattern is None:
+        return lambda url: (url.rpartition("/")[0].rpartition("/")[2] or "arm", None)
+    try:
+        compiled = re.compile(pattern)
+    except re.error as error:
+        raise UsageError(f"--names {pattern!r}: no regular expression: {error}") from None
+    if "arm" not in compiled.groupindex:
+        raise UsageError(f"--names {pattern!r}: has no group (?P<arm>...)")
+
+    def name(url: str) -> tuple[str, float | None]:
+        match = compiled.search(url)
+        if match is None or not match["arm"]:
+            raise UsageError(f"{url}: --names {pattern!r} finds no arm in it")
+        text = match.groupdict().get("date")
+        try:
+            return match["arm"], None if text is None else _timestamp(text)
+        except ValueError:
+            raise UsageError(f"{url}: {text!r} is no date; write 2026-03-31 or 2026-03-31T06:00") from None
+
+    return name
+
+
+def _timestamp(text: str) -> float:
+    moment = datetime.fromisoformat(text)
+    return (moment if moment.tzinfo else datetime.fromisoformat(f"{moment.isoformat()}+00:00")).timestamp()
+
+
+def _settled(
+    client: Client,
+    sources: Sequence[Source],
+    whose: Mapping[str, str],
+    description: str,
+    sha256: str,
+    store: Store,
+    request: FleetRequest,
+    tell: Tell,
+) -> tuple[Described, str]:
+    """Return the description with numbers, from the store or settled by the first arm that can be used."""
+    name = f"{SETTLED}/{sha256}.json"
+    kept = None if request.settle_again else store.read(name)
+    if kept is not None:
+        pilot, _, text = kept.decode().partition("\n")
+        return Described(text), pilot
+    # Of one arm, as others have other parameters; the first whose recordings can be used.
+    arms: dict[str, list[Source]] = {}
+    for source in sources:
+        arms.setdefault(whose[source.url], []).append(source)
+    problems: list[Problem] = []
+    for arm in sorted(arms)[:_ARMS_TRIED]:
+        tell(f"filter, delay and friction's shape are chosen from recordings of {arm}")
+        found = client.submit(settle, arms[arm][:_PILOTS_TRIED], description, pure=False).result()
+        if isinstance(found, Settled):
+            names = ", ".join(found.pilots)
+            store.write(name, f"{names}\n{found.description}".encode())
+            return Described(found.description), names
+        problems.extend(found)
+    reasons = "; ".join(f"{one.url}: {one.message}" for one in problems[:3])
+    raise RecordingError(
+        problems[0].url, f"filter, delay and friction's shape cannot be chosen, no recording can be used: {reasons}"
+    )
+
+
+def _mapped(client: Client, parts: Sequence[Part], described: Described, store: Store, tell: Tell) -> list[Outcome]:
+    """Return the outcome of each part, in their order."""
+    outcomes: list[Outcome | None] = [None] * len(parts)
+    tasks = [(part, described, store, __version__) for part in parts]
+
+    def died(number: int) -> Outcome:
+        part = parts[number]
+        text = "ended every worker that read it, most likely for want of memory; give workers more with --memory"
+        return Outcome(part, None, Problem(part.source.url, part.label, "worker", text))
+
+    step = max(len(parts) // 10, 1)
+    for count, (number, outcome) in enumerate(in_turn(client, reduce_recording, tasks, died), 1):
+        if outcome.problem is not None and outcome.problem.kind == "version":
+            raise UsageError(outcome.problem.message)
+        outcomes[number] = outcome
+        if count % step == 0 or count == len(parts):
+            tell(f"{count} of {len(parts)} recordings reduced")
+    return [outcome for outcome in outcomes if outcome is not None]
+
+
+def _merge_arms(client: Client, reduced: Reduced, store: Store, parts: Sequence[Part], tell: Tell) -> None:
+    waiting = list(reduced.arms)
+    for attempt in range(2):
+        for arm in waiting:
+            reduced.trees[arm] = _tree(client, reduced.arms[arm], reduced.described, store)
+        checks = {arm: client.submit(missing, reduced.trees[arm].merged, pure=False) for arm in waiting}
+        damaged: dict[str, tuple[str, ...]] = {}
+        for arm, check in checks.items():
+            try:
+                if found := check.result():
+                    damaged[arm] = found
+            except KilledWorker:
+                raise Unavailable(f"{arm}: merging it ended every worker; give workers more with --memory") from None
+        if not damaged:
+            return
+        keys = {key for found in damaged.values() for key in found}
+        if attempt:
+            told = ", ".join(sorted(keys)[:3])
+            raise StorageError(store.url, f"factors that were just written cannot be read: {told}")
+        tell(f"{len(keys)} factors are damaged in the store and are computed again")
+        urls = {(one.url, one.row.label) for arm in damaged for one in reduced.arms[arm] if one.row.key in keys}
+        again = [part for part in parts if (part.source.url, part.label) in urls]
+        tasks = [(part, reduced.described, store, __version__, True) for part in again]
+        for future in [client.submit(reduce_recording, *task, pure=False) for task in tasks]:
+            outcome = future.result()
+            if outcome.problem is not None:
+                raise StorageError(outcome.problem.url, f"its factor is damaged, and {outcome.problem.message}")
+        reduced.computed += len(tasks)
+        waiting = list(damaged)
+
+
+def _tree(client: Client, recordings: Sequence[Recorded], described: Described, store: Store) -> Tree:
+    """Merge an arm's factors in the order of the recordings' hashes."""
+    keys = [one.row.key for one in sorted(recordings, key=lambda one: (one.row.sha256, one.row.label, one.row.key))]
+    count = len(keys) - (max(len(keys) // 3, 1) if len(keys) > 1 else 0)
+    whole = count >= STRETCHES
+
+    def branch(of: Sequence[str]) -> Any:
+        level = [
+            client.submit(merge_stored, of[k : k + FAN_IN], described, store, whole, pure=False)
+            for k in range(0, len(of), FAN_IN)
+        ]
+        while len(level) > 1:
+            level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
+        return level[0]
+
+    single = client.submit(merge_stored, keys[:1], described, store, False, pure=False)
+    trained = single if count == 1 else branch(keys[:count])
+    held = branch(keys[count:]) if count < len(keys) else None
+    merged = trained if held is None else client.submit(merge, [trained, held], pure=False)
+    return Tree(single, trained, held, merged, whole, count)
+
+
+def status_of(request: FleetRequest) -> Mapping[str, Any]:
+    """Return which recordings have factors in the store, by arm, and how large they are; nothing is computed.
+
+    Raises:
+        UsageError, ConfigError: the request or the description is not valid.
+        StorageError: storage cannot be reached.
+    """
+    config = load_arm(request.arm)
+    store = Store(_absolute(request.store))
+    sizes = [size for _, size in store.names(FACTORS)]
+    answer: dict[str, Any] = {"store": store.url, "factors": len(sizes), "bytes": sum(sizes)}
+    kept = store.read(f"{SETTLED}/{config.sha256}.json")
+    answer |= {"settled": kept is not None, "settled_by": None if kept is None else kept.decode().partition("\n")[0]}
+    if not request.patterns:
+        return answer
+    named = _naming(request.names)
+    arms: dict[str, dict[str, int]] = {}
+    new: list[str] = []
+    described = None if kept is None else Described(kept.decode().partition("\n")[2])
+    for source in find(request.patterns):
+        entry = arms.setdefault(named(source.url)[0], {"recordings": 0, "reduced": 0})
+        entry["recordings"] += 1
+        count = max(1, -(-source.size // request.piece_bytes))
+        if described is not None and all(_is_stored(store, described, Part(source, k, count)) for k in range(count)):
+            entry["reduced"] += 1
+        else:
+            new.append(source.url)
+    return answer | {"arms": dict(sorted(arms.items())), "new": new}
+
+
+def _is_stored(store: Store, described: Described, part: Part) -> bool:
+    noted = store.read(described.seen(part))
+    return noted is not None and stored_row(store, noted.decode(errors="replace")) is not None

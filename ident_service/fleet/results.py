@@ -1,0 +1,410 @@
+"""Present what was found of a fleet: a document for programs, a Parquet table, one page, lines for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from ident_service import __version__
+from ident_service.estimation.change_detection import ALPHA, RELEVANT_TORQUE
+from ident_service.estimation.uncertainty import verdicts
+from ident_service.fleet.factor import Described
+from ident_service.fleet.population import Group, HeldOut, Population, Shares, Unlike
+from ident_service.fleet.reduction import FleetRequest, Recorded, Reduced
+from ident_service.fleet.trends import Change, Dependence, Scatter, series
+from ident_service.model.chain import Array
+
+FLEET, PAGE, TABLE, PROBLEMS = "fleet.json", "fleet.html", "parameters.parquet", "problems.json"
+FORMAT: Final = "ident-fleet"
+_ARMS_DRAWN = 12  # arms whose trends the page shows
+_GROUPS_DRAWN = 6  # of each
+_OF_TABLE = ("values", "standard_deviations", "verdicts", "negligible")  # of a summary, which the table has
+
+
+@dataclass(frozen=True)
+class FleetResult:
+    """Result of the identification of a fleet.
+
+    Attributes:
+        folder: where everything is.
+        reduced: recordings, and why some were left out.
+        found: the common model.
+        shares: where each parameter's variance comes from.
+        several: errors on held-out recordings, of arms with several recordings as they are.
+        single: the same of one recording of each.
+        odd: differences of arms from the others, every arm and group.
+        changes: most likely change of every arm and group.
+        dependences: on temperature and operating hours.
+        scatter: between recordings of one arm, per group.
+        document: the content of `fleet.json`.
+    """
+
+    folder: Path
+    reduced: Reduced
+    found: Population
+    shares: Shares
+    several: HeldOut
+    single: HeldOut
+    odd: list[Unlike]
+    changes: list[Change]
+    dependences: list[Dependence]
+    scatter: Mapping[Group, Scatter]
+    document: dict[str, Any]
+
+    @property
+    def changed(self) -> list[Change]:
+        """Return the changes that are significant and matter."""
+        return [one for one in self.changes if one.changed]
+
+
+Summaries = Mapping[str, Mapping[str, Any]]
+
+
+def group_name(group: Group, described: Described) -> str:
+    """Return a group's name for a person: `friction of joint elbow`, `inertia of link 2`."""
+    kind, number = group
+    if kind in ("friction", "drive inertia"):
+        return f"{kind} of joint {described.model.chain.names[number - 1]}"
+    return f"{kind} of link {number}"
+
+
+def _when(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def fleet_document(
+    result: FleetResult,
+    summaries: Summaries,
+    sha256: str,
+) -> dict[str, Any]:
+    """Return the content of `fleet.json`, but for the alarms.
+
+    Args:
+        result: what was found.
+        summaries: of each arm's estimate.
+        sha256: of the description as it was read.
+    """
+    reduced, found, described = result.reduced, result.found, result.reduced.described
+    base = described.base
+    unlike_of: dict[str, list[Unlike]] = {arm: [] for arm in summaries}
+    for one in result.odd:
+        unlike_of[one.arm].append(one)
+    arms = {}
+    for arm, recordings in reduced.arms.items():
+        ranked = sorted(unlike_of[arm], key=lambda one: (one.p, -one.test.statistic))
+        differs = [one for one in ranked if one.p < ALPHA and one.share >= RELEVANT_TORQUE]
+        most = max(ranked, key=lambda one: one.share, default=None)
+        arms[arm] = {
+            "recordings": len(recordings),
+            "first": _when(recordings[0].at),
+            "last": _when(recordings[-1].at),
+            **{key: value for key, value in summaries[arm].items() if key not in _OF_TABLE},
+            "unlike_p": ranked[0].p if ranked else None,
+            "unlike_torque_share": None if most is None else most.share,
+            "differs": [
+                {
+                    "what": group_name(one.group, described),
+                    "sigma": one.test.sigma,
+                    "p": one.p,
+                    "joint": described.model.chain.names[one.joint],
+                    "torque_share": one.share,
+                }
+                for one in differs
+            ],
+        }
+    ranking = sorted(
+        arms, key=lambda arm: (arms[arm]["unlike_p"] or 1.0, -(arms[arm]["unlike_torque_share"] or 0.0), arm)
+    )
+    percent = result.shares.percent
+    groups = {place: group for group, places in described.groups.items() for place in places}
+    return {
+        "format": FORMAT,
+        "version": 1,
+        "arm": {"name": described.config.name, "sha256": sha256},
+        "settled": {
+            "by": reduced.pilot,
+            "identification": described.config.identification.model_dump(mode="json"),
+        },
+        "recordings": sum(len(one) for one in reduced.arms.values()),
+        "left_out": [
+            {"url": one.url, "piece": one.label, "kind": one.kind, "message": one.message} for one in reduced.problems
+        ],
+        "ranking": ranking,
+        "arms": arms,
+        "parameters": [
+            {
+                "expression": base.expressions[k],
+                "unit": base.units[k],
+                "group": group_name(groups[k], described),
+                "common": float(found.common[k]),
+                "deviation_between_arms": float(found.between[k]),
+                "variance_percent": {"arms": percent[k, 0], "recordings": percent[k, 1], "noise": percent[k, 2]},
+            }
+            for k in range(base.size)
+        ],
+        "groups": [
+            {
+                "name": group_name(group, described),
+                "deviation_between_arms_torque": value,
+                "recordings_factor": result.scatter[group].factor,
+            }
+            for group, value in found.tau.items()
+        ],
+        "held_out": {
+            key: {
+                "arms": len(one.alone),
+                "alone_percent": _finite(one.totals[0]),
+                "pooled_percent": _finite(one.totals[1]),
+                "gain": _finite(one.gain),
+                "pooling_helps": one.helps,
+                "per_arm": {arm: [one.alone[arm], one.pooled[arm]] for arm in one.alone},
+            }
+            for key, one in (("several_recordings", result.several), ("one_recording", result.single))
+        },
+        "changes": [
+            {
+                "arm": one.arm,
+                "what": group_name(one.group, described),
+                "after": _when(one.before),
+                "until": _when(one.after),
+                "first_recording": reduced.arms[one.arm][one.at].name,
+                "sigma": float(np.sqrt(one.statistic)),
+                "p": one.p,
+                "joint": described.model.chain.names[one.joint],
+                "torque_share": one.torque_share,
+                "residual_share": one.residual_share,
+                "step": dict(
+                    zip([base.expressions[k] for k in described.groups[one.group]], one.step.tolist(), strict=True)
+                ),
+            }
+            for one in sorted(result.changed, key=lambda one: (one.p, -one.statistic))
+        ],
+        "tested": {"changes": len(result.changes), "unlike": len(result.odd), "alpha": ALPHA},
+        "dependences": [
+            {
+                "condition": one.condition,
+                "expression": base.expressions[one.place],
+                "unit": base.units[one.place],
+                "slope": one.slope,
+                "deviation": one.deviation,
+                "p": one.p,
+                "recordings": one.recordings,
+            }
+            for one in result.dependences
+        ],
+        "software": f"ident-service {__version__}",
+    }
+
+
+_SCHEMA = pa.schema(
+    [
+        pa.field("arm", pa.string(), nullable=False),
+        pa.field("recording", pa.string()),  # null: the arm's estimate from all of them
+        pa.field("sha256", pa.string()),
+        pa.field("time", pa.timestamp("us", tz="UTC")),
+        pa.field("parameter", pa.string(), nullable=False),
+        pa.field("group", pa.string(), nullable=False),
+        pa.field("unit", pa.string(), nullable=False),
+        pa.field("value", pa.float64(), nullable=False),
+        pa.field("deviation", pa.float64()),  # null: not seen
+        pa.field("verdict", pa.string(), nullable=False),
+        pa.field("quality", pa.string(), nullable=False),
+        pa.field("torque_error_percent", pa.float64(), nullable=False),
+        pa.field("temperature", pa.float64()),
+        pa.field("operating_hours", pa.float64()),
+    ]
+)
+
+
+def write_table(path: Path, result: FleetResult, summaries: Summaries) -> None:
+    """Write the table: one row per parameter of each recording's own estimate, and of each arm's."""
+    described, base = result.reduced.described, result.reduced.described.base
+    size = base.size
+    names = {k: group_name(group, described) for group, places in described.groups.items() for k in places}
+    columns = {
+        "parameter": list(base.expressions),
+        "group": [names[k] for k in range(size)],
+        "unit": list(base.units),
+    }
+    # In pieces, so that memory does not grow with the fleet.
+    with pq.ParquetWriter(path, _SCHEMA) as writer:
+        for arm, recordings in result.reduced.arms.items():
+            summary = summaries[arm]
+            entries: list[dict[str, Any]] = [_of_recording(one, summary) for one in recordings]
+            entries.append(
+                {
+                    "recording": None,
+                    "sha256": None,
+                    "time": None,
+                    "value": summary["values"],
+                    "deviation": summary["standard_deviations"],
+                    "verdict": summary["verdicts"],
+                    "quality": "; ".join(summary["unusable"]) or "good",
+                    "torque_error_percent": summary["error_percent"],
+                    "temperature": None,
+                    "operating_hours": None,
+                }
+            )
+            for entry in entries:
+                whole = {key: value if isinstance(value, list) else [value] * size for key, value in entry.items()}
+                writer.write_table(pa.table({"arm": [arm] * size, **columns, **whole}, schema=_SCHEMA))
+
+
+def _of_recording(one: Recorded, summary: Mapping[str, Any]) -> dict[str, Any]:
+    row = one.row
+    return {
+        "recording": one.name,
+        "sha256": row.sha256,
+        "time": round(one.at * 1e6),
+        "value": row.beta.tolist(),
+        "deviation": [_finite(value) for value in row.deviations],
+        "verdict": list(verdicts(row.beta, row.deviations, summary["negligible"])),
+        "quality": "; ".join(row.warnings) or "good",
+        "torque_error_percent": row.error,
+        "temperature": row.conditions.get("temperature"),
+        "operating_hours": row.conditions.get("operating_hours"),
+    }
+
+
+_WIDTH, _HEIGHT = 260.0, 96.0  # of a small drawing
+
+
+def _drawing(points: Array, common: float, change: Change | None) -> dict[str, Any]:
+    """Return the coordinates of one small multiple: value with interval over time, the fleet's mean, a change."""
+    low, high = float((points[:, 1] - points[:, 2]).min()), float((points[:, 1] + points[:, 2]).max())
+    low, high = min(low, common), max(high, common)
+    first, last = float(points[0, 0]), float(points[-1, 0])
+    room = (high - low) or 1.0
+
+    def x(at: float) -> float:
+        return round(6.0 + (_WIDTH - 12.0) * ((at - first) / ((last - first) or 1.0)), 1)
+
+    def y(value: float) -> float:
+        return round(6.0 + (_HEIGHT - 12.0) * (1.0 - (value - low) / room), 1)
+
+    return {
+        "bars": [(x(at), y(value - half), y(value + half), y(value)) for at, value, half in points.tolist()],
+        "line": " ".join(f"{x(at)},{y(value)}" for at, value, _ in points.tolist()),
+        "common": y(common),
+        "change": None if change is None else x(0.5 * (change.before + change.after)),
+        "low": f"{low:.3g}",
+        "high": f"{high:.3g}",
+        "first": _when(first)[:10],
+        "last": _when(last)[:10],
+    }
+
+
+def _trends(result: FleetResult) -> list[dict[str, Any]]:
+    reduced, described = result.reduced, result.reduced.described
+    groups = described.groups
+    numbers = {group: number for number, group in enumerate(groups)}
+    changed = {one.arm for one in result.changed}
+    order = sorted(result.document["ranking"], key=lambda arm: arm not in changed)[:_ARMS_DRAWN]
+    drawn = []
+    for arm in order:
+        of_arm = sorted((one for one in result.changes if one.arm == arm), key=lambda one: (one.p, -one.statistic))
+        figures = []
+        for one in of_arm[:_GROUPS_DRAWN]:
+            places = groups[one.group]
+            index = int(np.argmax(np.abs(one.step) / np.maximum(one.deviations, np.finfo(float).tiny)))
+            place = places[index]
+            points = series(reduced.arms[arm], place, numbers[one.group], index, result.scatter[one.group])
+            drawing = _drawing(points, float(result.found.common[place]), one if one.changed else None)
+            what = f"{described.base.expressions[place]} [{described.base.units[place] or '-'}]"
+            title = group_name(one.group, described)
+            figures.append({"what": what, "title": title, "p": one.p, "changed": one.changed, **drawing})
+        if figures:
+            drawn.append({"arm": arm, "figures": figures, "changed": arm in changed})
+    return drawn
+
+
+def fleet_page(result: FleetResult, request: FleetRequest) -> str:
+    """Return the page: one file, no network, readable without scripts."""
+    document = result.document
+    qualities = [
+        {
+            "arm": arm,
+            "name": one.name,
+            "at": _when(one.at)[:16].replace("T", " "),
+            "seconds": one.row.seconds,
+            "rate": one.row.rate,
+            "error": one.row.error,
+            "words": "; ".join(one.row.warnings),
+        }
+        for arm, recordings in result.reduced.arms.items()
+        for one in recordings
+    ]
+    # Of many recordings those that have something to tell; the table has all.
+    told = [one for one in qualities if one["words"]] if len(qualities) > 500 else qualities
+    return (
+        _environment()
+        .get_template("fleet.html")
+        .render(
+            document=document,
+            style=files("ident_service.results.report").joinpath("report.css").read_text(encoding="utf-8"),
+            trends=_trends(result),
+            qualities=told,
+            recordings=len(qualities),
+            patterns=request.patterns,
+            width=_WIDTH,
+            height=_HEIGHT,
+            table=TABLE,
+        )
+    )
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader(str(__package__)),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def fleet_text(result: FleetResult) -> str:
+    """Return what was found, for a terminal."""
+    document = result.document
+    lines = [
+        f"{document['recordings']} recordings of {len(document['arms'])} arms, {len(document['left_out'])} left out"
+    ]
+    lines += [f"  left out: {one['url']}{one['piece']}: {one['message']}" for one in document["left_out"]]
+    for key, words in (("several_recordings", "as recorded"), ("one_recording", "with one recording each")):
+        held = document["held_out"][key]
+        if held["arms"]:
+            helps = "pooled" if held["pooling_helps"] else "each arm alone"
+            lines.append(
+                f"torque error on held-out recordings, {words}: {held['alone_percent']:.3g} % alone,"
+                f" {held['pooled_percent']:.3g} % pooled ({-100.0 * held['gain']:+.0f} %): {helps}"
+            )
+    differing = {arm: document["arms"][arm]["differs"] for arm in document["ranking"]}
+    lines.append(f"unlike the others: {', '.join(arm for arm, found in differing.items() if found) or 'no arm'}")
+    lines += [
+        f"  {arm}: {one['what']}, {one['sigma']:.1f} sigma, {one['torque_share']:.1%} of {one['joint']}"
+        for arm, found in differing.items()
+        for one in found
+    ]
+    lines.append(f"changed: {', '.join(dict.fromkeys(one['arm'] for one in document['changes'])) or 'no arm'}")
+    lines += [
+        f"  {one['arm']}: {one['what']} between {one['after'][:10]} and {one['until'][:10]}, {one['sigma']:.1f} sigma"
+        for one in document["changes"]
+    ]
+    lines += [f"  alarm: {one['arm']}: {one['what']}" for one in document.get("alarms", [])]
+    lines += [f"files: {result.folder}", f"  {PAGE}, {FLEET}, {TABLE}, arms/*/parameters.json"]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,295 @@
+"""Follow every group of parameters of every arm over time: intervals, change points, dependence on conditions.
+
+The estimates b_t of a group from single recordings have covariances C_t, and differ besides from recording to recording
+of one arm. How much is estimated for the whole fleet from the differences of neighbours, robustly, so that the few that
+a change falls between do not hide it: a variance per parameter that is added to C_t, and one factor per group.
+
+A change at a split is tested by generalised least squares with a step there, and with the conditions that all of the
+arm's recordings carry (temperature, operating hours) as further columns:
+
+    T^2 = s^T Cov(s)^-1 s  ~  F(d, nu),    s the step, d parameters, nu neighbours' differences in the fleet
+
+The smallest probability of an arm's group over its splits is multiplied by their number (Bonferroni), and those of all
+arms and groups are one family, controlled by Holm's method: one false alarm in a hundred fleets, not in a hundred
+arms. As in `change_detection.py` a change must also matter for the torque.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from ident_service.estimation.change_detection import ALPHA, Kind, Motion, holm, probability, relevant
+from ident_service.fleet.factor import CONDITIONS
+from ident_service.fleet.population import ArmFit
+from ident_service.fleet.reduction import Recorded
+from ident_service.model.blas_threads import one_blas_thread
+from ident_service.model.chain import Array
+
+Group = tuple[Kind, int]
+
+_LEAST_SIDE = 2  # recordings on each side of a split: a single odd one is no change
+_LEAST = 2 * _LEAST_SIDE
+_MEDIAN = 0.45493642311957275  # of chi-square with one degree of freedom
+_TRIMMED = 0.9  # share of neighbours' statistics that the factor is found from
+_NORMAL = 1.959963984540054
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Scatter of the estimates of one group from recording to recording of one arm.
+
+    Attributes:
+        variances: added to each estimate's covariance [SI^2], shape (parameters of the group,).
+        factor: that the sum is multiplied by, at least 1.
+        degrees: neighbours' differences that it comes from, in the whole fleet.
+    """
+
+    variances: Array
+    factor: float
+    degrees: int
+
+
+@dataclass(frozen=True)
+class Change:
+    """Most likely change of one group of one arm.
+
+    Attributes:
+        arm: name.
+        group: kind and number of joint or link.
+        at: index of the first recording after it, in time.
+        before: time of the last recording before [s since 1970].
+        after: time of the first recording after.
+        step: of the group's parameters [SI].
+        deviations: of the step [SI].
+        statistic: T^2.
+        p: of the change, after Bonferroni over the splits and Holm over the fleet.
+        joint: the one whose torque changes most for its size, from 0.
+        torque_share: of that joint's torque, by which its prediction changes.
+        residual_share: of that joint's residual.
+        changed: whether it is significant and matters.
+    """
+
+    arm: str
+    group: Group
+    at: int
+    before: float
+    after: float
+    step: Array
+    deviations: Array
+    statistic: float
+    p: float
+    joint: int
+    torque_share: float
+    residual_share: float
+    changed: bool
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Regression of one base parameter on one condition, within arms, over the whole fleet.
+
+    Attributes:
+        condition: `temperature` [degrees Celsius] or `operating_hours` [h].
+        place: of the base parameter.
+        slope: [SI per unit of the condition].
+        deviation: of the slope.
+        p: that it is zero, after Holm over all parameters and conditions.
+        recordings: that carry the condition.
+    """
+
+    condition: str
+    place: int
+    slope: float
+    deviation: float
+    p: float
+    recordings: int
+
+
+def _estimates(recordings: Sequence[Recorded], number: int, places: Sequence[int]) -> tuple[list[int], Array, Array]:
+    """Return which recordings saw all of a group, their values and covariances."""
+    seen = [t for t, one in enumerate(recordings) if np.isfinite(np.diag(one.row.covariances[number])).all()]
+    values = np.array([recordings[t].row.beta[list(places)] for t in seen]).reshape(len(seen), len(places))
+    covariances = np.array([recordings[t].row.covariances[number] for t in seen])
+    return seen, values, covariances.reshape(len(seen), len(places), len(places))
+
+
+@one_blas_thread()
+def scatter_of(arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]]) -> dict[Group, Scatter]:
+    """Estimate how much recordings of one arm differ, per group, from neighbours in time of all arms."""
+    found = {}
+    for number, (group, places) in enumerate(groups.items()):
+        steps: list[Array] = []
+        sums: list[Array] = []
+        for recordings in arms.values():
+            _, values, covariances = _estimates(recordings, number, places)
+            steps.extend(np.diff(values, axis=0))
+            sums.extend(covariances[1:] + covariances[:-1])
+        if not steps:
+            found[group] = Scatter(np.zeros(len(places)), 1.0, 0)
+            continue
+        step, total = np.array(steps), np.array(sums)
+        noise = np.median(np.einsum("tkk->tk", total), axis=0)
+        variances = 0.5 * np.maximum(np.median(step**2, axis=0) / _MEDIAN - noise, 0.0)
+        statistics = np.sort(
+            [_squared(one, part + 2.0 * np.diag(variances)) for one, part in zip(step, total, strict=True)]
+        )
+        kept = statistics[: max(round(_TRIMMED * len(statistics)), 1)]
+        factor = float(np.mean(kept)) / _trimmed_mean(len(places))
+        found[group] = Scatter(variances, max(factor, 1.0), len(steps))
+    return found
+
+
+def _trimmed_mean(dimensions: int) -> float:
+    """Return the mean of the smallest `_TRIMMED` of a chi-square distribution."""
+    from scipy.special import chdtr, chdtri
+
+    largest = float(chdtri(dimensions, 1.0 - _TRIMMED))
+    return float(dimensions * chdtr(dimensions + 2, largest) / _TRIMMED)
+
+
+def _squared(step: Array, covariance: Array) -> float:
+    sizes = np.sqrt(np.diag(covariance))
+    return float(step / sizes @ np.linalg.pinv(covariance / np.outer(sizes, sizes), rcond=1e-10) @ (step / sizes))
+
+
+@one_blas_thread()
+def change_points(
+    arms: Mapping[str, Sequence[Recorded]],
+    fits: Mapping[str, ArmFit],
+    groups: Mapping[Group, Sequence[int]],
+    scatter: Mapping[Group, Scatter],
+) -> list[Change]:
+    """Find the most likely change of every group of every arm with enough recordings, and test it over the fleet.
+
+    Args:
+        arms: recordings of each arm, by time.
+        fits: of each arm, for what its torque and residual are.
+        groups: places of each group's parameters.
+        scatter: between recordings.
+    """
+    every: list[Change] = []
+    for arm, recordings in arms.items():
+        motion = Motion.of(fits[arm].total, fits[arm].fit.beta)
+        for number, (group, places) in enumerate(groups.items()):
+            found = _most_likely(recordings, number, places, scatter[group])
+            if found is None:
+                continue
+            p, statistic, at, step, deviations, times = found
+            only = np.zeros(len(fits[arm].fit.beta))
+            only[list(places)] = step
+            change, tiny = motion.change(only), np.finfo(float).tiny
+            shares = change / np.maximum(motion.torque, tiny), change / np.maximum(motion.residual, tiny)
+            joint = int(np.argmax(shares[0]))
+            of_joint = (float(shares[0][joint]), float(shares[1][joint]))
+            every.append(
+                Change(arm, group, at, *times, step, deviations, statistic, p, joint, *of_joint, relevant(shares))
+            )
+    corrected = holm([one.p for one in every])
+    return [replace(one, p=p, changed=one.changed and p < ALPHA) for one, p in zip(every, corrected, strict=True)]
+
+
+def _most_likely(
+    recordings: Sequence[Recorded], number: int, places: Sequence[int], scatter: Scatter
+) -> tuple[float, float, int, Array, Array, tuple[float, float]] | None:
+    seen, values, covariances = _estimates(recordings, number, places)
+    conditions = _carried([recordings[t] for t in seen])
+    count, size = values.shape
+    if count < _LEAST + conditions.shape[1]:
+        return None
+    L = np.linalg.cholesky(scatter.factor * (covariances + np.diag(scatter.variances + np.finfo(float).tiny)))
+    whitening = np.linalg.inv(L)
+    y = np.einsum("tij,tj->ti", whitening, values).ravel()
+
+    def columns(of: Array) -> Array:
+        return np.asarray(np.einsum("tij,t->tij", whitening, of).reshape(count * size, size))
+
+    known = np.hstack([columns(np.ones(count)), *(columns(one) for one in conditions.T)])
+    Q = np.linalg.qr(known)[0]
+    rest = y - Q @ (Q.T @ y)
+    best: tuple[float, float, int, Array, Array] | None = None
+    splits = range(_LEAST_SIDE, count - _LEAST_SIDE + 1)
+    for split in splits:
+        step = columns((np.arange(count) >= split).astype(float))
+        step = step - Q @ (Q.T @ step)
+        information = step.T @ step
+        sizes = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        covariance = np.linalg.pinv(information / np.outer(sizes, sizes), rcond=1e-10, hermitian=True)
+        covariance = covariance / np.outer(sizes, sizes)
+        found = covariance @ (step.T @ rest)
+        statistic = float(found @ (step.T @ rest))
+        if best is None or statistic > best[1]:
+            p = probability(statistic, size, float(max(scatter.degrees, size)))
+            best = (p, statistic, split, found, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    if best is None:
+        return None
+    p, statistic, split, found, deviations = best
+    times = (recordings[seen[split - 1]].at, recordings[seen[split]].at)
+    return min(p * len(splits), 1.0), statistic, seen[split], found, deviations, times
+
+
+def _carried(recordings: Sequence[Recorded]) -> Array:
+    """Return the conditions that all recordings carry and that differ, centred, shape (recordings, conditions)."""
+    found = []
+    for name in CONDITIONS.values():
+        if all(name in one.row.conditions for one in recordings):
+            values = np.array([one.row.conditions[name] for one in recordings])
+            spread = float(np.std(values)) if len(values) else 0.0
+            if spread > 0.0:
+                found.append((values - values.mean()) / spread)
+    return np.column_stack(found) if found else np.zeros((len(recordings), 0))
+
+
+@one_blas_thread()
+def dependences(
+    arms: Mapping[str, Sequence[Recorded]], groups: Mapping[Group, Sequence[int]], scatter: Mapping[Group, Scatter]
+) -> list[Dependence]:
+    """Regress every base parameter on the conditions that recordings carry, each arm with a level of its own."""
+    every = []
+    for name in CONDITIONS.values():
+        carrying = {arm: [one for one in recordings if name in one.row.conditions] for arm, recordings in arms.items()}
+        total = sum(len(recordings) for recordings in carrying.values())
+        for number, (group, places) in enumerate(groups.items()):
+            for j, place in enumerate(places):
+                products = squares = 0.0
+                for recordings in carrying.values():
+                    seen, values, covariances = _estimates(recordings, number, places)
+                    if len(seen) < 2:
+                        continue
+                    x = np.array([recordings[t].row.conditions[name] for t in seen])
+                    spread = scatter[group]
+                    weights = 1.0 / (spread.factor * (covariances[:, j, j] + spread.variances[j]))
+                    x = x - weights @ x / weights.sum()
+                    products += float(weights * x @ values[:, j])
+                    squares += float(weights * x @ x)
+                if squares > 0.0:
+                    slope, deviation = products / squares, squares**-0.5
+                    p = 2.0 * float(ndtr(-abs(slope / deviation)))
+                    every.append(Dependence(name, place, slope, deviation, p, total))
+    corrected = holm([one.p for one in every])
+    return [replace(one, p=p) for one, p in zip(every, corrected, strict=True)]
+
+
+def series(recordings: Sequence[Recorded], place: int, number: int, index: int, scatter: Scatter) -> Array:
+    """Return one parameter of one arm over time: time [s since 1970], value, and half its 95 % interval [SI].
+
+    Args:
+        recordings: of the arm, by time.
+        place: of the base parameter.
+        number: of its group.
+        index: of it in the group.
+        scatter: of the group, which the interval has in it.
+
+    Returns:
+        Shape (recordings that saw it, 3).
+    """
+    found = []
+    for one in recordings:
+        variance = float(one.row.covariances[number][index, index])
+        if np.isfinite(variance):
+            half = _NORMAL * float(np.sqrt(scatter.factor * (variance + scatter.variances[index])))
+            found.append((one.at, float(one.row.beta[place]), half))
+    return np.array(found).reshape(len(found), 3)

@@ -1,0 +1,357 @@
+"""Tell what configuring an arm's drives would change; import a DCF into them, have them store or restore parameters.
+
+The same code configures drives (`drivers.canopen.drive_setup`), with objects that note what they are to write.
+
+What a maker's tool has written into a drive stays, except for what opening an arm must set. A DCF of that tool is
+imported entry by entry: compared, written where it differs, read back; where one is refused, all that were written
+are set back. What opening sets anyway is left to it. Drives store parameters, or forget them, only when a person says
+so, and only while they are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.can.bus_state import BusError
+from drivers.can.can_link import Link, open_links
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.bus_scan import asking, hearing
+from drivers.canopen.capabilities import required, where
+from drivers.canopen.cia402 import POWER_OFF, state_of
+from drivers.canopen.drive_setup import DriveConfiguration, configure, identify, motor_limits, quick_stop_option
+from drivers.canopen.motor_units import coordinates
+from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.pdo_mapping import Write, bus_profiles
+from drivers.canopen.sdo import Change, DryRunObjects, Objects, optional
+from drivers.canopen.stored_zero import zeros_of
+from ident_service.config.arm import ArmConfig
+from ident_service.config.canopen import CanopenDriver
+from ident_service.config.eds import DataSheet, data_sheet
+from ident_service.config.quantities import TextFile
+from ident_service.errors import DriverError, UsageError
+
+
+@dataclass(frozen=True)
+class PlannedDrive:
+    """Hold what configuring one drive would write.
+
+    Attributes:
+        number: of the drive, from 1.
+        node: its node number.
+        changes: in the order in which they would be written.
+        refused: why the drive would be refused, then or before; empty where it would not.
+    """
+
+    number: int
+    node: int
+    changes: tuple[Change, ...]
+    refused: str
+
+
+def planned_configuration(
+    config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
+) -> tuple[PlannedDrive, ...]:
+    """Return what opening an arm would write into its drives, by SDO uploads alone.
+
+    Args:
+        config: of the arm.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        UsageError: the arm has no CANopen drives.
+        DriverError: a bus is in use, by another host too, cannot be opened, or is lost.
+    """
+    driver, gears = require_drives(config), config.transmission
+    if gears is None:
+        raise UsageError(f"{config.name}: the description has no transmission")
+    profiles = {profile.number: profile for profile in bus_profiles(driver, config.control.rate)}
+    found, zeros, option = coordinates(driver, gears), zeros_of(config), quick_stop_option(config)
+    planned = []
+    with asking(config, open_bus) as (_, links, heard):
+        every = [
+            DryRunObjects(links[one.bus], one.node, hearing(heard, one.bus), _fixed(sheet))
+            for one, sheet in zip(driver.drives, driver.sheets, strict=True)
+        ]
+        if zeros is not None:
+            held = [zeros.held(objects, number) for number, objects in enumerate(every)]
+            if known := [counts for counts in held if counts is not None]:
+                found = found.zeroed(known, zeros.home) if len(known) == len(held) else found
+        motors = motor_limits(config, found)
+        for number, (drive, objects) in enumerate(zip(driver.drives, every, strict=True)):
+            refused = ""
+            try:
+                identify(objects, drive.identity)
+                own = driver.reactions, option, motors[number], required(objects, driver, number)
+                configure(objects, DriveConfiguration(drive, profiles[drive.bus], *own))
+            except BusError:
+                raise
+            except DriverError as error:
+                refused = str(error)
+            planned.append(PlannedDrive(number + 1, drive.node, tuple(objects.changes), refused))
+    return tuple(planned)
+
+
+def _fixed(sheet: DataSheet) -> frozenset[int]:
+    return frozenset(key for key, entry in sheet.entries.items() if not entry.writable)
+
+
+def require_drives(config: ArmConfig) -> CanopenDriver:
+    """Return the driver's section of an arm; raises UsageError where its drives are not CANopen's."""
+    if isinstance(config.driver, CanopenDriver):
+        return config.driver
+    kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
+    raise UsageError(f"{config.name} has {kind}; only CANopen drives (driver.kind: canopen) are configured")
+
+
+_NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
+_IDENTITY = {"vendor": (od.VENDOR, 1), "product": (od.PRODUCT, 2)}
+# Of the host, at every opening or in every cycle.
+_OURS = frozenset(
+    {
+        *(0x1003, 0x1005, 0x1006, 0x1007, 0x100C, 0x100D, 0x1010, 0x1011, 0x1014, 0x1015, 0x1016, 0x1017, 0x1018),
+        *(0x1019, 0x1020, 0x1029, *range(0x1400, 0x1C00), 0x6007, 0x6040, 0x605A, 0x605E, 0x6060, 0x6071, 0x6072),
+        *(0x607A, 0x607D, 0x6080, 0x6085, 0x60C2),
+    }
+)
+_SAVE, _LOAD = 0x65766173, 0x64616F6C  # "save" and "load", little-endian (CiA 301, 7.5.2.13 and 14)
+_FLASH = 10.0  # s that a drive may take to store its parameters
+
+
+@dataclass(frozen=True)
+class ImportedDrive:
+    """Hold what importing a DCF has changed, or would change, in one drive.
+
+    Attributes:
+        number: of the drive, from 1.
+        node: its node number.
+        file: name of the DCF.
+        changes: that were written, or would be.
+        same: how many entries had their value already.
+        left: how many are left to opening, which sets them.
+    """
+
+    number: int
+    node: int
+    file: str
+    changes: tuple[Change, ...]
+    same: int
+    left: int
+
+
+def import_configuration(
+    config: ArmConfig,
+    files: Sequence[TextFile],
+    *,
+    dry: bool,
+    open_bus: Callable[[ArmConfig], list[Link]] = open_links,
+) -> tuple[ImportedDrive, ...]:
+    """Write the values that DCFs give to drives, one file for each drive in the arm's order.
+
+    A drive that refuses one of them, or keeps another value, is set back to what it held, and so are those before it.
+
+    Args:
+        config: of the arm.
+        files: DCFs.
+        dry: whether the changes are only listed.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        UsageError: no CANopen drives, not a file each, or a file that configures nothing.
+        DriverError: a bus is in use, or lost; a drive is on, or another than the file's; nothing has been written. Or
+            values could not be set back: the message names them.
+    """
+    driver = require_drives(config)
+    if len(files) != len(driver.drives):
+        raise UsageError(f"{len(files)} files for {len(driver.drives)} drives; give one DCF for each, in their order")
+    wanted = [_configured(file, drive.node) for file, drive in zip(files, driver.drives, strict=True)]
+    with asking(config, open_bus) as (_, links, heard):
+        every = [
+            (DryRunObjects if dry else Objects)(links[one.bus], one.node, hearing(heard, one.bus))
+            for one in driver.drives
+        ]
+        for file, objects in zip(files, every, strict=True):
+            _require_off(objects)
+            _require_same(file, objects)
+        done: list[ImportedDrive] = []
+        for number, (file, objects, writes) in enumerate(zip(files, every, wanted, strict=True), 1):
+            changes: list[Change] = []
+            ours = {key for key in writes if key >> 8 in _OURS}
+            try:
+                for key, write in writes.items():
+                    if key not in ours and not objects.holds(write):
+                        changes.append(Change(write.entry, objects.read(write.entry), write.value))
+                        objects.set(write)
+            except BusError:
+                raise
+            except DriverError as error:
+                back = [*zip(every, (one.changes for one in done), strict=False), (objects, changes)]
+                lost = [words for who, made in reversed(back) for words in _set_back(who, made)]
+                end = f"; NOT set back: {', '.join(lost)}" if lost else "; every drive holds again what it held"
+                raise DriverError(f"{error}{end}") from None
+            same = len(writes) - len(ours) - len(changes)
+            done.append(ImportedDrive(number, objects.node, file.name, tuple(changes), same, len(ours)))
+    return tuple(done)
+
+
+def _configured(file: TextFile, node: int) -> dict[int, Write]:
+    """Return the values that a DCF gives to its drive, by key; raises UsageError where there are none."""
+    sheet = data_sheet(file.text)
+    found = {}
+    for key, entry in sorted(sheet.entries.items()):
+        kind, value = _NUMBERS.get(entry.kind), entry.number(node)
+        if entry.configured and entry.writable and kind is not None and value is not None:
+            bits = 8 * kind.size
+            signed = kind in (Kind.I8, Kind.I16, Kind.I32)
+            value = value - (1 << bits) if signed and value >= 1 << (bits - 1) else value
+            found[key] = Write(Entry(key >> 8, key & 0xFF, kind, "value of the DCF"), value)
+    if not found:
+        why = sheet.mistake or "no entry has a ParameterValue; an EDS describes a kind of drive, a DCF configures one"
+        raise UsageError(f"{file.name}: configures no drive: {why}")
+    return found
+
+
+def _require_off(objects: Objects) -> None:
+    state = state_of(objects.read(od.STATUS_WORD))
+    if state not in POWER_OFF:
+        raise DriverError(f"node {objects.node}: is {state}; its parameters are only changed while it is off")
+
+
+def _require_same(file: TextFile, objects: Objects) -> None:
+    told = data_sheet(file.text).identity
+    for name, (entry, sub) in _IDENTITY.items():
+        if sub in told and (held := objects.read(entry)) != told[sub]:
+            raise DriverError(f"node {objects.node}: {name} is {held:08X}h, but {file.name} is for {told[sub]:08X}h")
+
+
+def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
+    lost = []
+    for change in reversed(changes):
+        try:
+            if change.before is not None and not objects.dry:
+                objects.ensure(Write(change.entry, change.before))
+        except DriverError:
+            lost.append(f"node {objects.node} {where(change.entry)}")
+    return lost
+
+
+def store_or_restore(
+    config: ArmConfig, *, store: bool, open_bus: Callable[[ArmConfig], list[Link]] = open_links
+) -> tuple[int, ...]:
+    """Have all drives store what they hold (1010h), or take back what they were shipped with (1011h).
+
+    What is restored takes effect when the drives' power has been switched off and on.
+
+    Args:
+        config: of the arm.
+        store: whether to store; else to restore.
+        open_bus: gives the links, in the order of the buses.
+
+    Returns:
+        The node numbers of the drives.
+
+    Raises:
+        UsageError: no CANopen drives.
+        DriverError: a bus is in use, or lost; a drive is on, lacks the entry, or holds a zero that must not be stored:
+            nothing has been written. Or one refused it: the message names those that have done it.
+    """
+    driver, entry = require_drives(config), od.STORED if store else od.RESTORE
+    with asking(config, open_bus) as (_, links, heard):
+        every = [Objects(links[one.bus], one.node, hearing(heard, one.bus)) for one in driver.drives]
+        for objects in every:
+            _require_off(objects)
+            if optional(objects.read, entry) is None:
+                raise DriverError(f"node {objects.node}: has no {where(entry)}; use its maker's tool")
+            mark: int | None = optional(objects.read, od.ZERO_MARK)
+            if store and mark:
+                raise DriverError(
+                    f"node {objects.node}: holds a zero (1020h), which must be lost with its power: switch the drives"
+                    " off and on, store, and then zero the arm again"
+                )
+        done: list[int] = []
+        for objects in every:
+            objects.patience = _FLASH
+            try:
+                objects.write(Write(entry, _SAVE if store else _LOAD))
+            except DriverError as error:
+                told = f"; done in nodes {', '.join(map(str, done))}" if done else "; no drive has done it"
+                raise DriverError(f"{error}{told}") from None
+            done.append(objects.node)
+    return tuple(done)
+
+
+def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: bool) -> str:
+    """Format an import as text, with a last line break."""
+    lines = [f"{config.name}: {'what importing would change; nothing was written' if dry else 'imported'}"]
+    for one in found:
+        lines += ["", f"drive {one.number}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
+        lines += [*_change_lines(one.changes)]
+        lines.append(f"  {one.same} had their value already; {one.left} are set whenever the arm is opened")
+    return "\n".join(lines) + "\n"
+
+
+def imported_document(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: bool) -> dict[str, Any]:
+    """Return an import as JSON values."""
+    return {
+        "arm": config.name,
+        "written": not dry,
+        "drives": [
+            {
+                "drive": one.number,
+                "node": one.node,
+                "file": one.file,
+                "changes": list(map(_document, one.changes)),
+                "same": one.same,
+                "left": one.left,
+            }
+            for one in found
+        ],
+    }
+
+
+def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive]) -> str:
+    """Format a dry run as text, with a last line break."""
+    lines = [f"{config.name}: what opening would write; nothing was written, and nothing moved"]
+    for one in planned:
+        lines += ["", f"drive {one.number}, node {one.node}: {_count(one)}", *_change_lines(one.changes)]
+        lines += [f"  {'REFUSED':<16}{one.refused}"] if one.refused else []
+    return "\n".join(lines) + "\n"
+
+
+def _count(one: PlannedDrive) -> str:
+    return f"{len(one.changes)} entries would be written" if one.changes else "has everything already"
+
+
+def _change_lines(changes: Sequence[Change]) -> Iterator[str]:
+    for change in changes:
+        before = "?" if change.before is None else f"{change.before} ({_hex(change, change.before)})"
+        after = f"{change.after} ({_hex(change, change.after)})"
+        yield f"  {where(change.entry):<16}{before} -> {after}  {change.entry.name}"
+
+
+def _hex(change: Change, value: int) -> str:
+    size = change.entry.kind.size
+    return f"{value & (1 << 8 * size) - 1:0{2 * size}X}h"
+
+
+def planned_document(config: ArmConfig, planned: Sequence[PlannedDrive]) -> dict[str, Any]:
+    """Return a dry run as JSON values."""
+    return {
+        "arm": config.name,
+        "written": False,
+        "drives": [
+            {
+                "drive": one.number,
+                "node": one.node,
+                "refused": one.refused,
+                "changes": list(map(_document, one.changes)),
+            }
+            for one in planned
+        ],
+    }
+
+
+def _document(change: Change) -> dict[str, Any]:
+    entry = change.entry
+    return {"entry": where(entry), "name": entry.name, "before": change.before, "after": change.after}

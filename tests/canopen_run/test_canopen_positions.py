@@ -1,0 +1,215 @@
+"""Runs of an arm whose drives are given positions: the whole job, and how each fault ends it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from canopen_run_bench import canopen, checked, described, truth, write
+from motion.motion_bench import Story
+
+from drivers.canopen.driver import CanopenArm
+from ident_service.cli import main
+from ident_service.config.load import load_arm
+from ident_service.errors import ArmFault, ConfigError, DriverError
+from ident_service.excitation.described_motion import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.model.base_parameters import base_parameters
+from ident_service.motion.command_channel import StopCondition
+from ident_service.motion.run import RunReport, run
+from ident_service.recordings.open import open_recording
+from sim_backend.emulator.faults import parse_fault
+from sim_backend.emulator.lock_step import LockStepArm
+
+RATE = 250.0
+SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
+MOTION = {"kind": "seeded", "seed": 1, "base_frequency": 0.4, "harmonics": 2, "periods": 1}
+
+
+def positions(name: str, **driver: Any) -> dict[str, Any]:
+    """The small arm behind drives that close the position loop by themselves."""
+    tree = canopen(
+        described(name, RATE, 225.0, 30.0), {"interface": "lock_step"}, 2, **{"streams": "position"} | driver
+    )
+    for drive in tree["driver"]["drives"]:
+        drive["rated_torque"] = 1.0
+    return tree
+
+
+def of_makers(name: str) -> dict[str, Any]:
+    """The same behind drives of two makers, by their files."""
+    files = [str(SHEETS / one) for one in ("maxon_epos4_50-5_0170h.eds", "e35.eds")]
+    dogs = ("heartbeat", "node_guarding")
+    # No more than the rated torque, to which the second one's 6073h limits it.
+    drive = {"counts": 65536, "rated_torque": 1.2, "max_torque": 1.2, "max_speed": 6000.0}
+    drives = [drive | {"node": k, "eds": file, "watchdog": dogs[k - 1]} for k, file in enumerate(files, 1)]
+    beats = {"period": 0.02, "timeout": 0.11, "host_timeout": 0.06}
+    section = {"eds": files[0], "drives": drives, "heartbeats": beats, "status": {"period": 0.1, "inhibit": 0.01}}
+    tree = canopen(described(name, RATE, 225.0, 30.0), {"interface": "lock_step"}, 2, **section, streams="position")
+    tree["driver"]["emulation"]["eds"] = files
+    return tree
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [positions, of_makers])
+def test_an_arm_is_checked_moved_and_identified_from_the_torque_that_its_drives_measure(
+    make: Any, tmp_path: Path
+) -> None:
+    if make is of_makers and not SHEETS.is_dir():
+        pytest.skip("the makers' data sheets are not beside this checkout")
+    arm = write(tmp_path, make("positions"))
+    state, folder, out = tmp_path / "state", tmp_path / "run", tmp_path / "out"
+    assert checked(arm, "positions", state)
+    ticket = json.loads((state / "arms" / "positions" / "ticket.json").read_text())
+    verdicts = {check["code"]: check["verdict"] for check in ticket["checks"]}
+    assert {code: verdicts[code] for code in ("gravity", "direction", "watchdog")} == {
+        "gravity": "passed",
+        "direction": "passed",
+        "watchdog": "passed",
+    }
+    assert main(["run", str(arm), "--out", str(folder), "--state", str(state)]) == 0
+    recording = open_recording(folder / "run.mcap", ("shoulder", "elbow"))
+    stamps = np.concatenate([block.stamp_ns for block in recording.blocks()])
+    np.testing.assert_array_equal(np.diff(stamps), round(1e9 / RATE))
+    assert (
+        main(["identify", str(folder / "run.mcap"), "--arm", str(arm), "--out", str(out), "--state", str(state)]) == 0
+    )
+    document = json.loads((out / "parameters.json").read_text())
+    assert document["torque"] == "measured"
+    model = arm_model(load_arm(arm))
+    base = base_parameters(model.chain, model.layout)
+    expected = base.K @ np.array([truth().get(name, 0.0) for name in model.layout.names])
+    found = document["base_parameters"]
+    z = (np.array(found["values"]) - expected) / np.array(found["standard_deviations"])
+    # 13 figures: none beyond what one in ten thousand is, nor all of them together.
+    assert np.abs(z).max() < 4.0, dict(zip(base.expressions, z, strict=True))
+    assert z @ z < 35.0, dict(zip(base.expressions, z, strict=True))
+
+
+@dataclass
+class Moved:
+    """A motion with a fault in its midst, and what came of it."""
+
+    behind: LockStepArm
+    story: Story
+    report: RunReport | None = None
+    fault: ArmFault | None = None
+    speed: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def off(self) -> bool:
+        """Whether no drive is enabled any more."""
+        return not any("operation enabled" in state for state in self.behind.emulator.states)
+
+
+def moved(folder: Path, fault: str = "", stop_at: int | None = None, **driver: Any) -> Moved:
+    tree = positions("faulty", **driver)
+    tree["motions"] = {"identification": MOTION, "validation": MOTION}
+    config = load_arm(write(folder, tree))
+    behind, model = LockStepArm(config), arm_model(config)
+    came = Moved(behind, Story())
+    behind.emulator.observer = lambda seen: came.speed.append(np.abs(seen.velocity))
+    cycles = 0
+
+    def asked() -> bool:
+        nonlocal cycles
+        cycles += 1
+        if cycles == 600 and fault:
+            behind.inject(parse_fault(fault, tuple(config.joints)))
+        return stop_at is not None and cycles > stop_at
+
+    with CanopenArm(config, behind.links if hasattr(behind, "links") else lambda _: [behind.link(0)]) as arm:
+        try:
+            motion = excitation(model, "identification")
+            came.report = run(arm, model, motion, came.story, StopCondition(asked), hold_seconds=0.1)
+        except ArmFault as error:
+            came.fault = error
+    return came
+
+
+def test_a_run_ends_where_it_began_and_a_stop_is_a_stop(tmp_path: Path) -> None:
+    done = moved(tmp_path)
+    assert done.report is not None
+    assert done.report.state.value == "done"
+    assert done.report.warnings == {}
+    assert done.off
+    stopped = moved(tmp_path, stop_at=600)
+    assert stopped.report is not None
+    assert stopped.story.states[-2:] == ["stopping", "stopped"]
+    assert stopped.off
+
+
+@pytest.mark.parametrize(
+    ("fault", "codes"),
+    [
+        ("frozen_encoder joint=elbow duration=5", ("torque_unexplained",)),
+        ("lost_feedback joint=elbow duration=1", ("feedback_gone",)),
+        ("encoder_jump joint=elbow duration=1 size=0.1", ("encoder_jumps", "feedback_gone", "following_error")),
+        ("drive_fault joint=elbow", ("drive_emergency", "drive_fault")),
+        ("emergency joint=elbow size=0x4310", ("drive_emergency", "drive_fault")),
+        ("node_silent joint=elbow", ("feedback_gone",)),
+        ("bus_gone", ("driver", "feedback_gone", "bus_silent", "bus_off")),
+        (
+            "torque_sign joint=elbow",
+            ("runaway", "following_error", "following_lost", "over_velocity", "torque_exceeded"),
+        ),
+        ("load_attached size=6", ("torque_unexplained",)),
+        ("watchdog_ignored joint=elbow", ()),
+    ],
+)
+def test_each_fault_ends_the_motion_by_its_name_and_leaves_no_drive_enabled(
+    fault: str, codes: tuple[str, ...], tmp_path: Path
+) -> None:
+    came = moved(tmp_path, fault)
+    if codes:
+        assert came.fault is not None, came.report
+        assert came.fault.code in codes, came.fault
+    else:
+        assert came.fault is None
+    assert came.off
+    # However it ended, no joint was ever much faster than it may be.
+    assert (np.max(came.speed, axis=0) < 2.5 * np.array([2.0, 3.0])).all()
+
+
+def test_a_joint_that_is_lost_is_stopped_by_its_drive_and_not_lowered(tmp_path: Path) -> None:
+    """No torque of ours can lower it."""
+    came = moved(tmp_path, "torque_saturation joint=shoulder size=0.02")
+    assert came.fault is not None
+    assert came.fault.code in ("following_error", "following_lost", "repeated_warnings", "over_velocity", "runaway")
+    assert "stopping" not in came.story.states or came.story.states[-1] in ("faulted", "stopped")
+    assert came.off
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"control": {"rate": 1000.0}}, r"driver.streams: positions are streamed at 100 to 500 Hz"),
+        ({"control": {"rate": 50.0}}, r"driver.streams: positions are streamed at 100 to 500 Hz"),
+        ({"control": {"rate": RATE, "after_stop": "lower"}}, r"control.after_stop: .* cannot lower an arm by torque"),
+        ({"identification": {"torque": "commanded"}}, r"identification.torque: .* no torque is commanded"),
+    ],
+)
+def test_what_does_not_go_with_positions_is_a_mistake_of_the_description(
+    changes: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_arm(write(tmp_path, positions("wrong") | changes))
+
+
+def test_drives_that_tell_no_torque_cannot_be_given_positions(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"driver.measured_torque: .* must tell their torque in every cycle"):
+        load_arm(write(tmp_path, positions("wrong", measured_torque="none")))
+
+
+def test_a_drive_that_does_not_take_the_period_is_refused(tmp_path: Path) -> None:
+    config = load_arm(write(tmp_path, positions("period")))
+    behind = LockStepArm(config)
+    objects = behind.emulator.faces[0].objects  # type: ignore[attr-defined]
+    key = 0x60C201
+    objects.entries[key] = objects.entries[key].__class__(**{**objects.entries[key].__dict__, "high": 1})
+    with pytest.raises(DriverError, match="60C2h"):
+        CanopenArm(config, lambda _: [behind.link(0)]).open()

@@ -1,0 +1,167 @@
+"""A DCF of the maker's tool is imported entry by entry, or not at all; drives store and restore on request only."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from helpers.emulated_arms import weightless_config
+from helpers.makers import SHEETS, Bench, arm_of, sheet
+
+from drivers.canopen import object_dictionary as od
+from ident_service.config.quantities import TextFile
+from ident_service.errors import DriverError, UsageError
+from ident_service.operations.drive_configuration import (
+    import_configuration,
+    imported_document,
+    imported_text,
+    store_or_restore,
+)
+from sim_backend.emulator.faults import DriveFault
+
+pytestmark = pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
+EPOS4 = "maxon_epos4_50-8_0110h.eds"
+NOMINAL, GAIN, RATED = "3001sub1", "30A0sub1", "6076"
+
+
+def dcf(**values: int) -> TextFile:
+    """An EDS as its maker's tool would write it for one drive, with these values."""
+    text = sheet(EPOS4)["text"]
+    for name, value in values.items():
+        text, count = re.subn(rf"(?im)^(\[{name}\]\r?\n)", rf"\g<1>ParameterValue={value}\n", text)
+        assert count == 1, name
+    return TextFile(name="drive.dcf", text=text)
+
+
+def held(bench: Bench, index: int, sub: int = 0) -> list[int]:
+    return [face.objects.number(index, sub) for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]
+
+
+def test_what_differs_is_written_and_listed_and_what_is_ours_is_left() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    before = held(bench, 0x3001, 1)
+    files = [dcf(**{NOMINAL: 4000, GAIN: 77, "6060": 3, "1017": 55})] * 2
+    planned = import_configuration(config, files, dry=True, open_bus=bench.links)  # type: ignore[arg-type]
+    assert bench.downloads() == []
+    assert held(bench, 0x3001, 1) == before
+    done = import_configuration(config, files, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert [one.changes for one in done] == [one.changes for one in planned]
+    assert {(node, index) for node, index, _ in bench.downloads()} == {(n, i) for n in (1, 2) for i in (0x3001, 0x30A0)}
+    assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == ([4000] * 2, [77] * 2)
+    assert [(one.same, one.left) for one in done] == [(0, 2)] * 2
+    text = imported_text(config, done, dry=False)
+    assert f"3001h:01        {before[0]} " in text
+    assert "-> 4000 " in text
+    assert "0 had their value already; 2 are set whenever the arm is opened" in text
+    assert imported_document(config, done, dry=True)["drives"][0]["changes"][0]["after"] == 4000
+    (again, _) = import_configuration(config, files, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert (again.changes, again.same) == ((), 2)
+    assert bench.downloads() == []
+
+
+def test_a_refused_entry_sets_every_drive_back() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    before = held(bench, 0x3001, 1), held(bench, 0x30A0, 1)
+    objects = bench.behind.emulator.faces[1].objects  # type: ignore[attr-defined]
+    key = 0x30A001
+    objects.entries[key] = type(objects.entries[key])(**{**vars(objects.entries[key]), "high": 10})
+    with pytest.raises(DriverError, match=r"node 2: setting 30A0h.*every drive holds again what it held"):
+        import_configuration(config, [dcf(**{NOMINAL: 4000, GAIN: 77})] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert (held(bench, 0x3001, 1), held(bench, 0x30A0, 1)) == before
+
+
+def test_a_drive_that_is_on_or_another_is_not_touched() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    other = TextFile(name="other.dcf", text=sheet("elmo_gold_V002.dcf")["text"])
+    with pytest.raises(DriverError, match=r"node 2: vendor is 000000FBh, but other.dcf is for 0000009Ah"):
+        import_configuration(config, [dcf(**{NOMINAL: 4000}), other], dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert bench.downloads() == []
+    bench.behind.settle(bench.behind.clock.now_ns() + 1_000_000_000)  # until it has booted
+    face = bench.behind.emulator.faces[0]
+    face.power.control(6)  # type: ignore[attr-defined]
+    face.power.control(7)  # type: ignore[attr-defined]
+    face.tick(bench.behind.clock.now_ns())
+    assert bench.states[0] == "switched on"
+    for act in (
+        lambda: import_configuration(config, [dcf(**{NOMINAL: 4000})] * 2, dry=False, open_bus=bench.links),  # type: ignore[arg-type]
+        lambda: store_or_restore(config, store=True, open_bus=bench.links),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(
+            DriverError, match="node 1: is switched on; its parameters are only changed while it is off"
+        ):
+            act()
+        assert bench.downloads() == []
+
+
+def test_files_that_configure_nothing_are_refused() -> None:
+    config = arm_of(EPOS4)
+    with pytest.raises(UsageError, match="1 files for 2 drives"):
+        import_configuration(config, [dcf(**{NOMINAL: 1})], dry=True)
+    with pytest.raises(UsageError, match="configures no drive: no entry has a ParameterValue"):
+        import_configuration(config, [TextFile(name="a.eds", text=sheet(EPOS4)["text"])] * 2, dry=True)
+    with pytest.raises(UsageError, match="configures no drive"):
+        import_configuration(config, [TextFile(name="a.eds", text="x")] * 2, dry=True)
+
+
+def test_drives_store_and_restore_what_they_hold() -> None:
+    config = arm_of(EPOS4)
+    bench = Bench(config)
+    factory = held(bench, 0x3001, 1)
+
+    def power_cycle() -> None:
+        for number in range(2):
+            bench.behind.inject(DriveFault("reboot", number))
+        bench.behind.settle(bench.behind.clock.now_ns() + 1_000_000_000)
+
+    import_configuration(config, [dcf(**{NOMINAL: 4000})] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    power_cycle()
+    assert held(bench, 0x3001, 1) == factory
+    import_configuration(config, [dcf(**{NOMINAL: 4000})] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    assert store_or_restore(config, store=True, open_bus=bench.links) == (1, 2)  # type: ignore[arg-type]
+    power_cycle()
+    assert held(bench, 0x3001, 1) == [4000] * 2
+    with bench.arm:  # and nothing of it is undone by opening
+        assert held(bench, 0x3001, 1) == [4000] * 2
+    assert store_or_restore(config, store=False, open_bus=bench.links) == (1, 2)  # type: ignore[arg-type]
+    assert held(bench, 0x3001, 1) == [4000] * 2
+    power_cycle()
+    assert held(bench, 0x3001, 1) == factory
+
+
+def test_opening_never_stores() -> None:
+    for name in (EPOS4, "e35.eds", "elmo_gold_V002.dcf"):
+        bench = Bench(arm_of(name))
+        with bench.arm:
+            written = bench.downloads()
+        assert not [one for one in written if one[1] in (0x1010, 0x1011)]
+
+
+def test_a_zero_that_must_be_lost_with_power_is_not_stored_and_what_is_lacking_is_told() -> None:
+    config = weightless_config()
+    bench = Bench(config)
+    objects = bench.behind.emulator.faces[1].objects  # type: ignore[attr-defined]
+    objects.put(od.ZERO_MARK.index, 5, od.ZERO_MARK.sub)
+    words = "holds a zero" if od.STORED.key in objects.entries else "has no 1010h:01; use its maker's tool"
+    with pytest.raises(DriverError, match=words):
+        store_or_restore(config, store=True, open_bus=bench.links)  # type: ignore[arg-type]
+    assert bench.downloads() == []
+    elmo = Bench(arm_of("maxon_epos2_50-5_2126h.eds"))
+    for face in elmo.behind.emulator.faces:
+        face.objects.put(od.ZERO_MARK.index, 5, od.ZERO_MARK.sub)  # type: ignore[attr-defined]
+    with pytest.raises(DriverError, match=r"node 1: holds a zero \(1020h\), which must be lost with its power"):
+        store_or_restore(arm_of("maxon_epos2_50-5_2126h.eds"), store=True, open_bus=elmo.links)  # type: ignore[arg-type]
+
+
+def test_the_commands_ask_for_the_arms_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from ident_service.cli import USAGE, main
+
+    file = tmp_path / "a.dcf"
+    file.write_text(dcf(**{NOMINAL: 4000}).text, encoding="latin-1")
+    for words in (["import", "wam7_canopen", str(file)], ["store", "wam7_canopen"], ["restore", "wam7_canopen"]):
+        for more in ([], ["--confirm", "other"]):
+            assert main(["bus", *words, *more]) == USAGE
+            assert "--confirm wam7_canopen; nothing was written" in capsys.readouterr().err

@@ -1,0 +1,231 @@
+"""Whole fleets on a real cluster of two worker processes: results, faults, kills, the same bits whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+from distributed import Client, LocalCluster
+from helpers.fleets import BEGIN, WEEK, Kind, kind, write_recording
+
+from ident_service.certificate_verifier import verify_path
+from ident_service.cli import main
+
+pytestmark = [
+    pytest.mark.slow,
+    # distributed's own: what a worker that was killed leaves open, and its closed event loop.
+    pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+ARMS, RECORDINGS, ODD = 4, 6, "arm2"
+NAMES = r"/(?P<arm>arm\d+)/"
+
+
+@pytest.fixture(scope="module")
+def usual() -> Kind:
+    return kind(rate=100.0, seconds=12.0)
+
+
+@pytest.fixture(scope="module")
+def folder(usual: Kind, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four arms, six weeks; from the fourth week on one has a quarter more friction in its elbow."""
+    place = tmp_path_factory.mktemp("fleet")
+    names = usual.model.layout.names
+    for arm in range(ARMS):
+        delta = usual.individual(arm)
+        for week in range(RECORDINGS):
+            now = delta.copy()
+            if f"arm{arm}" == ODD and week >= 3:
+                now[[names.index("fv2"), names.index("fc2")]] *= 1.25
+            path = place / f"arm{arm}" / f"week{week}.mcap"
+            said = {"temperature_celsius": f"{20 + week % 2}"}
+            write_recording(usual, path, now, seed=100 * arm + week, at=BEGIN + week * WEEK, metadata=said)
+    return place
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[LocalCluster]:
+    with LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        memory_limit="1GiB",
+        host="127.0.0.1",
+        dashboard_address=None,
+        silence_logs=50,
+    ) as started:
+        yield started
+
+
+Run = Callable[..., tuple[int, dict[str, Any]]]
+
+
+@pytest.fixture
+def fleet(cluster: LocalCluster, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """`ident fleet identify --json` on the cluster: exit code and answer."""
+
+    def run(
+        *patterns: str, out: str = "out", store: str | None = None, verb: str = "identify"
+    ) -> tuple[int, dict[str, Any]]:
+        words = ["fleet", verb, *patterns, "--arm", "planar2", "--names", NAMES, "--json"]
+        words += ["--store", store or str(tmp_path / "store")]
+        if verb == "identify":
+            words += ["--scheduler", cluster.scheduler_address, "--out", str(tmp_path / out)]
+        capsys.readouterr()
+        code = main(words)
+        return code, json.loads(capsys.readouterr().out)
+
+    return run
+
+
+def bits(folder: Path) -> dict[str, str]:
+    """Everything that was found, but for the hour at which it was written down."""
+    found = {"fleet.json": (folder / "fleet.json").read_text()}
+    for path in sorted(folder.glob("arms/*/parameters.json")):
+        content = json.loads(path.read_text())
+        del content["provenance"]["created"]
+        found[str(path.relative_to(folder))] = json.dumps(content)
+    found["table"] = (folder / "parameters.parquet").read_bytes().hex()
+    return found
+
+
+def test_a_fleet_is_identified_and_the_changed_arm_found(fleet: Run, folder: Path, tmp_path: Path, usual: Kind) -> None:
+    code, answer = fleet(str(folder / "*" / "*.mcap"))
+    assert code == 3, "an arm changed"
+    assert {one["arm"] for one in answer["changes"]} == {ODD}
+    (change,) = answer["changes"]
+    assert change["what"] == "friction of joint elbow"
+    assert change["first_recording"] == "week3.mcap"
+    assert change["after"][:10] == "2026-01-15"
+    assert change["until"][:10] == "2026-01-22"
+    assert [one["verdict"] for one in answer["alarms"]] == ["changed"]
+    assert "friction of joint elbow" in answer["alarms"][0]["what"]
+    out = tmp_path / "out"
+    document = json.loads((out / "changes" / ODD / "comparison.json").read_text())
+    assert document["format"] == "ident-comparison"
+    assert (out / "changes" / ODD / "comparison.html").is_file()
+
+    for arm in range(ARMS):
+        place = out / "arms" / f"arm{arm}"
+        assert verify_path(place / "parameters.json").verdict == "feasible"
+        content = json.loads((place / "parameters.json").read_text())
+        assert len(content["provenance"]["recordings"]) == RECORDINGS
+        assert content["fleet"]["arm"] == f"arm{arm}"
+        if f"arm{arm}" != ODD:
+            beta = usual.base.K @ usual.individual(arm)
+            deviations = np.array(content["base_parameters"]["standard_deviations"], dtype=float)
+            off = np.abs(np.array(content["base_parameters"]["values"]) - beta)
+            assert np.all(off < 5.0 * np.where(np.isfinite(deviations), deviations, np.inf) + 1e-9)
+    assert main(["compare", str(out / "arms" / "arm0"), str(out / "arms" / "arm1")]) in (0, 3)
+
+    rows = ARMS * (RECORDINGS + 1) * usual.base.size
+    table, other = pd.read_parquet(out / "parameters.parquet"), pl.read_parquet(out / "parameters.parquet")
+    assert len(table) == len(other) == rows
+    assert list(table.columns) == other.columns
+    assert {"arm", "recording", "parameter", "value", "deviation", "verdict", "quality"} <= set(table.columns)
+    assert set(table.verdict) <= {"identified", "weak", "unidentified"}
+    assert other.filter(pl.col("recording").is_null()).height == ARMS * usual.base.size
+    page = (out / "fleet.html").read_text()
+    assert "://" not in page.replace("http://www.w3.org", "")
+    for one in answer["parameters"]:
+        assert sum(one["variance_percent"].values()) == pytest.approx(100.0)
+
+    again, second = fleet(str(folder / "*" / "*.mcap"), out="again")
+    assert again == 3
+    assert bits(tmp_path / "again") == bits(out)
+    assert second == answer | {"folder": str(tmp_path / "again")}
+    status, told = fleet(str(folder / "*" / "*.mcap"), verb="status")
+    assert status == 0
+    assert told["factors"] == ARMS * RECORDINGS
+    assert told["new"] == []
+    assert told["arms"]["arm0"] == {"recordings": RECORDINGS, "reduced": RECORDINGS}
+
+
+def test_bad_recordings_are_named_and_the_others_go_on(fleet: Run, folder: Path, tmp_path: Path) -> None:
+    place = tmp_path / "mixed"
+    shutil.copytree(folder / "arm0", place / "arm0")
+    good = (place / "arm0" / "week0.mcap").read_bytes()
+    (place / "arm0" / "truncated.mcap").write_bytes(good[: len(good) // 2])
+    (place / "arm0" / "corrupt.mcap").write_bytes(good[:3000] + np.random.default_rng(1).bytes(len(good) - 3000))
+    (place / "arm0" / "foreign.csv").write_text("t,q1,q2,q3,tau1,tau2,tau3\n0,0,0,0,0,0,0\n0.01,0,0,0,0,0,0\n")
+    (place / "arm0" / "twice.mcap").write_bytes(good)
+    (place / "arm9").mkdir()
+    (place / "arm9" / "empty.mcap").write_bytes(b"")
+    code, answer = fleet(str(place))
+    assert code == 3, answer
+    assert list(answer["arms"]) == ["arm0"]
+    assert answer["recordings"] == RECORDINGS
+    left_out = {Path(one["url"]).name: one for one in answer["left_out"]}
+    twice = {"twice.mcap", "week0.mcap"} & set(left_out)
+    assert len(twice) == 1
+    assert set(left_out) == {"truncated.mcap", "corrupt.mcap", "foreign.csv", "empty.mcap"} | twice
+    assert all(one["message"] and one["kind"] == "recording" for one in left_out.values())
+    assert json.loads((tmp_path / "out" / "problems.json").read_text()) == answer["left_out"]
+    shutil.rmtree(place)
+    place.mkdir()
+    (place / "arm1").mkdir()
+    (place / "arm1" / "only.mcap").write_bytes(good[: len(good) // 2])
+    code, answer = fleet(str(place), out="none")
+    assert code == 1
+    assert answer["error"]["kind"] == "RecordingError"
+    assert not (tmp_path / "none").exists()
+
+
+def test_killed_workers_change_nothing(fleet: Run, cluster: LocalCluster, folder: Path, tmp_path: Path) -> None:
+    pattern = str(folder / "arm[01]" / "*.mcap")
+    fleet(pattern, out="undisturbed", store=str(tmp_path / "store1"))
+    stop, killed = threading.Event(), []
+
+    def kill() -> None:
+        with Client(cluster, set_as_default=False) as client:
+            factors = tmp_path / "store2" / "factors"
+            for count in (2, 6):
+                while not stop.is_set() and (not factors.is_dir() or len(list(factors.iterdir())) < count):
+                    time.sleep(0.01)
+                pids = client.run(os.getpid)
+                pid = pids[sorted(pids)[0]]
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        fleet(pattern, out="disturbed", store=str(tmp_path / "store2"))
+    finally:
+        stop.set()
+        killer.join()
+    assert len(killed) == 2
+    assert bits(tmp_path / "disturbed") == bits(tmp_path / "undisturbed")
+
+
+def test_after_a_killed_client_the_next_call_goes_on(
+    fleet: Run, cluster: LocalCluster, folder: Path, tmp_path: Path
+) -> None:
+    pattern, store = str(folder / "arm[01]" / "*.mcap"), tmp_path / "store"
+    words = ["fleet", "identify", pattern, "--arm", "planar2", "--names", NAMES, "--store", str(store)]
+    words += ["--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "killed")]
+    with subprocess.Popen([sys.executable, "-m", "ident_service", *words], stdout=subprocess.DEVNULL) as client:
+        rows = store / "rows"
+        while client.poll() is None and (not rows.is_dir() or len(list(rows.glob("*.json"))) < 3):
+            time.sleep(0.01)
+        client.kill()
+    assert client.returncode == -signal.SIGKILL
+    assert not (tmp_path / "killed").exists()
+    before = {path.name: path.stat().st_mtime_ns for path in rows.glob("*.json")}
+    fleet(pattern)
+    after = {path.name: path.stat().st_mtime_ns for path in rows.glob("*.json")}
+    assert before.items() <= after.items(), "what was there was not computed again"
+    assert len(after) == 2 * RECORDINGS
+    fleet(pattern, out="undisturbed", store=str(tmp_path / "fresh"))
+    assert bits(tmp_path / "out") == bits(tmp_path / "undisturbed")

@@ -1,0 +1,183 @@
+"""Common model and deviations of arms: recovered from known ones, unlike arms found, pooling judged on unseen data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.fleets import Kind, kind, write_recording
+
+from ident_service import __version__
+from ident_service.fleet.factor import Described, Merged, Part, Row, Settled, merge_stored, reduce_recording, settle
+from ident_service.fleet.population import (
+    ArmFit,
+    HeldOut,
+    Population,
+    arm_fit,
+    held_out_errors,
+    pooled_fit,
+    population,
+    unlike,
+    variance_shares,
+)
+from ident_service.fleet.storage import Store, find
+
+ARMS, TOOL = 10, 7
+
+
+@pytest.fixture(scope="module")
+def usual() -> Kind:
+    return kind(rate=100.0, seconds=10.0, noise=0.3)
+
+
+@pytest.fixture(scope="module")
+def truths(usual: Kind) -> list[np.ndarray]:
+    """Ten arms that differ by 2 %; one carries 0.5 kg more at its flange."""
+    found = [usual.individual(arm, 0.02) for arm in range(ARMS)]
+    names = usual.model.layout.names
+    for name, more in (("m2", 0.5), ("lx2", 0.02), ("Lxx2", 1e-3), ("Lyy2", 2e-3), ("Lzz2", 2e-3)):
+        found[TOOL][names.index(name)] += more
+    return found
+
+
+@pytest.fixture(scope="module")
+def fleet(usual: Kind, truths: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Row]]:
+    """Two recordings of each arm, of which the first of arm 0 lasts 3.2 s."""
+    place = tmp_path_factory.mktemp("population")
+    for arm, delta in enumerate(truths):
+        for number in range(2):
+            seconds = 3.2 if (arm, number) == (0, 0) else None
+            write_recording(usual, place / f"{arm}-{number}.mcap", delta, seed=10 * arm + number, seconds=seconds)
+    sources = find([str(place)])
+    settled = settle(sources[2:4], usual.model.config.model_dump_json())
+    assert isinstance(settled, Settled)
+    global DESCRIBED, STORE
+    DESCRIBED, STORE = Described(settled.description), Store(str(place / "store"))
+    rows: dict[str, list[Row]] = {}
+    for source in sources:
+        outcome = reduce_recording(Part(source), DESCRIBED, STORE, __version__)
+        assert outcome.row is not None, outcome.problem
+        rows.setdefault(source.name[0], []).append(outcome.row)
+    return rows
+
+
+DESCRIBED: Described
+STORE: Store
+
+
+def merged(*rows: Row) -> Merged:
+    found = merge_stored([row.key for row in rows], DESCRIBED, STORE, whole=False)
+    assert isinstance(found, Merged)
+    return found
+
+
+@pytest.fixture(scope="module")
+def fits(fleet: dict[str, list[Row]]) -> dict[str, ArmFit]:
+    return {arm: arm_fit(merged(*rows), "wls") for arm, rows in fleet.items()}
+
+
+@pytest.fixture(scope="module")
+def found(fits: dict[str, ArmFit]) -> Population:
+    return population(fits, DESCRIBED.groups)
+
+
+def test_the_common_model_is_the_mean_of_the_arms(found: Population, usual: Kind, truths: list[np.ndarray]) -> None:
+    mean = np.mean([usual.base.K @ delta for delta in truths], axis=0)
+    known = np.sqrt(np.diag(found.covariance)) * found.scale
+    assert np.all(np.abs(found.common - mean) < 4.0 * known + 2.0 * found.between / np.sqrt(ARMS))
+
+
+def test_the_spread_between_arms_is_that_of_their_bodies(
+    found: Population, usual: Kind, truths: list[np.ndarray]
+) -> None:
+    base = np.array([usual.base.K @ delta for delta in truths])
+    for group, places in DESCRIBED.groups.items():
+        spread = np.sqrt(np.mean(np.var(base[:, list(places)], axis=0, ddof=1) / found.scale[list(places)] ** 2))
+        if spread > 0.05:  # N m, beyond the noise of ten arms
+            assert 0.5 * spread < found.tau[group] < 2.0 * spread, group
+
+
+def test_pooled_estimates_are_nearer_to_the_truth(
+    fits: dict[str, ArmFit], found: Population, usual: Kind, truths: list[np.ndarray]
+) -> None:
+    def far(beta: np.ndarray, arm: str) -> float:
+        return float(np.linalg.norm((beta - usual.base.K @ truths[int(arm)]) / found.scale))
+
+    ordinary = [arm for arm in fits if int(arm) != TOOL]
+    alone = [far(fits[arm].fit.beta, arm) for arm in ordinary]
+    pooled = [far(pooled_fit(fits[arm], found.other_arms(arm), found.scale).beta, arm) for arm in ordinary]
+    assert np.sqrt(np.mean(np.square(pooled))) < np.sqrt(np.mean(np.square(alone)))
+
+
+def test_with_much_data_an_arm_stays_itself(fits: dict[str, ArmFit], found: Population) -> None:
+    one = fits["3"]
+    sure = ArmFit(one.fit, one.doubt, one.clusters, 1e6 * one.precision, one.total, one.error)
+    pooled = pooled_fit(sure, found.other_arms("3"), found.scale)
+    np.testing.assert_allclose(pooled.beta / found.scale, one.fit.beta / found.scale, atol=0.02)
+
+
+def test_the_arm_with_a_tool_is_the_most_unlike(fits: dict[str, ArmFit], found: Population) -> None:
+    leading = tuple(DESCRIBED.base.names[column] for column in DESCRIBED.base.base)
+    every = unlike(fits, found, DESCRIBED.groups, leading)
+    assert len(every) == ARMS * len(DESCRIBED.groups)
+    best = min(every, key=lambda one: one.p)
+    assert best.arm == str(TOOL)
+    assert best.p < 0.01
+    assert best.group[0] in ("first moments", "inertia")
+    assert {one.arm for one in every if one.p < 0.01} == {str(TOOL)}
+
+
+def test_two_arms_are_too_few_to_call_one_unlike(fits: dict[str, ArmFit]) -> None:
+    two = {arm: fits[arm] for arm in ("1", "2")}
+    assert unlike(two, population(two, DESCRIBED.groups), DESCRIBED.groups, ()) == []
+
+
+def test_one_arm_alone_is_a_fleet(fits: dict[str, ArmFit]) -> None:
+    alone = population({"1": fits["1"]}, DESCRIBED.groups)
+    assert np.all(np.isfinite(alone.common))
+
+
+def test_shares_of_variance_are_those_that_were_drawn() -> None:
+    rng = np.random.default_rng(3)
+    arms, recordings, noise = 4.0, 1.0, 0.25
+    rows = {}
+    for arm in range(300):
+        level = np.sqrt(arms) * rng.standard_normal()
+        beta = level + np.sqrt(recordings) * rng.standard_normal(6) + np.sqrt(noise) * rng.standard_normal(6)
+        rows[str(arm)] = [row(value, noise) for value in beta]
+    found = variance_shares(rows, {("friction", 1): (0,)})
+    assert found.arms[0] == pytest.approx(arms, rel=0.2)
+    assert found.recordings[0] == pytest.approx(recordings, rel=0.2)
+    assert found.noise[0] == noise
+    assert found.percent[0].sum() == pytest.approx(100.0)
+
+
+def row(value: float, variance: float) -> Row:
+    one = np.array([value])
+    return Row("k", "s", "", 0.0, 1.0, 1.0, one, one, (np.array([[variance]]),), 12, one, one, 1.0, 0, 0.0, (), {})
+
+
+def test_pooling_helps_an_arm_with_one_short_recording(fleet: dict[str, list[Row]], fits: dict[str, ArmFit]) -> None:
+    told = population(
+        {arm: one for arm, one in fits.items() if arm != "0"} | {"0": arm_fit(merged(fleet["0"][0]), "wls")},
+        DESCRIBED.groups,
+    )
+    short, unseen = merged(fleet["0"][0]), merged(fleet["0"][1])
+    alone, pooled = held_out_errors(short, unseen, told.other_arms("0"), told.scale, None, DESCRIBED)
+    # What noise leaves is in both; beyond it, most of the error is gone.
+    left = arm_fit(unseen, "wls").error.relative_percent
+    excess = [np.sqrt(max(error**2 - left**2, 0.0)) for error in (alone, pooled)]
+    assert excess[1] < 2.0 / 3.0 * excess[0]
+
+
+def test_pooling_is_judged_by_its_gain() -> None:
+    assert HeldOut({"a": 3.0, "b": 4.0}, {"a": 1.5, "b": 2.0}).gain == pytest.approx(0.5)
+    assert HeldOut({"a": 3.0}, {"a": 2.0}).helps
+    assert not HeldOut({"a": 3.0}, {"a": 2.99}).helps
+    assert not HeldOut({"a": 3.0}, {"a": 4.0}).helps
+    assert not HeldOut({}, {}).helps
+
+
+def test_the_fixture_has_the_short_recording(fleet: dict[str, list[Row]], tmp_path: Path) -> None:
+    assert fleet["0"][0].seconds < 4.0 < fleet["0"][1].seconds

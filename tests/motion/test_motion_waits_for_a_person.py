@@ -1,0 +1,95 @@
+"""A run of an arm that a person enables: what is told, what if it is moved meanwhile, and how waiting ends."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from campaign_pucks import bench_puck_config
+from motion_bench import Story
+
+from drivers.barrett.driver import BarrettArm
+from ident_service.config.arm import ArmConfig
+from ident_service.errors import MotionRefused
+from ident_service.excitation.described_motion import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.command_channel import LocalCommands
+from ident_service.motion.faults import ActiveFaults
+from ident_service.motion.run import WAITS_FOR, run
+from ident_service.motion.state_machine import State
+from sim_backend.emulator.lock_step import LockStepArm
+
+
+class LedArm(BarrettArm):
+    """An arm that somebody leads away while it waits for Shift-Activate, some times."""
+
+    def __init__(self, config: ArmConfig, times: int, way: float) -> None:
+        self.behind, self.left, self.way = LockStepArm(config), times, way
+        super().__init__(config, lambda _: [self.behind.link(0)])
+
+    def enable(self) -> None:
+        if self.left:
+            self.left -= 1
+            body = self.behind.emulator.body
+            body.support(self.clock.now_ns())
+            body.lead(body.plant.position + self.way, self.clock.now_ns())
+        super().enable()
+
+
+def moved(times: int, way: float, controls: Any = None, config: ArmConfig | None = None) -> tuple[Any, Story, Any]:
+    config = config or bench_puck_config()
+    model, story, latch = arm_model(config), Story(), ActiveFaults()
+    with LedArm(config, times, way) as arm:
+        before = arm.exchange(None).position
+        try:
+            report = run(arm, model, excitation(model, "identification"), story, controls, latch=latch)
+        except MotionRefused as refused:
+            return refused, story, latch
+        assert np.abs(arm.exchange(None).position - before - times * way).max() < 0.02
+    return report, story, latch
+
+
+def waited(story: Story) -> int:
+    return sum(message.startswith(WAITS_FOR) for _, _, message in story.events)
+
+
+@pytest.mark.slow
+def test_an_arm_that_was_moved_meanwhile_is_planned_again_from_where_it_is() -> None:
+    report, story, _ = moved(1, 0.05)
+    assert report.state is State.DONE
+    assert waited(story) == 2
+    assert "the arm was moved while a person was waited for; planned again" in story.states
+
+
+@pytest.mark.slow
+def test_an_arm_that_stands_is_asked_for_once() -> None:
+    report, story, _ = moved(1, 0.002)
+    assert report.state is State.DONE
+    assert waited(story) == 1
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_moved_each_time_is_refused() -> None:
+    refused, story, latch = moved(9, 0.02)
+    assert "moved each time" in str(refused)
+    assert waited(story) == 3
+    assert not latch.faults
+
+
+@pytest.mark.slow
+def test_a_stop_ends_the_waiting_and_nothing_is_latched() -> None:
+    document = bench_puck_config().model_dump(mode="json", by_alias=True)
+    document["driver"]["emulation"]["operator"] = None
+    commands, asked = LocalCommands(), [0]
+
+    def lease_ok(now_ns: int) -> bool:
+        asked[0] += 1
+        commands.stop = asked[0] > 50
+        return True
+
+    commands.lease_ok = lease_ok  # type: ignore[method-assign]
+    refused, story, latch = moved(0, 0.0, commands, ArmConfig.model_validate(document))
+    assert "a stop was asked for before the arm was energised" in str(refused)
+    assert waited(story) == 1
+    assert not latch.faults
