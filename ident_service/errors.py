@@ -3,29 +3,29 @@
 ::
 
     IdentError
-    ├── UsageError (ValueError)        a command or call that cannot be meant: missing file, contradictory options
+    ├── UsageError (ValueError)        invalid command or call: missing file, contradictory options
     │   ├── UnknownId (LookupError)    an id that the registry does not have
-    │   ├── AlreadyThere               a name that is taken, where replacing it was not asked for
-    │   ├── InUse                      something that cannot be deleted, because other things refer to it
-    │   ├── InvalidRequest             a request that the API of a daemon does not take as it is
-    │   └── AccessRefused              a daemon does not know who asks, or they may not do this
+    │   ├── AlreadyThere               a name that is taken, and replacement was not requested
+    │   ├── InUse                      something that cannot be deleted because it is in use or referred to
+    │   ├── InvalidRequest             a request that the daemon's API rejects
+    │   └── AccessRefused              no valid token, or a role without this right
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
     ├── ParameterError (ValueError)    a parameter file or expression that does not parse or does not fit
     ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
-    │   └── PersonNeeded               a re-identification that judged nothing: somebody must look at the arm first
-    ├── Unavailable (RuntimeError)     this machine, or a daemon, cannot do it now; asked again later, it may
-    │   ├── RegistryBusy               another process keeps the registry of the state folder
+    │   └── PersonNeeded               a re-identification without a verdict: a person must act first
+    ├── Unavailable (RuntimeError)     temporarily impossible on this machine or daemon; try again later
+    │   ├── RegistryBusy               another process has locked the registry
     │   ├── DiskFull (OSError)         the disk of the state folder has no room
     │   └── StorageError (OSError)     storage of a fleet's recordings or factors is gone, or too slow
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
-        │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
+        │   └── PositionUnknown        the encoders lost their zero: a person must set the home
         ├── Stopped                    a motion did not come to its end, because a stop was requested
-        └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
+        └── ArmFault                   the safety monitor or a drive stopped a motion; has code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
 """
@@ -50,15 +50,15 @@ class IdentError(Exception):
 
 
 class UsageError(IdentError, ValueError):
-    """The request itself cannot be meant: a file that does not exist, options that contradict each other."""
+    """The request is invalid: a file that does not exist, options that contradict each other."""
 
 
 class UnknownId(UsageError, LookupError):
-    """An arm, motion, run, file or job was named that the registry does not have."""
+    """The registry has no arm, motion, run, file or job of this name."""
 
 
 class AlreadyThere(UsageError):
-    """A name is taken, and replacing what has it was not asked for."""
+    """A name is taken, and replacement was not requested."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,11 @@ class InUse(UsageError):
 
 
 class InvalidRequest(UsageError):
-    """A daemon's API does not take a request as it is: an unknown field, a value out of bounds, too many bytes."""
+    """The daemon's API rejects a request: an unknown field, a value out of bounds, too many bytes."""
 
 
 class AccessRefused(UsageError):
-    """A daemon does not know who asks (no token that counts), or does not let them do this (their role)."""
+    """The daemon refuses access: no valid token, or a role without this right."""
 
 
 @dataclass(frozen=True)
@@ -143,15 +143,15 @@ class MotionRefused(IdentError, ValueError):
 
 
 class PersonNeeded(MotionRefused):
-    """A re-identification was refused by preflight or by the arm, so nothing is known about a change of the arm."""
+    """Preflight or the arm refused a re-identification, so it is unknown whether the arm has changed."""
 
 
 class Unavailable(IdentError, RuntimeError):
-    """Something cannot be done now, for want of what may be there again later; nothing has been changed."""
+    """Something is temporarily impossible; nothing has been changed."""
 
 
 class RegistryBusy(Unavailable):
-    """Another process keeps the registry of the state folder: a backup, a database browser, another command."""
+    """Another process has locked the registry: a backup, a database browser, another command."""
 
 
 class DiskFull(Unavailable, OSError):
@@ -178,15 +178,15 @@ class DriverError(ArmError, OSError):
 
 
 class AnotherDrive(DriverError):
-    """A drive answers that is not the one that the description names."""
+    """A drive has another identity than the description says."""
 
 
 class PositionUnknown(DriverError):
-    """Drives do not know where the arm stands; a person leads it home by hand and says so (`Arm.zero`)."""
+    """The encoders have lost their zero; a person moves the arm home by hand and confirms it (`Arm.zero`)."""
 
 
 class Stopped(ArmError):
-    """A motion did not come to its end: a stop was requested, or nobody renewed its lease."""
+    """A motion did not come to its end: a stop was requested, or its lease was not renewed."""
 
 
 class ArmFault(ArmError):

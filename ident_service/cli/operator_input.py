@@ -75,7 +75,7 @@ class StdinLease:
                 renewed = now
         self._renewed = now if renewed is None else renewed
         if now - self._renewed > self._seconds:
-            self._over = f"nobody renewed the lease for {self._seconds:g} s"
+            self._over = f"the lease was not renewed for {self._seconds:g} s"
 
 
 def add_lease(sub: Parser, *, confirm: bool = True) -> None:

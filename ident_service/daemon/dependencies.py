@@ -114,7 +114,7 @@ async def viewer(found: Annotated[Access | None, Depends(access_of)]) -> Access:
 async def operator(found: Annotated[Access, Depends(viewer)]) -> Access:
     """Return the caller, who needs the role operator; raises 403 for others."""
     if found.role != "operator":
-        raise HTTPException(403, f"the token {found.name!r} may look only; this needs the role operator")
+        raise HTTPException(403, f"the token {found.name!r} may only read; this needs the role operator")
     return found
 
 
@@ -168,9 +168,7 @@ async def while_known(request: Request, bearer: Bearer = None, cookie: Cookie = 
 
 def unknown() -> HTTPException:
     """Return the error for a caller without a valid token or session (401)."""
-    return HTTPException(
-        401, "give a token that counts: Authorization: Bearer TOKEN", headers={"WWW-Authenticate": "Bearer"}
-    )
+    return HTTPException(401, "give a valid token: Authorization: Bearer TOKEN", headers={"WWW-Authenticate": "Bearer"})
 
 
 def throttled(error: Throttled) -> HTTPException:

@@ -49,17 +49,17 @@ _STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
 _KINDS: Final = {413: "TooLarge"}  # whose phrase is another one in each version of Python
 _LOG = logging.getLogger("ident.http")
 _WORDS: Final = {
-    400: "The request cannot be meant.",
-    401: "No token or session, or one that does not count.",
-    403: "Not with this role, or not from this page.",
-    404: "No such thing is known.",
-    405: "Not with this method.",
-    409: "Not now: a fault, a lease, another motion, a name that is taken, or what refers to it stands against it.",
+    400: "The request is invalid.",
+    401: "No token or session, or an invalid one.",
+    403: "Not allowed for this role, or not from this page.",
+    404: "Not found.",
+    405: "Method not allowed.",
+    409: "Not possible at present: a fault, a lease, another motion, a name that is taken, or references to it.",
     413: "Too large.",
-    421: "The service is not called that.",
+    421: "Wrong host name.",
     422: "The request has mistakes; the message names them.",
     429: "Too many failed attempts.",
-    503: "Not at this moment: ask again after `Retry-After` seconds.",
+    503: "Temporarily impossible: try again after `Retry-After` seconds.",
     507: "The disk, or the registry's share of it, is full.",
 }
 
@@ -129,9 +129,9 @@ def _short_of(request: Request, error: Exception) -> tuple[int, str, str, dict[s
     if not isinstance(error, Unavailable):
         found = shortage(request.app.state.service.state / FILE, error) or error
     if isinstance(found, RegistryBusy):
-        return 503, "RegistryBusy", "another process keeps the registry; ask again", {"Retry-After": "2"}
+        return 503, "RegistryBusy", "another process has locked the registry; try again", {"Retry-After": "2"}
     if isinstance(found, DiskFull):
-        return 507, "DiskFull", "the disk of the state folder is full; make room, then ask again", {}
+        return 507, "DiskFull", "the disk of the state folder is full; free space, then try again", {}
     return None
 
 

@@ -123,10 +123,10 @@ class _Now(Collector):
             family.add_metric(names, count)
         yield family
         for name, words in (
-            ("moving", "Whether somebody moves the arm."),
+            ("moving", "Whether the arm is moving."),
             ("faults", "Faults that nobody has acknowledged."),
             ("due", "Re-identifications that are due."),
-            ("drift_alarms", "Drift alarms that stand."),
+            ("drift_alarms", "Open drift alarms."),
         ):
             family = GaugeMetricFamily(f"ident_arm_{name}", words, labels=["arm"])
             for arm, count in sorted(self._arms[name].items()):

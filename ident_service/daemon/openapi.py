@@ -13,7 +13,7 @@ _RUN: Final = "20261101T080000Z-wam7_sim-3fa9c1"
 EXAMPLES: Final[dict[str, dict[str, Any]]] = {
     "Acceptance": {"A person's word": {"run": _RUN, "note": "after the new belt, torque error 2.1 %"}},
     "Description": {"An arm that extends a shipped one": {"description": _YAML}},
-    "Enabled": {"Let it count no more": {"enabled": False}},
+    "Enabled": {"Disable it": {"enabled": False}},
     "Event": {"Gear oil": {"what": "gear oil changed", "note": "joint 2, 40 ml"}},
     "JobRequest": {
         "Commission a simulated arm": {"job": {"kind": "simulate", "arm": "planar2", "seed": 1}},
@@ -60,16 +60,16 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
 
 FAILURES: Final[dict[int, tuple[str, str]]] = {
     400: ("UsageError", "a description comes with 16 files at most"),
-    401: ("Unauthorized", "give a token that counts: Authorization: Bearer TOKEN"),
-    403: ("Forbidden", "the token 'screen' may look only; this needs the role operator"),
+    401: ("Unauthorized", "give a valid token: Authorization: Bearer TOKEN"),
+    403: ("Forbidden", "the token 'screen' may only read; this needs the role operator"),
     404: ("UnknownId", "no run 'x' is known; see the list of runs"),
     409: ("MotionRefused", "wam7_sim: a motion needs a fresh challenge of this arm"),
     413: ("TooLarge", "a request has 65536 bytes at most"),
-    421: ("WrongHost", "this service is not called that; use the address or name that it was started with"),
+    421: ("WrongHost", "wrong host name; use the address or name that the service was started with"),
     422: ("ConfigError", "arm.yaml:3:11: control.rate: Input should be greater than 0"),
     429: ("TooManyRequests", "ten failed logins in a minute; try again in 42 s"),
-    503: ("RegistryBusy", "another process keeps the registry; ask again"),
-    507: ("DiskFull", "the disk of the state folder is full; make room, then ask again"),
+    503: ("RegistryBusy", "another process has locked the registry; try again"),
+    507: ("DiskFull", "the disk of the state folder is full; free space, then try again"),
 }
 """Example of a failure (kind and message) by HTTP status."""
 

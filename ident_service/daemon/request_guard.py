@@ -62,7 +62,7 @@ class _Busy(HTTPException):
     """Error for a request while as many are being answered as may be."""
 
     def __init__(self) -> None:
-        super().__init__(503, "too many requests are being answered; ask again", {"Retry-After": "1"})
+        super().__init__(503, "too many requests at a time; try again", {"Retry-After": "1"})
 
 
 class RequestGuardMiddleware:
@@ -134,13 +134,13 @@ class RequestGuardMiddleware:
         hosts = [value for name, value in headers if name == b"host"]
         host = hosts[0].decode("latin-1") if len(hosts) == 1 else ""
         if _name(host) not in self._hosts:
-            return 421, "WrongHost", "this service is not called that; use the address or name that it was started with"
+            return 421, "WrongHost", "wrong host name; use the address or name that the service was started with"
         origins = [value.decode("latin-1") for name, value in headers if name == b"origin"]
         if any(origin.lower() != f"{self._scheme}://{host.lower()}" for origin in origins):
-            return 403, "WrongOrigin", "a page of another origin may not ask this service for anything"
+            return 403, "WrongOrigin", "requests from pages of other origins are refused"
         sites = [value for name, value in headers if name == b"sec-fetch-site"]
         if scope["method"] not in _SAFE and any(site not in (b"same-origin", b"none") for site in sites):
-            return 403, "WrongOrigin", "a page of another origin may not ask this service for anything"
+            return 403, "WrongOrigin", "requests from pages of other origins are refused"
         return None
 
     def _counted(self, scope: Scope, receive: Receive, *, urgent: bool) -> Receive:

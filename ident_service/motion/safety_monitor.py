@@ -403,7 +403,7 @@ class SafetyMonitor:
             self._sent = wanted
             return wanted, None
         finite = np.isfinite(wanted)
-        what = f"a torque of {{}} {{f}} was asked for, more than {ABSURD:g} times the limit of {{}}"
+        what = f"a torque of {{}} {{f}} was requested, more than {ABSURD:g} times the limit of {{}}"
         for check in (
             Check("torque_not_finite", ~finite, "the requested torque is not a number"),
             Check("torque_absurd", finite & (size > ABSURD * limit), what, (wanted, limit)),

@@ -8,7 +8,7 @@
 | refused | exit code 3: done, but the verdict is no |
 | failed | exit code 1 or 2, or no answer |
 | faulted | exit code 4: a fault stopped the arm |
-| cancelled | somebody stopped it, or nobody renewed its lease |
+| cancelled | somebody stopped it, or its lease was not renewed |
 | interrupted | the service died meanwhile; `detail` says what its folder shows |
 """
 

@@ -297,7 +297,7 @@ def test_one_drive_that_cannot_be_zeroed_leaves_none_zeroed(lost: int) -> None:
     before = bench.marks()
     bench.lead((0.1, 0.3))
     bench.loses = deaf_from(lost)
-    words = "" if lost <= 2 else r".*no drive has a zero now; drives 2 could not be told"
+    words = "" if lost <= 2 else r".*no drive has a zero now; drives 2 could not be cleared"
     with pytest.raises(DriverError, match=rf"node 2: (setting|reading) 1020h{words}"):
         bench.arm.zero()
     bench.loses = lambda frame: False

@@ -50,7 +50,7 @@ def test_that_an_arm_is_supported_takes_its_typed_name(ident: Ident, state: Path
         for words in ((), ("--confirm", "planar"), ("--json",)):
             ended = ident("supported", "planar2", *words)
             assert (ended.code, holder.supported) == (2, False)
-        assert "typed: --confirm planar2" in ended.out + ended.err
+        assert "by its name: --confirm planar2" in ended.out + ended.err
         assert ident("supported", "planar2", "--confirm", "planar2").code == 0
         assert holder.supported
 

@@ -214,7 +214,7 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
     words = {
         "cancel": "cancelled by owner",
         "stop": "anybody asked",
-        "silence": "nobody renewed",
+        "silence": "lease was not renewed",
         "shutdown": "service",
     }
     assert ended["state"] == "cancelled"

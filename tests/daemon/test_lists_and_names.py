@@ -115,7 +115,7 @@ def test_a_computation_that_is_asked_for_twice_is_one_job(daemon: Asked, viewer:
     for key in ("a b", "", "x" * 201):
         refusal(post(key), 422)
     body = {"job": {"kind": "home", "arm": "planar2"}, "confirm": {"name": "planar2", "challenge": "x"}}
-    refusal(post("third", body), 400, "its challenge counts once")
+    refusal(post("third", body), 400, "its challenge is valid once")
     # Another token has keys of its own, and a day later a key is forgotten.
     daemon.service.db.write("UPDATE idempotency_keys SET at = at - 90000")
     assert "idempotent-replayed" not in post("first").headers

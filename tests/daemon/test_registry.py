@@ -192,7 +192,7 @@ def test_a_refusal_says_why_in_the_jobs_own_line() -> None:
     assert detail(feasible=True, unusable=["the data pull against the mass of link 2"]) == (
         "the data pull against the mass of link 2"
     )
-    assert detail(feasible=False, unusable=[]) == "no real body can have these parameters"
+    assert detail(feasible=False, unusable=[]) == "these parameters are not feasible"
     assert detail(objections=["too fast"], error=None) == "too fast"
     assert (
         detail(error={"kind": "MotionRefused", "message": "no preflight ticket"}, objections=["x"])

@@ -101,7 +101,7 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         looks = IdentClient(client.url, document["token"])
         assert looks.get("/api/v1/whoami") == {"name": "ann", "role": "viewer"}
         assert "ident_jobs" in _metrics(client)
-        with pytest.raises(UsageError, match="look only"):
+        with pytest.raises(UsageError, match="only read"):
             looks.post("/api/v1/jobs", {"job": {"kind": "simulate", "arm": "quick"}})
         with pytest.raises(UnknownId):
             client.get("/api/v1/runs/none")

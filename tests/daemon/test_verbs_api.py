@@ -175,7 +175,7 @@ def test_zeroing_waits_for_nothing(state: Path, monkeypatch: pytest.MonkeyPatch)
         body = {"job": {"kind": "zero", "arm": ON_A_BUS}}
         for _ in range(2):
             body["confirm"] = {"name": ON_A_BUS, "challenge": daemon.challenge(ON_A_BUS)}
-            refusal(daemon.post("/api/v1/jobs", body), 409, "ask again when that has ended")
+            refusal(daemon.post("/api/v1/jobs", body), 409, "try again when that has ended")
         assert [job["kind"] for job in daemon.get("/api/v1/jobs").json()] == ["recover"]
         monkeypatch.undo()
 

@@ -21,7 +21,7 @@ def test_every_file_with_link_values_says_that_they_are_one_of_many() -> None:
     arm = dataclasses.replace(arm, verdicts=verdicts)
     first, *rest = body_notes(arm)
     assert first.startswith("link values are one feasible body of many with the same torques")
-    assert "option --prior of ident identify" in first
+    assert "option prior of ident identify" in first
     assert first.endswith(f"2 of {arm.base.size} base parameters are unidentified")
     assert rest == []
     for one in export_texts(arm, LINKS):

@@ -243,7 +243,7 @@ def test_a_bolted_link_of_nothing_stays_as_it_is(tmp_path: Path) -> None:
     text = FOREIGN.replace('<link name="frame"/>', f"{zero}</inertial></link>")
     model = foreign(tmp_path, text)
     found, notes = written(model, weights(model))
-    assert notes[0].endswith("as it was: tool, camera")
+    assert notes[0].endswith("are unchanged: tool, camera")
     assert zero in found
 
 

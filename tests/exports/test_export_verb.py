@@ -73,8 +73,8 @@ def test_all_formats_are_written_and_what_they_lack_is_said(
     assert code_of("export", run, "--out", tmp_path / "out") == 0
     assert names_in(tmp_path / "out") == ALL
     said = capsys.readouterr().out
-    assert said.startswith(f"files: {tmp_path / 'out'}\n  planar2.urdf (urdf)\n    has no place for: gravity\n")
-    assert "  planar2.xml (mjcf)\n    has no place for: torque offset (fo) of every joint\n" in said
+    assert said.startswith(f"files: {tmp_path / 'out'}\n  planar2.urdf (urdf)\n    not in this format: gravity\n")
+    assert "  planar2.xml (mjcf)\n    not in this format: torque offset (fo) of every joint\n" in said
 
 
 def test_the_answer_for_programs_names_every_file(

@@ -119,7 +119,7 @@ def test_stalls_of_a_second_are_added_up_and_forgotten_after_it() -> None:
     fault = times.cycle(3 * MS)
     assert code(fault) == "late_cycles"
     assert fault is not None
-    assert fault.message.startswith("this computer kept 52 of the 1000 cycles of a second waiting or lost them, 50 are")
+    assert fault.message.startswith("this computer delayed or lost 52 of the 1000 cycles of a second, 50 are")
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_a_fault_is_acknowledged_by_its_name_and_no_other() -> None:
         latch.acknowledge("runaway")
     latch.set("runaway", "elbow: fast", 5)
     latch.set("runaway", "elbow: faster", 9)
-    with pytest.raises(UsageError, match=r"no fault 'driver' is latched \(latched: runaway"):
+    with pytest.raises(UsageError, match=r"no active fault 'driver' \(active: runaway"):
         latch.acknowledge("driver")
     (fault,) = latch.faults
     assert (fault.code, fault.cause, fault.since_ns) == ("runaway", "elbow: fast", 5)

@@ -61,7 +61,7 @@ def test_with_a_motion_that_does_not_fit() -> None:
     ticket = checked(flight, bus_goes(flight, 0), other)
     assert verdicts(ticket)["motion_fits"] is Verdict.FAILED
     assert verdicts(ticket)["gravity"] is Verdict.FAILED
-    assert for_a_way_home(ticket) == ["the check did not pass: gravity"]
+    assert for_a_way_home(ticket) == ["checks failed: gravity"]
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def test_nothing_stands_against_it_only_where_nothing_does(good: Made) -> None:
     verdicts = {"verdicts": ["identified"] * good.estimate.base.size}
     assert said(good, base_parameters=verdicts).endswith("Next: it can be used.")
     warned = replace(good.evidence, warnings=("x",))
-    assert "Next: mend what the recordings' warnings name" in said(good, warned, base_parameters=verdicts)
+    assert "Next: correct what the recordings' warnings name" in said(good, warned, base_parameters=verdicts)
     first = good.estimate.base.expressions[0][:57]
     blind = {"verdicts": ["unidentified", *verdicts["verdicts"][1:]]}
     words = said(good, base_parameters=blind)
@@ -80,7 +80,7 @@ def with_validation(made: Made, validation: list[dict[str, Any]]) -> Made:
 
 
 def test_a_joint_that_the_whole_arm_s_error_hides_is_named(good: Made) -> None:
-    assert "No joint's error exceeds 15 % of its own torque on what it never saw." in said(good)
+    assert "No joint's error exceeds 15 % of its own torque on the validation recordings." in said(good)
     first, second = good.evidence.joints
     poor = with_validation(good, joints_of(good, 14.9, 84.7))
     # Poor where it moves, too.
@@ -97,10 +97,10 @@ def test_a_joint_that_the_whole_arm_s_error_hides_is_named(good: Made) -> None:
 
 
 def test_without_a_second_recording_the_joints_of_the_fit_are_judged(alone: Made) -> None:
-    assert "No joint's error exceeds 15 % of its own torque on what it was fitted to." in said(alone)
+    assert "No joint's error exceeds 15 % of its own torque on the fitted recordings." in said(alone)
     rows = [row | {"relative_error_percent": 40.0} for row in alone.parameters.content["fit"]["per_joint"]]
     words = said(alone, own(alone, moving_joints=((40.0, 40.0),)), fit={"per_joint": rows})
-    assert "on what it was fitted to, the error exceeds 15 %" in words
+    assert "on the fitted recordings, the error exceeds 15 %" in words
 
 
 def test_the_verdict_and_the_warnings_agree(good: Made, alone: Made, bare: Made) -> None:

@@ -40,10 +40,10 @@ def test_a_fault_stays_until_it_is_acknowledged_by_name(folder: Path) -> None:
     faults.latch("runaway", "another cause")
     assert list(FaultStore(folder).latched().items()) == [("runaway", "a sign"), ("driver", "a cable")]
     with pytest.raises(
-        MotionRefused, match=r"small: faults .* runaway \(a sign\); driver \(a cable\); `ident acknowledge"
+        MotionRefused, match=r"small: unacknowledged faults: runaway \(a sign\); driver \(a cable\); `ident acknowledge"
     ):
         faults.began(Path("run"))
-    with pytest.raises(UsageError, match=r"small: no fault 'far_outside' is latched \(latched: runaway, driver\)"):
+    with pytest.raises(UsageError, match=r"small: no active fault 'far_outside' \(active: runaway, driver\)"):
         faults.acknowledge("far_outside")
     assert faults.acknowledge("runaway") == "a sign"
     assert faults.latched() == {"driver": "a cable"}
@@ -66,7 +66,7 @@ def test_an_arm_that_moves_has_no_fault_yet_and_one_that_ended_has_none(folder: 
     with ControlFile.take(folder / CONTROLS, None):
         faults.began(Path("run"))
         assert faults.latched() == {}
-        with pytest.raises(UsageError, match="no fault 'motion_process' is latched"):
+        with pytest.raises(UsageError, match="no active fault 'motion_process'"):
             faults.acknowledge("motion_process")
         faults.ended()
     assert faults.latched() == {}

@@ -172,7 +172,7 @@ def test_latched_faults_are_said(config: ArmConfig, behind: LockStepArm, state: 
     found = recover(config, state)
     assert "drives 2 do not know" in found.zero_lost
     acknowledged = next(k for k, step in enumerate(found.steps) if "`ident acknowledge pucks2 drive_restarted`" in step)
-    zeroed = next(k for k, step in enumerate(found.steps) if "--zero" in step)
+    zeroed = next(k for k, step in enumerate(found.steps) if "`ident set-home" in step)
     assert acknowledged < zeroed < len(found.steps) - 1
     done = set_home(config, state, sure)
     assert [fault.code for fault in done.faults] == ["drive_restarted"]

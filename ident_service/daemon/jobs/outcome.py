@@ -94,11 +94,11 @@ def outcome(heard: ProcessOutput, exit_code: int | None, asked_to_end: str) -> O
     if not isinstance(code, int):
         how = "" if exit_code is None else f" (signal {-exit_code})" if exit_code < 0 else f" (exit code {exit_code})"
         last = heard.log.strip().splitlines()[-1:]
-        words = "; ".join([f"its process ended without an answer{how}", *last])
+        words = "; ".join([f"its process ended without a result{how}", *last])
         return Outcome("cancelled", asked_to_end, exit_code) if asked_to_end else Outcome("failed", words, exit_code)
     message = _message(heard.answer)
     if _report(heard.answer).get("state") == STOPPED:
-        return Outcome("cancelled", asked_to_end or "the arm was brought to rest: a stop was requested", code)
+        return Outcome("cancelled", asked_to_end or "the arm was stopped: a stop was requested", code)
     state = _STATES.get(code, "failed")
     if asked_to_end and state in ("failed", "refused"):
         return Outcome("cancelled", "; ".join(filter(None, (asked_to_end, message))), code)
@@ -161,7 +161,7 @@ def _objections(answer: dict[str, Any]) -> Iterator[str]:
         said = answer.get(key)
         yield from map(str, said if isinstance(said, list) else ())
     if answer.get("feasible") is False:
-        yield "no real body can have these parameters"
+        yield "these parameters are not feasible"
 
 
 def _report(answer: dict[str, Any]) -> dict[str, Any]:
@@ -219,7 +219,7 @@ def mark_interrupted(db: Database, state: Path) -> None:
             if row["state"] == "running":
                 detail = UNTOLD
             elif row["motion"]:
-                detail = "the service ended before it began; nothing has moved, ask for it again"
+                detail = "the service ended before it began; nothing has moved, request it again"
             else:
                 continue
             rows.ended(db, row["id"], "interrupted", detail)

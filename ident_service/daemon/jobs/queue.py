@@ -178,13 +178,15 @@ class LiveJobs:
         """
         with self._lock:
             if self._closing:
-                raise MotionRefused("the service is ending and begins nothing")
+                raise MotionRefused("the service is shutting down and starts no jobs")
             if stops is not None and stops != self.stops(live.order.arm):
-                raise MotionRefused("a stop was requested meanwhile; nothing more is begun")
+                raise MotionRefused("a stop was requested meanwhile; no job is started")
             needed = set(live.order.resources)
             before = next((one.job for one in self._jobs.values() if needed & set(one.order.resources)), "")
             if before and not live.order.waits:
-                raise MotionRefused(f"{live.order.arm}: {before} has it or waits for it; ask again when that has ended")
+                raise MotionRefused(
+                    f"{live.order.arm}: {before} uses it or waits for it; try again when that has ended"
+                )
             self._jobs[live.job] = live
 
     def enter(self, live: LiveJob) -> None:
@@ -321,7 +323,7 @@ class LiveJobs:
         elif silent > self.lease_factor * live.order.lease:
             moved = f"for {live.order.lease:g} s"
             waited = "while it waited; nothing has moved"
-            self._end(live, f"nobody renewed its lease {waited if live.child is None else moved}")
+            self._end(live, f"its lease was not renewed {waited if live.child is None else moved}")
 
 
 def _say_stop(live: LiveJob) -> None:

@@ -34,7 +34,7 @@ def main() -> int:
     except (ValueError, KeyError, TypeError):
         return refuse("not a request")
     if not taken(words):
-        return refuse("only motions under a lease, and looks without a torque, are done here")
+        return refuse("only motions under a lease, and read-only commands, are accepted here")
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
     try:
         process, answer, log = (os.open(folder / name, flags, 0o600) for name in (PROCESS, ANSWER, LOG))

@@ -227,7 +227,7 @@ class Reidentifications:
             state = "failed" if judged else job["state"]
             self._ended(row, state, f"{row['step']}: {job['detail'] or job['state']}{_kept(row)}")
         elif row["step"] == "check" and row["id"] not in self._stops:
-            why = "the service ended between preflight and run; nothing has moved since, ask for it again"
+            why = "the service ended between preflight and run; nothing has moved since, request it again"
             self._ended(row, "interrupted", why)
         else:
             self._begin_next(row)

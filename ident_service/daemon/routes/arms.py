@@ -161,7 +161,7 @@ def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> A
     """Confirm that the arm, which is held after a stop, is supported or home: it is then let down."""
     name = known.known_arm(service.db, service.state, arm).name
     if body.confirm != name:
-        raise MotionRefused(f"that {name} is supported is confirmed by its name, typed by a person who sees it")
+        raise MotionRefused(f"confirm that {name} is supported by its name, typed by a person who sees it")
     return AskedAnswer(arm=name, asked="supported", reached=service.engine.confirm_support(name, who.name))
 
 

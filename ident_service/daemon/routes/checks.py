@@ -27,7 +27,7 @@ class Checks:
         """
         if not self._places.acquire(blocking=False):
             raise HTTPException(
-                503, f"{MOST_CHECKS} descriptions are being checked; ask again", headers={"Retry-After": "2"}
+                503, f"{MOST_CHECKS} descriptions are being checked; try again", headers={"Retry-After": "2"}
             )
         try:
             yield

@@ -112,7 +112,7 @@ def create_job(
     if idempotency_key is None:
         return begin_job(service, who, body)
     if body.job.kind in MOVES:
-        raise UsageError("a motion has no Idempotency-Key: its challenge counts once, and it must not begin later")
+        raise UsageError("a motion has no Idempotency-Key: its challenge is valid once, and it must not begin later")
     asked = hashlib.sha256(body.job.model_dump_json().encode()).hexdigest()
     if (row := rows.job_of_key(service.db, who.name, idempotency_key, asked)) is None:
 
@@ -197,7 +197,7 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswe
     """Renew the lease of a motion; only the caller who asked for the motion can."""
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
-        raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
+        raise HTTPException(403, "only the requester of a motion renews its lease")
     if (seconds := service.engine.live.renew(job)) is None:
         row = await run_in_threadpool(rows.known_job, service.db, job)
         raise MotionRefused(f"the job {job} has no lease to renew: {row['state']}")

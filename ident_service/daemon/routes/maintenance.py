@@ -261,7 +261,7 @@ async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -
         row = await run_in_threadpool(known_reidentification, service.db, name)
         step = row["begun_by"], row["job"]
     if step[0] != who.name:
-        raise HTTPException(403, "the lease of a motion is renewed by whoever asked for it")
+        raise HTTPException(403, "only the requester of a motion renews its lease")
     if step[1] is not None:
         service.engine.live.renew(step[1])
     return LeaseAnswer(job=step[1] or "", seconds=LEASE_SECONDS)

@@ -19,7 +19,7 @@ def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
         return ()
     count, size = arm.verdicts.count("unidentified"), arm.base.size
     drawn = arm.model.config.identification.prior.kind != "none"
-    how = "regularised towards the prior parameters" if drawn else "see the option --prior of ident identify"
+    how = "regularised towards the prior parameters" if drawn else "see option prior of ident identify"
     first = (
         f"link values are one feasible body of many with the same torques ({how}); "
         f"{count} of {size} base parameters are unidentified"
