@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import os
 import pwd
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 from ident_service.cli.arguments import Parser, VerbList, count
 from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
-from ident_service.errors import IdentError, UsageError
+from ident_service.errors import IdentError, InUse, UsageError
 
 _LONGEST_NAME = 80
 _PATIENCE = 1.0  # s to wait for a locked registry when an act that is done is entered in the audit trail
@@ -186,10 +187,23 @@ def _delete(arguments: argparse.Namespace) -> Answer:
 
     kind, state = arguments.word.rpartition(" ")[2], own_state_folder(arguments)
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
-    with Database(state) as db:
+    with Database(state) as db, deleted_with_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
     document = {"deleted": arguments.name, "dependents": [asdict(one) for one in found]}
     return DONE, deleted_text(document), document
+
+
+@contextmanager
+def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
+    """Let what refuses a deletion in the block say which command does it all the same."""
+    try:
+        yield
+    except InUse as error:
+        if not error.dependents:
+            raise
+        words = str(error).partition(";")[0]  # a daemon's go on for those who speak HTTP
+        hint = f"to delete it all the same: `ident delete {kind} {name} --anyway`"
+        raise InUse(f"{words}; {hint}", error.dependents) from None
 
 
 def _backup(arguments: argparse.Namespace) -> Answer:

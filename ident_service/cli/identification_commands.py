@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, tell
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, state_folder, tell
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
 
@@ -314,7 +314,8 @@ def _add_comparing(verbs: VerbList) -> None:
     sub = verbs.add(
         "compare", _compare, "compare parameter sets: has the arm changed? (exit code 3: yes, or undecided)"
     )
-    sub.add_argument("reference", type=Path, metavar="A", help="folder of results, or parameters.json: the reference")
+    reference = "the reference: a folder of results, a parameters.json, or accepted:NAME, the accepted set of an arm"
+    sub.add_argument("reference", type=Path, metavar="A", help=reference)
     sub.add_argument(
         "others", type=Path, nargs="+", metavar="B", help="folder of results, or parameters.json, to compare"
     )
@@ -339,17 +340,28 @@ def _add_comparing(verbs: VerbList) -> None:
     )
 
 
+def accepted_name(path: Path) -> str | None:
+    """Return NAME of `accepted:NAME`, which stands for an arm's accepted set; None of anything else, and of a file."""
+    word, _, name = str(path).partition(":")
+    return name if word == "accepted" and name and "/" not in name and not path.exists() else None
+
+
 def _compare(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.parameter_files import KEPT, compare_files, compare_into
     from ident_service.results.comparison.presentation import comparison_document, comparison_text
 
+    reference = arguments.reference
+    if (arm := accepted_name(reference)) is not None:
+        from ident_service.operations.acceptance import PARAMETERS, accepted_set
+
+        reference = accepted_set(state_folder(arguments), arm)[1] / PARAMETERS
     if arguments.keep:
         if len(arguments.others) != 1 or not arguments.others[0].is_dir():
             raise UsageError("--keep is for one folder of results that is compared with the reference")
         folder = arguments.others[0]
-        comparison, files = compare_into(arguments.reference, folder), tuple(folder / name for name in KEPT)
+        comparison, files = compare_into(reference, folder), tuple(folder / name for name in KEPT)
     else:
-        comparison, files = compare_files([arguments.reference, *arguments.others], arguments.out)
+        comparison, files = compare_files([reference, *arguments.others], arguments.out)
     text = comparison_text(comparison) + "".join(f"file: {path}\n" for path in files)
     document = comparison_document(comparison) | {"files": [str(path) for path in files]}
     return (DONE if comparison.verdict == "unchanged" else VERDICT_NO), text, document

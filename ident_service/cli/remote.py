@@ -29,7 +29,7 @@ from ident_service.cli.output import (
 )
 from ident_service.cli.remote_recordings import file_of, recording, require_known
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
-from ident_service.errors import IdentError, UnknownId, UsageError
+from ident_service.errors import AccessRefused, IdentError, UnknownId, UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -98,7 +98,18 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
 
     def connected(arguments: argparse.Namespace) -> Answer:
         with closing(_client(arguments)) as client:
-            return verb(client, arguments)
+            try:
+                return verb(client, arguments)
+            except AccessRefused as error:
+                if "token that counts" not in str(error):
+                    raise
+                # The daemon's words are for programs that speak HTTP.
+                given = "$IDENT_TOKEN" if os.environ.get("IDENT_TOKEN") else str(state_folder(arguments) / "token")
+                raise AccessRefused(
+                    f"{client.url}: the token from {given} does not count there: it was revoked, or is of another"
+                    " daemon; `ident token add NAME --role operator` makes one at the daemon's machine, and"
+                    " IDENT_TOKEN=... gives it to this command"
+                ) from None
 
     return connected
 

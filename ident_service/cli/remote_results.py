@@ -10,8 +10,9 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.archive_commands import deleted_text, pruned_text
+from ident_service.cli.archive_commands import deleted_text, deleted_with_anyway, pruned_text
 from ident_service.cli.daemon_commands import token_line
+from ident_service.cli.identification_commands import accepted_name
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, with_answer_lines
 from ident_service.cli.remote import Verb, job_verb, word_of_address
 from ident_service.cli.remote_recordings import recording
@@ -46,10 +47,17 @@ def _correct(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
     return {"kind": "correct", **_of_file(client, arguments)}
 
 
-def _compare(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+def _compare(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if len(arguments.others) != 1:
         raise UsageError("compare --server: compares one run with one other")
     run, other = arguments.reference, arguments.others[0]
+    if (arm := accepted_name(run)) is not None:
+        acts = client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")
+        if not acts:
+            raise UsageError(
+                f"{arm}: nothing has been accepted yet; `ident accept RUN` makes a run's parameters its own"
+            )
+        run = acts[-1]["run"]
     return {"run": word_of_address(str(run)), "other": word_of_address(str(other))}
 
 
@@ -66,6 +74,8 @@ def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer)
 
     code, text, document = with_answer_lines(client, arguments, answer)
     if code not in (DONE, VERDICT_NO):
+        return code, text, document
+    if document["job"]["run"] is None:  # refused before anything was written
         return code, text, document
     export = word_of_address(str(document["job"]["run"]))
     files = client.get(f"{_API}/exports/{export}")["files"]
@@ -125,7 +135,8 @@ def _rollback(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 def _delete(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     kind, name = arguments.word.rpartition(" ")[2], word_of_address(arguments.name)
-    done = client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else ""))
+    with deleted_with_anyway(kind, name):
+        done = client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else ""))
     return DONE, deleted_text(done), done
 
 

@@ -23,6 +23,7 @@ from ident_service.errors import (
     MotionRefused,
     Stopped,
     Unavailable,
+    UnknownId,
     UsageError,
 )
 
@@ -116,15 +117,30 @@ def upload(connection: Connection, arm: str, file: Path, columns: str, tell: Cal
             announced = {"arm": arm, "name": name, "bytes": size, "sha256": sha256, "columns": columns}
             seen = connection.post(_UPLOADS, announced)
             if seen["run"] is None:
-                _send(connection, stream, seen, tell)
-                path = f"{_UPLOADS}/{seen['id']}/complete"
-                seen = connection.ask("POST", path, {}, patience=_CHECKING)
+                seen = _sent(connection, stream, file, seen, tell)
     except OSError as error:
         if isinstance(error, IdentError):
             raise
         raise UsageError(f"{file}: cannot be read: {error.strerror or error}") from None
     tell(1.0)
     return {"run": str(seen["run"]), "name": str(seen["name"])}
+
+
+def _sent(
+    connection: Connection, stream: BinaryIO, file: Path, seen: dict[str, Any], tell: Callable[[float], None]
+) -> dict[str, Any]:
+    """Send what the daemon has not yet; return what the upload became."""
+    try:
+        _send(connection, stream, seen, tell)
+        return dict(connection.ask("POST", f"{_UPLOADS}/{seen['id']}/complete", {}, patience=_CHECKING))
+    except (UnknownId, AlreadyThere) as error:
+        if seen["id"] not in str(error):
+            raise
+        # An upload's id means nothing to whoever has a file.
+        why = "another program is uploading it; try again when that is done"
+        if isinstance(error, UnknownId):
+            why = "what had arrived was deleted at the daemon meanwhile; upload it again"
+        raise type(error)(f"{file}: was not uploaded: {why}") from None
 
 
 def _send(connection: Connection, stream: BinaryIO, seen: dict[str, Any], tell: Callable[[float], None]) -> None:

@@ -64,6 +64,9 @@ _WORDS: Final = {
 }
 
 
+ANYWAY: Final = "; `?anyway=true` deletes it all the same"
+
+
 def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
     """Return the `responses` of a route: its own failure statuses, besides those that any route may have."""
     every = {400, 401, 403, 413, 421, 422, 429, 503, 507, *statuses}
@@ -105,7 +108,8 @@ def answer_mistakes(app: FastAPI) -> None:
         if status == HTTPStatus.INTERNAL_SERVER_ERROR:
             _LOG.error("an answer failed", exc_info=error)
         more = {"dependents": [asdict(one) for one in error.dependents]} if isinstance(error, InUse) else {}
-        return _answer(status, type(error).__name__, str(error), more=more)
+        hint = ANYWAY if more.get("dependents") else ""
+        return _answer(status, type(error).__name__, f"{error}{hint}", more=more)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:

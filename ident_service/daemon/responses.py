@@ -120,7 +120,7 @@ class ProgressAnswer(BaseModel):
 
 
 class JobAnswer(BaseModel):
-    """A job; `run` is the id of the run, motion or export that it makes or is about.
+    """A job; `run` is the id of the run, motion or export that it makes or is about, null where it ended and made none.
 
     `held` says that its motion has stopped, and that the arm, which has no brakes, is held until a person confirms that
     it is supported; until then the job runs.

@@ -180,7 +180,7 @@ def _require_idle(db: Database, what: str, busy: list[str]) -> None:
 def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
     if found and not anyway:
         names = ", ".join(f"{one.kind} {one.id}" for one in found[:10]) + (", ..." if len(found) > 10 else "")
-        raise InUse(f"{what} is referred to by {names}; to delete it anyway, use `--anyway` or `?anyway=true`", found)
+        raise InUse(f"{what} is referred to by {names}", found)
 
 
 def forget_run(db: Database, state: Path, run: str, who: str) -> None:

@@ -278,9 +278,8 @@ def direction_check(
     # Where the response to torque cannot be told from friction, only following can be judged.
     found = [one for one in found if one.value is not None or one.what.startswith("displacement")]
     found += delay_measures(delays, model, session.period)
-    told = [
-        f"{name} responds to torque {value:.2g} times as the model expects: a gear ratio twice too large gives "
-        f"0.25, half of the torque 0.5, rotors heavier than described less than 1"
+    odd = [
+        (name, f"{value:.2g}")
         for name, value, sure in zip(names, response, np.abs(response) + _DOUBT * doubt, strict=True)
         if sure < ODD_ANSWER
     ]
@@ -291,9 +290,27 @@ def direction_check(
         "that no brake and nothing else holds it; a joint that responds too little may lack drive inertia in the prior."
         " A hidden delay is in the drive's filters or its interpolation, or belongs into identification.delay.",
     )
-    if told and check.verdict is Verdict.PASSED:
-        return replace(check, reason="; ".join([*told, "`ident preflight ARM --scale` tells which"]))
+    if odd and check.verdict is Verdict.PASSED:
+        return replace(check, reason=_of_odd_answers(odd, model))
     return check
+
+
+def _of_odd_answers(odd: Sequence[tuple[str, str]], model: ArmModel) -> str:
+    """Say of joints, with their answers to torque, whether a person has to do anything, and what."""
+    names, values = (", ".join(column) for column in zip(*odd, strict=True))
+    respond = "responds" if len(odd) == 1 else "respond"
+    found = (
+        f"{names} {respond} to torque {values} times as the model expects. Drives with more inertia than described do"
+        " so, and identification finds it. "
+    )
+    driver = model.config.driver
+    if driver is not None and driver.kind == "simulated":
+        return f"{found}Nothing to do: the arm is simulated"
+    return (
+        f"{found}Nothing to do where gear ratios and torque constants of this arm have been checked. Where they have"
+        " not, do `ident preflight ARM --scale` before the motion: with a gear ratio configured twice too large a joint"
+        " responds 0.25 times as much, with half of the torque 0.5 times"
+    )
 
 
 def _free_stroke(

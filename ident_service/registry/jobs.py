@@ -103,6 +103,11 @@ def ended(db: Database, job: str, state: str, detail: str, exit_code: int | None
     )
 
 
+def made_nothing(db: Database, job: str) -> None:
+    """Forget the id of what a job was to make, and has not made: it leads nowhere."""
+    db.write("UPDATE jobs SET run = NULL WHERE id = ?", job)
+
+
 def explain(db: Database, job: str, detail: str) -> None:
     """Replace the detail of a job that has ended."""
     db.write("UPDATE jobs SET detail = ? WHERE id = ?", detail, job)

@@ -59,8 +59,10 @@ def test_twice_the_torque_of_motor_1_is_refused() -> None:
 
 def test_a_gear_ratio_twice_too_large_is_told_and_leads_to_the_scale() -> None:
     check = checked(wam(ratio=2.0), wam())["direction"]
-    assert "j1 answers torque 0.24 times as the model expects: a gear ratio configured twice too large" in check.reason
-    assert "`ident preflight ARM --scale`" in check.reason
+    assert check.reason.startswith("j1, ")
+    assert " respond to torque 0.24, " in check.reason
+    assert "Nothing to do where gear ratios and torque constants of this arm have been checked. Where" in check.reason
+    assert "do `ident preflight ARM --scale` before the motion: with a gear ratio configured" in check.reason
 
 
 def test_a_hidden_delay_of_a_cycle_is_refused() -> None:

@@ -336,7 +336,7 @@ def test_a_name_that_is_no_link_parameter_is_no_free_variable(
     path = table(tmp_path, content, feasibility={"feasible": True, "margin": 1.0, "certificate": witness})
     more = ("--out", tmp_path / "corrected.json") if verb == "correct" else ()
     ended = ident(verb, path, *more)
-    assert ended.code == (3 if verb == "verify" else 1)
+    assert ended.code == (3 if verb == "verify" else 2)
     said = ended.out if verb == "verify" else ended.err
     assert f"'{name}' is not the name of a link parameter: allowed are Lxx Lxy " in said
     assert not (tmp_path / "corrected.json").exists()

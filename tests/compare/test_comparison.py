@@ -46,6 +46,20 @@ def test_nothing_has_changed(commissioned: Path, ident: Ident) -> None:
     assert "\nUNCHANGED (p >= 0.01 after Holm" in out
 
 
+def test_the_accepted_set_is_named_by_its_arm(commissioned: Path, ident: Ident, tmp_path: Path) -> None:
+    state = ("--state", tmp_path / "state")
+    folder = commissioned / "accepted"
+    config = read_side(folder).config
+    assert config is not None
+    arm = config.name
+    code, _, err = ident("compare", f"accepted:{arm}", folder, *state)
+    assert (code, "nothing has been accepted yet" in err) == (2, True)
+    assert ident("accept", folder, "--note", "good", *state)[0] == 0
+    code, out, _ = ident("compare", f"accepted:{arm}", commissioned / "again", *state)
+    assert (code, "\nUNCHANGED" in out) == (0, True)
+    assert ident("compare", f"accepted:{arm}", commissioned / "dry", *state)[0] == 3
+
+
 def test_a_drier_elbow_is_named(commissioned: Path, ident: Ident) -> None:
     code, out, _ = ident("compare", commissioned / "accepted", commissioned / "dry")
     assert code == 3

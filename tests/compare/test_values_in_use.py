@@ -48,7 +48,7 @@ def test_a_file_whose_values_contradict_each_other_is_refused(commissioned: Path
     path = edited(accepted, tmp_path / "edited.json", link=False)
     for words in ((accepted, path), (path, accepted)):
         code, out, err = ident("compare", *words)
-        assert (code, out) == (1, "")
+        assert (code, out) == (2, "")
         assert f"{path}: its link parameters do not have the values of its base parameters" in err
     free = typed(tmp_path / "free.json", feasible_set="none", base={"unconstrained_values": [0.4, 0.2]})
     with pytest.raises(ParameterError, match="without constraints, but its values are not its unconstrained values"):
@@ -146,7 +146,7 @@ def test_another_kind_of_table_is_pointed_to_the_small_one(commissioned: Path, t
     path = tmp_path / "table6.json"
     path.write_text(json.dumps({"title": "Estimated base parameters", "rows": []}))
     code, _, err = ident("compare", commissioned / "accepted", path)
-    assert code == 1
+    assert code == 2
     assert 'a table from a paper is typed as {"format": "ident-parameters", "version": 1, "base_parameters"' in err
     typed(path, base={"values": [0.4, "x"]})
     assert "a table from a paper" not in ident("compare", commissioned / "accepted", path)[2]

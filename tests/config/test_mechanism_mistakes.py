@@ -209,3 +209,22 @@ def test_of_many_mistakes_the_first_are_told() -> None:
     with pytest.raises(ModelError, match=r"^r\.urdf:4: .*r\.urdf:7: .*r\.urdf:7: .*; and 2 more$") as caught:
         require_urdf(TextFile(name="r.urdf", text=text))
     assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize("verb", [("config", "check"), ("base",), ("simulate",), ("new",)])
+def test_what_breaks_a_parser_is_counted_first_at_the_command_line_too(
+    tmp_path: Path, verb: tuple[str, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    count = 5000
+    links = "".join(f'<link name="l{k}"/>' for k in range(count))
+    joints = "".join(
+        f'<joint name="j{k}" type="fixed"><parent link="l{k}"/><child link="l{k + 1}"/></joint>'
+        for k in range(count - 1)
+    )
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{links}{joints}</robot>')
+    (tmp_path / "arm.yaml").write_text("extends: threelink\nname: r\nkinematics: {urdf: r.urdf}\n")
+    file = tmp_path / ("r.urdf" if verb == ("new",) else "arm.yaml")
+    assert main([*verb, str(file), *(["--out", str(tmp_path / "o")] if verb[0] in ("new", "simulate") else [])]) == 2
+    err = capfd.readouterr().err
+    assert "r.urdf: more than 256 links; an arm has fewer" in err
+    assert len(err.splitlines()) == 1

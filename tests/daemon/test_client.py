@@ -16,6 +16,7 @@ from daemon.served import daemon_process
 from daemon.verbs_bench import unstable_text
 
 from ident_service import errors
+from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.client.connection import error_of
 from ident_service.errors import (
@@ -71,7 +72,9 @@ def test_lists_are_read_to_their_end(client: IdentClient, state: Path) -> None:
     assert len(whole) > 30
 
 
-def test_errors_are_of_one_tree(client: IdentClient) -> None:
+def test_errors_are_of_one_tree(
+    client: IdentClient, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(UnknownId, match="nothing"):
         client.job("nothing")
     with pytest.raises(UnknownId):
@@ -86,6 +89,15 @@ def test_errors_are_of_one_tree(client: IdentClient) -> None:
         client.arm("quick").run(confirm="quack")
     with IdentClient(client.url, "ident_no") as nobody, pytest.raises(AccessRefused, match="valid token"):
         nobody.arms()
+    with monkeypatch.context() as patched:  # at a terminal, whose words are no HTTP
+        patched.setenv("IDENT_TOKEN", "ident_no")
+        assert main(["jobs", "list", "--server", client.url]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(
+        f"ident: {client.url}: the token from $IDENT_TOKEN does not count there: it was revoked, or is"
+    )
+    assert "`ident token add NAME --role operator`" in said
+    assert "Bearer" not in said
     with pytest.raises(UsageError, match="https only"):
         IdentClient("http://robot.example:8470", "x")
     with socket.socket() as closed:

@@ -63,7 +63,7 @@ def test_what_refers_to_a_run_is_named_and_kept(filled: Asked) -> None:
     status, answer = delete(filled, f"runs/{FIRST}")
     wanted = [{"kind": "acceptance", "id": "1", "becomes": "kept"}]
     assert (status, answer["error"]["kind"], answer["error"]["dependents"]) == (409, "InUse", wanted)
-    assert "acceptance 1" in answer["error"]["message"]
+    assert answer["error"]["message"].endswith("acceptance 1; `?anyway=true` deletes it all the same")
     assert filled.get(f"/api/v1/runs/{FIRST}").status_code == 200
     assert delete(filled, f"runs/{FIRST}?anyway=true") == (200, {"deleted": FIRST, "dependents": wanted})
     assert (state / "arms" / "quick" / "current" / "parameters.json").is_file()
@@ -205,7 +205,8 @@ def test_the_command_deletes_and_names(state: Path, commissioned: Path, capsys: 
         accept(db, state, state / "runs" / FIRST, "good", "test")
     words = ["delete", "run", FIRST, "--state", str(state)]
     assert main(words) == 2
-    assert "acceptance 1" in capsys.readouterr().err
+    said = f"the run {FIRST} is referred to by acceptance 1; to delete it all the same: "
+    assert capsys.readouterr().err == f"ident: {said}`ident delete run {FIRST} --anyway`\n"
     assert main([*words, "--anyway", "--json", "--by", "ann"]) == 0
     assert json.loads(capsys.readouterr().out)["dependents"] == [{"kind": "acceptance", "id": "1", "becomes": "kept"}]
     with Database(state) as db:

@@ -202,7 +202,7 @@ def test_verbs_are_done_by_a_daemon(
         assert done("verify", RUN)["answer"]["message"].startswith("consistent with its own conditions: feasible: ")
         assert done("verify", RUN, "--arm", "quick")["answer"]["message"].startswith("proven for ")
         assert done("feasible", RUN, "--arm", "quick")["answer"]["feasible"] is True
-        singular = done("correct", SINGULAR, "--metric", "covariance", "--out", tmp_path / "none.json", code=1)
+        singular = done("correct", SINGULAR, "--metric", "covariance", "--out", tmp_path / "none.json", code=2)
         assert "singular" in singular["job"]["detail"]  # the metric was told
         assert not (tmp_path / "none.json").exists()
         done("correct", RUN, "--feasible-set", "inertia", "--out", tmp_path / "near.json")
@@ -220,7 +220,11 @@ def test_verbs_are_done_by_a_daemon(
         assert all(path.read_bytes().startswith(b"<svg") for path in (tmp_path / "drawn").iterdir())
         assert len(list((tmp_path / "drawn").iterdir())) > 5
 
+        assert "nothing has been accepted" in done("compare", "accepted:quick", RUN, code=2)["error"]["message"]
         assert done("accept", RUN, "--note", "good")["number"] == 1
+        assert done("compare", "accepted:quick", other)["job"]["request"]["run"] == RUN
+        kept = done("delete", "run", RUN, code=2)["error"]["message"]
+        assert kept.endswith(f"acceptance 1; to delete it all the same: `ident delete run {RUN} --anyway`")
         assert done("accept", other, "--note", "better")["who"] == "owner"
         assert done("rollback", "quick", "--note", "back")["origin"] == 1
         assert done("prune", "--keep", 1)["deleted"] is False

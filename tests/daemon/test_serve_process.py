@@ -78,7 +78,7 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         code, document = ident(capsys, "identify", f"{run}/identification.mcap", "--arm", "quick", *server)
         assert (code, document["answer"]["feasible"]) == (0, True)
         code, document = ident(capsys, "simulate", "wam7", *server)
-        assert (code, document["job"]["state"]) == (1, "failed")
+        assert (code, document["job"]["state"]) == (2, "failed")
         assert ident(capsys, "verify", "x.json", *server)[0] == 2
         assert ident(capsys, "jobs", "list", "--state", state)[1]["jobs"][0]["kind"] == "simulate"
         with ControlFile.take(control_path(state, "quick"), None) as mover:

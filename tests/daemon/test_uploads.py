@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import tempfile
@@ -24,6 +25,7 @@ from helpers.forks import fork
 from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.daemon import uploads
+from ident_service.errors import AlreadyThere, UnknownId
 from ident_service.operations.backup import back_up, restore
 from ident_service.recordings.open import open_recording
 from ident_service.registry.database import Database
@@ -318,6 +320,29 @@ def test_an_upload_outlives_torn_lines_and_kills(state: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
+def test_a_failed_upload_names_the_file_and_no_id(state: Path, tmp_path: Path) -> None:
+    content = os.urandom(100_000)
+    (tmp_path / "mine.csv").write_bytes(content)
+    with daemon_process(state) as (_, client):
+
+        def deleted(_: float) -> None:
+            shutil.rmtree(state / ".uploads")
+
+        with pytest.raises(UnknownId, match=r"^\S+/mine\.csv: was not uploaded: what had arrived was deleted at the"):
+            client.upload("planar2", tmp_path / "mine.csv", tell=deleted)
+        other = IdentClient(client.url, (state / "token").read_text().strip())
+        begun = other.post("/api/v1/uploads", announced(content, name="mine.csv"))
+        with (
+            uploads.Piece(state, begun["id"], 0),
+            pytest.raises(
+                AlreadyThere, match=r"^\S+/mine\.csv: was not uploaded: another program is uploading it; try"
+            ),
+        ):
+            client.upload("planar2", tmp_path / "mine.csv")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_parameters_are_identified_from_ones_own_data(
     table: Path, state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -349,6 +374,13 @@ def test_parameters_are_identified_from_ones_own_data(
         ended = client.wait(client.begin("identify", arm="quick", recordings=[bare]).id)
         assert (ended.state, bare["run"] == recording["run"]) == ("failed", False)
         assert "stamp" in ended.detail
+        # What was refused has made no run, and names none.
+        assert client.get(f"/api/v1/jobs/{ended.id}")["run"] is None
+        assert main(["run", "quick", "--confirm", "quick", *there[:4]]) == 3
+        told = capsys.readouterr()
+        assert "not checked yet" in told.out
+        assert "\nrun " not in told.out
+        assert client.get(f"/api/v1/jobs/{answer['job']['id']}")["run"] == answer["job"]["run"]
         # What takes no columns file says so.
         assert main(["payload", answer["job"]["run"], f"{recording['run']}", "--server", client.url]) == 2
         assert "columns file" in capsys.readouterr().err

@@ -132,6 +132,17 @@ def test_a_preflight_that_is_refused_begins_no_run_and_asks_for_a_person(scene: 
     assert len(pending(scene.db, ARM)) == 1
 
 
+def test_a_run_that_was_refused_is_not_named(scene: Scene) -> None:
+    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.ended("done")
+    scene.keeper.look()
+    assert (scene.only["step"], scene.only["recorded"] is None) == ("run", False)
+    scene.ended("refused", detail="the arm is in use")
+    scene.keeper.look()
+    assert scene.only["state"] == "refused"
+    assert (scene.only["recorded"], scene.only["run"]) == (None, None)
+
+
 def _faulted(scene: Scene) -> str:
     fault_file(scene.state, ARM).latch("late_cycle", "a cycle was late")
     return "a fault waits"

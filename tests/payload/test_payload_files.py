@@ -108,7 +108,7 @@ def test_a_recording_that_ended_in_a_fault_is_refused(arms: Path, ident: Ident, 
     with_event(arms / "tooled.mcap", faulty, 20.0, 40, "following_error: j1 lags by 0.3 rad")
     out = tmp_path / "out"
     code, _, err = ident("payload", arms / "bare", faulty, "--out", out)
-    assert code == 1
+    assert code == 2
     assert "fault.mcap: ended in a fault 20 s after its first sample: following_error: j1 lags by 0.3 rad" in err
     assert "give a part before: fault.mcap@0:SECONDS" in err
     assert not out.exists()

@@ -154,7 +154,13 @@ def test_a_period_without_a_cycle_is_filled_in_and_the_torque_before_it_acted_on
 
 
 @pytest.mark.slow
-def test_the_shipped_wam_may_move_after_the_check_of_the_readme(tmp_path: Path) -> None:
+def test_the_shipped_wam_may_move_after_the_check_of_the_readme(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Its drives have no brakes: without torque it sinks onto what a person has put under it."""
     words = ["check", "wam7_sim", "--confirm", "wam7_sim", "--state", str(tmp_path)]
     assert main(words) == 0
+    # Its drives have more inertia than the description says; whoever reads it knows that nothing is to be done.
+    (told,) = (line for line in capsys.readouterr().out.splitlines() if "as the model expects" in line)
+    assert told.strip().startswith("j5, j6, j7 respond to torque ")
+    assert told.endswith("Nothing to do: the arm is simulated")

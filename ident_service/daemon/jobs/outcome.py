@@ -208,6 +208,13 @@ def folder_of(state: Path, row: Row) -> Path | None:
     return state / FOLDERS.get(row["kind"], RUNS) / str(row["run"])
 
 
+def forget_unmade(db: Database, state: Path, row: Row) -> None:
+    """Forget the folder that an ended job was to make, where there is none: after a refusal, for example."""
+    folder = folder_of(state, row)
+    if folder is not None and not folder.exists():
+        rows.made_nothing(db, row["id"])
+
+
 UNTOLD = "the service died while it ran; its process is being looked for"
 _WAIT = 40.0  # s for a process of the previous service: a controlled stop and its recording take less
 
@@ -223,6 +230,8 @@ def mark_interrupted(db: Database, state: Path) -> None:
             else:
                 continue
             rows.ended(db, row["id"], "interrupted", detail)
+            if detail is not UNTOLD:
+                forget_unmade(db, state, row)
             note(db, "service", "job interrupted", row["id"])
 
 
@@ -244,6 +253,7 @@ def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool]
             register_outputs(db, state, row, row["created_by"])
         except (IdentError, OSError) as error:
             detail = f"{detail}; its folder could not be entered: {error}"
+        forget_unmade(db, state, row)
         rows.explain(db, row["id"], detail)
 
 

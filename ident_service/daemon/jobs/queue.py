@@ -30,6 +30,7 @@ from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, Own
 from ident_service.daemon.jobs.commands import JOBS, Command, command
 from ident_service.daemon.jobs.outcome import (
     explain_interrupted,
+    forget_unmade,
     lateness_of,
     mark_interrupted,
     outcome,
@@ -624,6 +625,7 @@ class Engine:
         with self.db.transaction():
             entered = rows.ended(self.db, live.job, state, detail, code)
             if entered:
+                forget_unmade(self.db, self.state, rows.known_job(self.db, live.job))
                 note(self.db, live.by, "job ended", live.job, state=state, detail=detail)
         if entered:
             self._count(live.job)
@@ -648,6 +650,7 @@ class Engine:
                 order = command(self.db, self.state, reader.validate_python(row["request"]))
             except (IdentError, ValueError) as error:
                 rows.ended(self.db, row["id"], "failed", f"it cannot be begun any more: {error}")
+                forget_unmade(self.db, self.state, row)
                 continue
             # Its arguments and folder are those that were entered when it was requested.
             order = Command(tuple(row["words"]), order.arm, order.moves, row["run"], order.resources, order.lease)

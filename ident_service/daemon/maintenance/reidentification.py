@@ -33,6 +33,7 @@ from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Database, Row, note
 from ident_service.registry.jobs import LIVE, known_job
 from ident_service.registry.motions import new_id
+from ident_service.registry.runs import RUNS
 
 SERVICE: Final = "service"
 LOG = logging.getLogger("ident.maintenance")
@@ -259,6 +260,13 @@ class Reidentifications:
         self._engine.create(asked, row["begun_by"], own_lease=own, stops=stops, entering=enter)
 
     def _ended(self, row: Row, state: str, detail: str) -> None:
+        for column in ("recorded", "run"):
+            if row[column] is not None and not (self._state / RUNS / row[column]).exists():
+                # The step that was to make it made nothing, and its id leads nowhere.
+                self._db.write(
+                    f"UPDATE reidentifications SET {column} = NULL WHERE id = ?",  # noqa: S608 - ours
+                    row["id"],
+                )
         _end(self._db, row, state, detail, self._now())
         self._forget(row["id"])
 
