@@ -22,6 +22,7 @@
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
+        │   ├── NobodyEnabled          a person did not enable it in time, or is not waited for any more
         │   └── PositionUnknown        its encoders lost their zero: a person must say where the arm stands
         ├── Stopped                    a motion did not come to its end, because somebody asked for a stop
         └── ArmFault                   the guard or a drive stopped a motion; carries code and last samples
@@ -167,6 +168,10 @@ class DriverError(ArmError, OSError):
 
 class AnotherDrive(DriverError):
     """A drive answers that is not the one that the description names."""
+
+
+class NobodyEnabled(DriverError):
+    """A person who enables the arm, by a pendant for example, did not do so in time, or is not waited for any more."""
 
 
 class PositionUnknown(DriverError):

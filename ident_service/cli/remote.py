@@ -285,6 +285,7 @@ LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
     "emulate": "it is drives on a bus of this machine, until they are switched off",
+    "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
     **dict.fromkeys(("backup", "restore"), "it is an act at the daemon's state folder"),
