@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
-from drivers.barrett.bus_load import budget
-from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status
+from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status, budget
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
