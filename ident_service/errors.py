@@ -23,9 +23,10 @@
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── AnotherDrive           a drive answers that the description does not name
-        │   └── PositionUnknown        the encoders lost their zero: a person must set the home
-        ├── Stopped                    a motion did not come to its end, because a stop was requested
-        └── ArmFault                   the safety monitor or a drive stopped a motion; has code and last samples
+         │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
+         │   └── PositionUnknown        the encoders lost their zero: a person must set the home
+         ├── Stopped                    a motion did not come to its end, because a stop was requested
+         └── ArmFault                   the safety monitor or a drive stopped a motion; has code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
 """
@@ -179,6 +180,10 @@ class DriverError(ArmError, OSError):
 
 class AnotherDrive(DriverError):
     """A drive has another identity than the description says."""
+
+
+class NobodyEnabled(DriverError):
+    """A person who enables the arm, by a pendant for example, did not do so in time, or is not waited for any more."""
 
 
 class PositionUnknown(DriverError):

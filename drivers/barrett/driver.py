@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
-from drivers.barrett.bus_load import budget
-from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status
+from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status, budget
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
@@ -34,7 +33,7 @@ from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, motor_coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.barrett import BarrettDriver
-from ident_service.errors import DriverError, PositionUnknown
+from ident_service.errors import DriverError, NobodyEnabled, PositionUnknown
 
 LOOK_RATE = 20.0  # Hz
 _SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
@@ -400,10 +399,10 @@ class BarrettArm(Arm):
         until_ns = self.clock.now_ns() + round(self._driver.activate_within * 1e9)
         while codec.safety.mode != SafetyMode.ACTIVE:
             if not self.still_wanted():
-                raise DriverError("nobody wants the arm to be enabled any more")
+                raise NobodyEnabled("nobody wants the arm to be enabled any more")
             if self.clock.now_ns() > until_ns:
                 waited = self._driver.activate_within
-                raise DriverError(
+                raise NobodyEnabled(
                     f"nobody pressed Shift-Activate for {waited:g} s; the pendant: {codec.safety.pendant}"
                 )
             bus.cycle(zero, asks_safety=True)

@@ -325,8 +325,8 @@ def _driver_test(arguments: argparse.Namespace) -> Answer:
     from dataclasses import asdict
 
     from ident_service.config.load import load_arm
+    from ident_service.motion.arm_factory import Outcome, contract_text, try_driver
     from ident_service.motion.command_channel import ControlFile
-    from ident_service.operations.driver_contract import Outcome, contract_text, try_driver
     from ident_service.registry.state_folder import control_path
 
     config = load_arm(arguments.arm)

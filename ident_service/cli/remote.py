@@ -301,6 +301,7 @@ LOCAL_ONLY: dict[str, str] = {
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
     **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
     "emulate": "it is drives on a bus of this machine, until they are switched off",
+    "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
     "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
     **dict.fromkeys(

@@ -22,7 +22,7 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.errors import ArmFault, DriverError, MotionRefused
+from ident_service.errors import ArmFault, DriverError, MotionRefused, NobodyEnabled
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import Contact
@@ -241,6 +241,7 @@ class _Run:
         if self.latch.faults:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
             raise MotionRefused(f"unacknowledged faults: {waiting}")
+        self.nobody = ""
         for _ in range(_ENABLINGS):
             loop, torque = self._prepared()
             if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
@@ -251,6 +252,8 @@ class _Run:
                 )
             if self._enabled_where_planned(loop, torque):
                 break
+            if self.nobody:
+                raise MotionRefused(f"{self.nobody}; nothing has moved")
         else:
             raise MotionRefused("the arm was moved each time while a person enabled it; it is without torque")
         try:
@@ -295,10 +298,10 @@ class _Run:
                 self.arm.still_wanted = self._still_wanted
             try:
                 self.arm.enable()
-            except DriverError:
-                if not action or self._still_wanted():
-                    raise
-                self.arm.stop(StopKind.QUICK_STOP)  # who looks next finds the stop, and refuses
+            except NobodyEnabled as error:
+                self.arm.stop(StopKind.QUICK_STOP)
+                # A stop is found, and told, where the next attempt begins.
+                self.nobody = str(error) if self._still_wanted() else ""
                 return False
             if not action or self.controls.stop:
                 return True

@@ -291,10 +291,12 @@ def emulate(
         The summary.
 
     Raises:
-        UsageError: drives that are no CANopen drives, or in the process that moves them; a malformed fault.
+        UsageError: drives that are not on a CAN bus, or in the process that moves them; a malformed fault.
         DriverError: as `build_emulator`, an interface that cannot be had or is lost.
     """
     buses = config.can_buses
+    if not buses:
+        raise UsageError(f"{config.name}: the driver has no CAN bus, so there is no drive to emulate")
     if any(bus.interface == INTERFACE for bus in buses):
         raise UsageError(
             f"{config.name}: {INTERFACE} drives live in the process that moves them; "

@@ -3,8 +3,8 @@
 It watches the positions and torques that pass, leaves ACTIVE by itself, and lets only a person raise its mode. Its
 velocity is that of the fastest joint frame's origin, which for a WAM are elbow and flange; before the arm is zeroed it
 watches joint velocities alone. That it counts as a heartbeat whatever is packed, positions and torques, is what public
-sources say; its time is this emulation's. How it tells the pucks their MODE is not documented: here by a frame from
-node 10 to group 0, as real arms show one.
+sources say; its time is this emulation's. How it tells the pucks their MODE is not documented. Here a frame from
+node 10 to group 0 does; of such a broadcast only the identifier is known.
 """
 
 from __future__ import annotations

@@ -67,3 +67,26 @@ def test_a_velocity_fault_in_the_middle_of_a_run_is_latched_and_its_recording_ca
     assert sum(len(block.position) for block in blocks) > RATE
     assert main(["run", str(path), "--out", str(tmp_path / "again"), "--state", str(state)]) == 3
     assert "drive_emergency" in capsys.readouterr().err
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(1800)
+def test_the_shipped_wam_of_pucks_is_checked_run_and_identified(tmp_path: Path, capsys: Any) -> None:
+    motion = {"kind": "seeded", "base_frequency": 0.2, "harmonics": 3, "periods": 1}
+    tree = {
+        "extends": "wam7_pucks",
+        "name": "wampucks",
+        "motions": {"identification": motion | {"seed": 7}, "validation": motion | {"seed": 8}},
+        "driver": {"kind": "barrett", "bus": LOCK_STEP, "emulation": {"operator": 0.1, "zeroed": True}},
+    }
+    path, state, run, out = write(tmp_path, tree), tmp_path / "state", tmp_path / "run", tmp_path / "out"
+    assert checked(path, "wampucks", state), capsys.readouterr().out
+    assert main(["run", str(path), "--out", str(run), "--state", str(state)]) == 0
+    assert main(["identify", str(run / "run.mcap"), "--arm", str(path), "--out", str(out), "--state", str(state)]) == 0
+    document = json.loads((out / "parameters.json").read_text())["base_parameters"]
+    model = arm_model(load_arm(path))
+    truth_of = model.config.driver.emulation.truth  # type: ignore[union-attr]
+    base = base_parameters(model.chain, model.layout)
+    true = base.K @ model.layout.vector(truth_of)
+    z = (np.array(document["values"]) - true) / np.array(document["standard_deviations"])
+    assert np.abs(z).max() < 5.0, z

@@ -23,7 +23,7 @@ from ident_service.cli import main
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from ident_service.motion import arm_factory
-from ident_service.operations.driver_contract import Outcome, try_driver
+from ident_service.motion.arm_factory import Outcome, try_driver
 
 PAGE = Path(__file__).parents[2] / "docs" / "drivers.md"
 WATCHDOG = 0.05

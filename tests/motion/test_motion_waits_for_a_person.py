@@ -78,6 +78,18 @@ def test_an_arm_that_is_moved_each_time_is_refused() -> None:
 
 
 @pytest.mark.slow
+def test_nobody_at_the_pendant_is_no_fault_of_the_arm() -> None:
+    document = bench_puck_config().model_dump(mode="json", by_alias=True)
+    document["driver"]["emulation"]["operator"] = None
+    document["driver"]["activate_within"] = 0.5
+    refused, story, latch = moved(0, 0.0, None, ArmConfig.model_validate(document))
+    assert "nobody pressed Shift-Activate for 0.5 s" in str(refused)
+    assert "nothing has moved" in str(refused)
+    assert waited(story) == 1
+    assert not latch.faults
+
+
+@pytest.mark.slow
 def test_a_stop_ends_the_waiting_and_nothing_is_latched() -> None:
     document = bench_puck_config().model_dump(mode="json", by_alias=True)
     document["driver"]["emulation"]["operator"] = None

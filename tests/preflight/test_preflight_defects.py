@@ -389,14 +389,25 @@ def test_drives_without_a_watchdog_are_refused() -> None:
     flight = Flight(
         changes={"driver": {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "watchdog": 1e6}}
     )
-    # The driver promises 10 ms to preflight and has none.
+    # The driver promises 10 ms to preflight, in its section and when it is open, and has none.
     config = flight.model.config
     promised = config.model_copy(update={"driver": config.driver.model_copy(update={"watchdog": 0.01})})
     flight.model = replace(flight.model, config=promised)
+    flight.arm.description = lambda says: replace(says, watchdog=0.01)
     ticket = flight.ticket()
     check = only_failure(ticket, "watchdog")
     assert "1400h" in check.remedy
     assert all(one.value is None for one in check.measures)
+
+
+@pytest.mark.slow
+def test_drives_that_say_themselves_that_they_go_on_for_long_are_refused_before_they_are_energised() -> None:
+    flight = Flight()
+    flight.arm.description = lambda says: replace(says, watchdog=0.5)
+    check = only_failure(flight.ticket(), "identities")
+    assert "drives go on for 0.5 s when the host is gone" in check.reason
+    assert "driver.watchdog_reason" in check.remedy
+    assert "enable" not in flight.arm.calls
 
 
 class Beating(FlightArm):

@@ -188,7 +188,7 @@ def test_a_fault_and_an_interface_are_checked_before_anything_runs(
     assert main(["emulate", str(arm_file(tmp_path, 1)), "--fault", "earthquake"]) == USAGE
     assert "no fault is called 'earthquake'" in capsys.readouterr().err
     assert main(["emulate", "planar2"]) == USAGE
-    assert "the driver is not CANopen's" in capsys.readouterr().err
+    assert "the driver has no CAN bus" in capsys.readouterr().err
     with pytest.raises(SystemExit) as wrong:
         main(["emulate", path, "--seconds", "0"])
     assert wrong.value.code == USAGE

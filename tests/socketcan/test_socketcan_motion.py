@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ident_service.config.barrett import BarrettDriver
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.estimation.identify import identify
@@ -34,7 +35,7 @@ PATIENCE = 300.0  # s, for a machine that emulates another one and has more to d
 
 ARM = """
 extends: {planar2}
-name: planar2_canopen
+name: planar2_socketcan
 gravity: [0, 0, -9.81]
 control: {{rate: 20, velocity_cutoff: 10}}
 joints:
@@ -44,6 +45,16 @@ motions:
   identification: {{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 3, periods: 2}}
   validation: {{kind: seeded, seed: 2, base_frequency: 0.2, harmonics: 3, periods: 2}}
 transmission: {{ratios: [40, -20], drive_terms: joints}}
+{driver}  emulation:
+    seed: 1
+    truth:
+      {{Lxx1: 0.0034, Lxy1: 0.0106, Lyy1: 0.178, Lzz1: 0.179, lx1: -0.53, ly1: 0.04, m1: 2.15,
+       Ia1: 0.03, fv1: 0.4, fc1: 0.1, fo1: 0.05,
+       Lxx2: 0.0021, Lxy2: -0.0054, Lyy2: 0.091, Lzz2: 0.092, lx2: -0.27, ly2: -0.02, m2: 1.08,
+       Ia2: 0.012, fv2: 0.2, fc2: 0.05, fo2: -0.03}}
+    torque_noise: [0.05, 0.02]
+"""
+CANOPEN = """\
 driver:
   kind: canopen
   eds: {eds}
@@ -55,19 +66,22 @@ driver:
   drives:
     - {{node: 1, rated_torque: 0.1, max_torque: 1.2, max_speed: 6000}}
     - {{node: 2, rated_torque: 0.1, max_torque: 0.9, max_speed: 6000}}
-  emulation:
-    seed: 1
-    truth:
-      {{Lxx1: 0.0034, Lxy1: 0.0106, Lyy1: 0.178, Lzz1: 0.179, lx1: -0.53, ly1: 0.04, m1: 2.15,
-       Ia1: 0.03, fv1: 0.4, fc1: 0.1, fo1: 0.05,
-       Lxx2: 0.0021, Lxy2: -0.0054, Lyy2: 0.091, Lzz2: 0.092, lx2: -0.27, ly2: -0.02, m2: 1.08,
-       Ia2: 0.012, fv2: 0.2, fc2: 0.05, fo2: -0.03}}
-    torque_noise: [0.05, 0.02]
 """
+PUCKS = """\
+driver:
+  kind: barrett
+  bus: {{interface: {interface}, channel: {channel}}}
+  pucks: [{{node: 1, ipnm: 2700, mt: 3240, cts: 4096}}, {{node: 2, ipnm: 2700, mt: 2430, cts: 4096}}]
+  limits: {{velocity: 7.0, torque: 8191}}
+  heartbeat: 5.0
+  status_period: 0.5
+  watchdog_reason: an emulated arm in a slow guest
+"""
+OF_PUCKS = "    zeroed: true\n    operator: 1.0\n    heartbeat: 4.0\n"
 
 
 @contextmanager
-def emulated(arm: Path) -> Iterator[dict[str, object]]:
+def emulated(arm: Path, ready: str) -> Iterator[dict[str, object]]:
     """`ident emulate` in a process of its own; what it says at its end is in the dictionary then."""
     words = [sys.executable, "-m", "ident_service", "emulate", str(arm), "--json"]
     pipe, said, document = subprocess.PIPE, list[str](), dict[str, object]()
@@ -85,7 +99,7 @@ def emulated(arm: Path) -> Iterator[dict[str, object]]:
                 time.sleep(0.1)
 
         try:
-            says("node 2: pre operational")
+            says(ready)
             begun = len(said)
             yield document
             says("the arm is at rest", begun)
@@ -97,29 +111,34 @@ def emulated(arm: Path) -> Iterator[dict[str, object]]:
             reader.join()
 
 
-@pytest.mark.parametrize("interface", ["raw", "socketcan"])
-def test_a_motion_over_a_real_bus_identifies_the_arm(interface: str, can_interface: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("interface", "kind"), [("raw", "canopen"), ("socketcan", "canopen"), ("raw", "barrett"), ("socketcan", "barrett")]
+)
+def test_a_motion_over_a_real_bus_identifies_the_arm(
+    interface: str, kind: str, can_interface: str, tmp_path: Path
+) -> None:
     planar2 = shipped_arms()["planar2"]
     path, recording = tmp_path / "arm.yaml", tmp_path / "identification.mcap"
-    path.write_text(
-        ARM.format(planar2=planar2, eds=planar2.parent / "puck.eds", interface=interface, channel=can_interface)
-    )
+    section = CANOPEN if kind == "canopen" else PUCKS
+    driver = section.format(eds=planar2.parent / "puck.eds", interface=interface, channel=can_interface)
+    path.write_text(ARM.format(planar2=planar2, driver=driver) + (OF_PUCKS if kind == "barrett" else ""))
     config = load_arm(path)
     model = arm_model(config)
     motion = excitation(model, "identification")
-    with emulated(path) as drives:
+    ready = "node 2: pre operational" if kind == "canopen" else "safety, node 10: IDLE"
+    with emulated(path, ready) as drives:
         report = record_motion(make_arm(config), model, motion, recording)
     print(f"{interface}: {report}\ndrives: {drives}")
     assert report.state is State.DONE
     assert drives["at_rest"] is True
     assert drives["unsent"] == 0
-    # At every SYNC both drives tell where they are; torque and SYNC are two frames a cycle.
+    # At every request (SYNC) both drives tell where they are; torque and request are two frames a cycle.
     assert isinstance(drives["sent"], int)
     assert isinstance(drives["heard"], int)
     assert min(drives["sent"], drives["heard"]) >= 2 * report.cycles
 
     estimate = identify(model, [open_recording(recording, model.chain.names)])
-    assert isinstance(config.driver, CanopenDriver)
+    assert isinstance(config.driver, CanopenDriver | BarrettDriver)
     assert config.driver.emulation.truth is not None
     truth = estimate.base.K @ model.layout.vector(config.driver.emulation.truth)
     deviations = np.abs(estimate.beta - truth) / estimate.standard_deviations
