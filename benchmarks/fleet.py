@@ -76,6 +76,17 @@ def _tell(begin: float) -> Any:
     return lambda line: print(f"  {time.perf_counter() - begin:6.1f} s  {line}", flush=True)
 
 
+def cost(folder: Path, place: Path, described: Described) -> float:
+    """Return CPU seconds a recording, in this process, which a loaded machine changes least."""
+    store = Store(str(place / "cost"))
+    parts = [Part(source) for source in find([f"{folder}/arm00/*.mcap"])]
+    reduce_recording(parts[0], described, store, __version__)
+    begin = time.process_time()
+    for part in parts[1:]:
+        reduce_recording(part, described, store, __version__)
+    return (time.process_time() - begin) / len(parts[1:])
+
+
 def memory(folder: Path, place: Path) -> float:
     """Return the largest resident memory of a worker while it reduces recordings [MiB]."""
     request = FleetRequest(ARM, (f"{folder}/arm00/*.mcap",), str(place / "memory"), workers=1)
@@ -147,6 +158,7 @@ def measure(folder: Path, place: Path) -> list[Row]:
     two, computed, result = whole(folder, place / "out2", str(place / "store2"), 2)
     one, _, _ = whole(folder, place / "out1", str(place / "store1"), 1)
     again, store = _again(folder, place, total)
+    spent = cost(folder, place, result.reduced.described)
     peak = memory(folder, place)
     merged, size = merging(Store(store), result)
     with connected(FleetRequest(ARM, (), store, workers=2), lambda _: None) as client:
@@ -156,6 +168,7 @@ def measure(folder: Path, place: Path) -> list[Row]:
         Row(f"{label}: two processes", computed / two, "1/s", ">= 2.5"),
         Row(f"{label}: one process", total / one, "1/s"),
         Row("two processes over one", one / two, "", ">= 1.8"),
+        Row("CPU of one recording, in this process", spent, "s"),
         Row("worker's memory while it reduces", peak, "MiB", "<= 500"),
         Row("second call with 5 % new recordings, of the first", 100.0 * again / two, "%", "<= 10"),
         Row(f"merge of {STORED} stored factors", merged, "s", "<= 60"),

@@ -277,9 +277,7 @@ def test_recordings_and_store_on_s3(
     assert answer["recordings"] == 3
     assert [one["url"] for one in answer["left_out"]] == ["s3://recordings/arm0/week9.mcap"]
     assert len(s3.ls("store/factors/factors")) == 3
-    code, local = fleet(
-        *(f"{folder}/arm0/week{week}.mcap" for week in range(3)), out="local", store=str(tmp_path / "here")
-    )
+    code, _ = fleet(*(f"{folder}/arm0/week{week}.mcap" for week in range(3)), out="local", store=str(tmp_path / "here"))
     assert code == 0
     there, here = (
         json.loads((tmp_path / name / "arms" / "arm0" / "parameters.json").read_text())["base_parameters"]
