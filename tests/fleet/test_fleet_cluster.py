@@ -79,7 +79,7 @@ def cluster(endpoint: str) -> Iterator[LocalCluster]:
         threads_per_worker=1,
         memory_limit="1GiB",
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         silence_logs=50,
         env={**KEYS, "FSSPEC_S3_ENDPOINT_URL": endpoint},
     ) as started:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,8 @@ from fsspec.implementations.memory import MemoryFileSystem
 from helpers.fleets import BEGIN, WEEK, kind, write_recording
 
 from ident_service.cli import main
-from ident_service.fleet import storage
+from ident_service.errors import Unavailable, UsageError
+from ident_service.fleet import reduction, storage
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 COUNT = 3
@@ -53,7 +55,7 @@ def test_recordings_and_store_in_memory(
         "--json",
     ]
     with LocalCluster(
-        processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None, silence_logs=50
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0", silence_logs=50
     ) as cluster:
         assert main([*words, "--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "out")]) == 0
     assert json.loads(capsys.readouterr().out)["recordings"] == COUNT
@@ -61,9 +63,6 @@ def test_recordings_and_store_in_memory(
 
 
 def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ident_service.errors import Unavailable
-    from ident_service.fleet import reduction
-
     monkeypatch.setattr(reduction, "_CONNECT_S", 0.5)
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler="tcp://127.0.0.1:9")
     with (
@@ -71,3 +70,55 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pyt
         reduction.connected(request, lambda _: None),
     ):
         pass
+
+
+def test_a_missing_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = importlib.util.find_spec
+
+    def without(name: str, package: str | None = None) -> object:
+        return None if name == "pyarrow" else found(name, package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", without)
+    assert main(["fleet", "status", "--arm", "planar2", "--store", str(tmp_path)]) == 2
+    assert "pyarrow is not installed; pip install 'ident-service[fleet]'" in capsys.readouterr().err
+
+
+def test_the_status_of_an_empty_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "arms" / "one").mkdir(parents=True)
+    (tmp_path / "arms" / "one" / "1.mcap").write_bytes(b"x")
+    words = ["fleet", "status", f"{tmp_path}/arms/*/*.mcap", "--arm", "planar2", "--store", str(tmp_path / "store")]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("0 factors, 0.0 MiB")
+    assert "one: 0 of 1 recordings reduced" in said
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [("(", "no regular expression"), ("x", "has no group"), ("(?P<arm>Q)", "finds no arm in it")]
+)
+def test_names_that_find_nothing_are_refused(
+    names: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "1.mcap").write_bytes(b"x")
+    store = str(tmp_path / "store")
+    assert main(["fleet", "status", f"{tmp_path}/1.mcap", "--arm", "planar2", "--names", names, "--store", store]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_dates_in_names_count_in_utc() -> None:
+    named = reduction._naming(r"(?P<arm>R\d+)_(?P<date>[\d-]+)\.mcap")
+    assert named("/weekly/R12_2026-01-01.mcap") == ("R12", BEGIN)
+    with pytest.raises(UsageError, match="is no date"):
+        named("/weekly/R12_2026-13-01.mcap")
+
+
+def test_a_folder_of_somebody_else_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("mine")
+    words = ["fleet", "identify", str(tmp_path), "--arm", "planar2", "--store", str(tmp_path / "store")]
+    assert main([*words, "--out", str(tmp_path / "mine")]) == 2
+    assert "holds what is no result of a fleet" in capsys.readouterr().err
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "mine"
