@@ -21,18 +21,15 @@ from distributed import Client
 
 from benchmarks.harness import Row, table, write
 from ident_service import __version__
-from ident_service.config.load import load_arm
 from ident_service.fleet.factor import (
     FACTORS,
     FAN_IN,
     Described,
     Part,
-    Settled,
     merge,
     merge_stored,
     missing,
     reduce_recording,
-    settle,
 )
 from ident_service.fleet.identify import identify_fleet
 from ident_service.fleet.reduction import FleetRequest, connected, in_turn
@@ -87,20 +84,14 @@ def cost(folder: Path, place: Path, described: Described) -> float:
     return (time.process_time() - begin) / len(parts[1:])
 
 
-def memory(folder: Path, place: Path) -> float:
+def memory(folder: Path, place: Path, described: Described) -> float:
     """Return the largest resident memory of a worker while it reduces recordings [MiB]."""
     request = FleetRequest(ARM, (f"{folder}/arm00/*.mcap",), str(place / "memory"), workers=1)
+    store, largest = Store(request.store), 0.0
     with connected(request, lambda _: None) as client:
-        sources = find(request.patterns)
-        settled = client.submit(settle, sources[:3], load_arm(ARM).model_dump_json()).result()
-        if not isinstance(settled, Settled):
-            raise TypeError(settled)
-        described, store = Described(settled.description), Store(request.store)
-        client.restart()
-        largest = 0.0
-        for source in sources:
+        (pid,) = client.run(os.getpid).values()
+        for source in find(request.patterns):
             future = client.submit(reduce_recording, Part(source), described, store, __version__, pure=False)
-            (pid,) = client.run(os.getpid).values()
             while not future.done():
                 largest = max(largest, psutil.Process(pid).memory_info().rss / 2**20)
                 time.sleep(0.02)
@@ -159,7 +150,7 @@ def measure(folder: Path, place: Path) -> list[Row]:
     one, _, _ = whole(folder, place / "out1", str(place / "store1"), 1)
     again, store = _again(folder, place, total)
     spent = cost(folder, place, result.reduced.described)
-    peak = memory(folder, place)
+    peak = memory(folder, place, result.reduced.described)
     merged, size = merging(Store(store), result)
     with connected(FleetRequest(ARM, (), store, workers=2), lambda _: None) as client:
         per_task = overhead(client)
