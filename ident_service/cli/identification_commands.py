@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
+import importlib.util
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -262,12 +263,11 @@ def _fleet_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
-    try:
-        from ident_service.fleet.reduction import FleetRequest
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in ("distributed", "dask", "fsspec"):
-            raise
-        raise UsageError(f"{error.name} is not installed; pip install 'ident-service[fleet]'") from None
+    missing = [name for name in ("distributed", "fsspec", "pyarrow") if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(f"{', '.join(missing)} is not installed; pip install 'ident-service[fleet]'")
+    from ident_service.fleet.reduction import FleetRequest
+
     store = arguments.store or str(own_state_folder(arguments) / "fleet" / "store")
     return FleetRequest(
         arm=arguments.arm, patterns=tuple(arguments.patterns), store=store, names=arguments.names, **more

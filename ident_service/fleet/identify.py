@@ -40,7 +40,7 @@ from ident_service.fleet.population import (
     unlike,
     variance_shares,
 )
-from ident_service.fleet.reduction import FleetRequest, Reduced, Tell, connected, reduce_fleet
+from ident_service.fleet.reduction import FleetRequest, Reduced, Tell, absolute_url, connected, reduce_fleet
 from ident_service.fleet.results import (
     FLEET,
     FORMAT,
@@ -176,7 +176,7 @@ def _analysed(
         names = [(one.name, one.row.sha256) for one in arms[arm]]
         more = {"arm": arm, "pooled": helps and pooled is not None, "arms": len(arms)}
         files_of[arm] = submit(_arm_files, fits[arm], tree.merged, names, described, pooled, config, more)
-    store = Store(request.store if "://" in request.store else str(Path(request.store).absolute()))
+    store = Store(absolute_url(request.store))
     splits_of = {
         arm: _split_files(
             client, arm, [one for one in changes if one.changed and one.arm == arm], reduced, store, config

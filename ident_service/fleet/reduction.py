@@ -257,7 +257,7 @@ def reduce_fleet(client: Client, request: FleetRequest, tell: Tell) -> Reduced:
     named = _naming(request.names)
     sources = find(request.patterns)
     whose = {source.url: named(source.url) for source in sources}
-    store = Store(_absolute(request.store))
+    store = Store(absolute_url(request.store))
     arm_of = {url: arm for url, (arm, _) in whose.items()}
     described, pilot = _settled(client, sources, arm_of, config.model_dump_json(), config.sha256, store, request, tell)
     parts = [
@@ -294,7 +294,7 @@ def _by_time(one: Recorded) -> tuple[float, str, str]:
     return one.at, one.row.sha256, one.row.label
 
 
-def _absolute(url: str) -> str:
+def absolute_url(url: str) -> str:
     """Return a URL that workers elsewhere on this machine understand."""
     return url if "://" in url or "::" in url else str(Path(url).absolute())
 
@@ -444,7 +444,7 @@ def status_of(request: FleetRequest) -> Mapping[str, Any]:
         StorageError: storage cannot be reached.
     """
     config = load_arm(request.arm)
-    store = Store(_absolute(request.store))
+    store = Store(absolute_url(request.store))
     sizes = [size for _, size in store.names(FACTORS)]
     answer: dict[str, Any] = {"store": store.url, "factors": len(sizes), "bytes": sum(sizes)}
     kept = store.read(f"{SETTLED}/{config.sha256}.json")

@@ -34,6 +34,7 @@ Group = tuple[Kind, int]
 _LEAST_SIDE = 2  # recordings on each side of a split: a single odd one is no change
 _LEAST = 2 * _LEAST_SIDE
 _MEDIAN = 0.45493642311957275  # of chi-square with one degree of freedom
+_AT_ONCE = 64  # splits that are tested together, so that memory is bounded
 _TRIMMED = 0.9  # share of neighbours' statistics that the factor is found from
 _NORMAL = 1.959963984540054
 
@@ -210,25 +211,27 @@ def _most_likely(
     known = np.hstack([columns(np.ones(count)), *(columns(one) for one in conditions.T)])
     Q = np.linalg.qr(known)[0]
     rest = y - Q @ (Q.T @ y)
-    best: tuple[float, float, int, Array, Array] | None = None
-    splits = range(_LEAST_SIDE, count - _LEAST_SIDE + 1)
-    for split in splits:
-        step = columns((np.arange(count) >= split).astype(float))
+    splits = np.arange(_LEAST_SIDE, count - _LEAST_SIDE + 1)
+    statistics, steps, deviations = [], [], []
+    for part in np.array_split(splits, -(-len(splits) // _AT_ONCE)):
+        after = (np.arange(count) >= part[:, None]).astype(float)
+        step = np.einsum("tij,pt->ptij", whitening, after).reshape(len(part), count * size, size)
         step = step - Q @ (Q.T @ step)
-        information = step.T @ step
-        sizes = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        covariance = np.linalg.pinv(information / np.outer(sizes, sizes), rcond=1e-10, hermitian=True)
-        covariance = covariance / np.outer(sizes, sizes)
-        found = covariance @ (step.T @ rest)
-        statistic = float(found @ (step.T @ rest))
-        if best is None or statistic > best[1]:
-            p = probability(statistic, size, float(max(scatter.degrees, size)))
-            best = (p, statistic, split, found, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
-    if best is None:
-        return None
-    p, statistic, split, found, deviations = best
+        information = np.swapaxes(step, 1, 2) @ step
+        sizes = np.sqrt(np.maximum(np.einsum("pkk->pk", information), np.finfo(float).tiny))
+        scale = sizes[:, :, None] * sizes[:, None, :]
+        covariance = np.linalg.pinv(information / scale, rcond=1e-10, hermitian=True) / scale
+        right = np.einsum("pnk,n->pk", step, rest)
+        found = np.einsum("pkj,pj->pk", covariance, right)
+        statistics.append(np.sum(found * right, axis=1))
+        steps.append(found)
+        deviations.append(np.sqrt(np.maximum(np.einsum("pkk->pk", covariance), 0.0)))
+    every = np.concatenate(statistics)
+    best = int(np.argmax(every))
+    statistic, split = float(every[best]), int(splits[best])
+    p = min(probability(statistic, size, float(max(scatter.degrees, size))) * len(splits), 1.0)
     times = (recordings[seen[split - 1]].at, recordings[seen[split]].at)
-    return min(p * len(splits), 1.0), statistic, seen[split], found, deviations, times
+    return p, statistic, seen[split], np.concatenate(steps)[best], np.concatenate(deviations)[best], times
 
 
 def _carried(recordings: Sequence[Recorded]) -> Array:

@@ -14,15 +14,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
 from distributed import Client, LocalCluster
 from helpers.fleets import BEGIN, WEEK, Kind, kind, write_recording
+from moto.server import ThreadedMotoServer
 
 from ident_service.certificate_verifier import verify_path
 from ident_service.cli import main
+from ident_service.fleet.identify import identify_fleet
+from ident_service.fleet.reduction import FleetRequest
 
 pytestmark = [
     pytest.mark.slow,
@@ -56,14 +60,28 @@ def folder(usual: Kind, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def cluster() -> Iterator[LocalCluster]:
+def endpoint() -> Iterator[str]:
+    """Address of an S3 server of this process."""
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    _, port = server.get_host_and_port()
+    yield f"http://127.0.0.1:{port}"
+    server.stop()
+
+
+KEYS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
+
+
+@pytest.fixture(scope="module")
+def cluster(endpoint: str) -> Iterator[LocalCluster]:
     with LocalCluster(
         n_workers=2,
         threads_per_worker=1,
         memory_limit="1GiB",
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         silence_logs=50,
+        env={**KEYS, "FSSPEC_S3_ENDPOINT_URL": endpoint},
     ) as started:
         yield started
 
@@ -182,9 +200,21 @@ def test_bad_recordings_are_named_and_the_others_go_on(fleet: Run, folder: Path,
     assert not (tmp_path / "none").exists()
 
 
-def test_killed_workers_change_nothing(fleet: Run, cluster: LocalCluster, folder: Path, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def undisturbed(cluster: LocalCluster, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """What two of the arms say when nothing is killed."""
+    place = tmp_path_factory.mktemp("undisturbed")
+    request = FleetRequest(
+        "planar2", (f"{folder}/arm[01]/*.mcap",), str(place / "store"), NAMES, cluster.scheduler_address
+    )
+    identify_fleet(request, place / "out")
+    return bits(place / "out")
+
+
+def test_killed_workers_change_nothing(
+    fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
+) -> None:
     pattern = str(folder / "arm[01]" / "*.mcap")
-    fleet(pattern, out="undisturbed", store=str(tmp_path / "store1"))
     stop, killed = threading.Event(), []
 
     def kill() -> None:
@@ -206,11 +236,11 @@ def test_killed_workers_change_nothing(fleet: Run, cluster: LocalCluster, folder
         stop.set()
         killer.join()
     assert len(killed) == 2
-    assert bits(tmp_path / "disturbed") == bits(tmp_path / "undisturbed")
+    assert bits(tmp_path / "disturbed") == undisturbed
 
 
 def test_after_a_killed_client_the_next_call_goes_on(
-    fleet: Run, cluster: LocalCluster, folder: Path, tmp_path: Path
+    fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
     pattern, store = str(folder / "arm[01]" / "*.mcap"), tmp_path / "store"
     words = ["fleet", "identify", pattern, "--arm", "planar2", "--names", NAMES, "--store", str(store)]
@@ -227,5 +257,30 @@ def test_after_a_killed_client_the_next_call_goes_on(
     after = {path.name: path.stat().st_mtime_ns for path in rows.glob("*.json")}
     assert before.items() <= after.items(), "what was there was not computed again"
     assert len(after) == 2 * RECORDINGS
-    fleet(pattern, out="undisturbed", store=str(tmp_path / "fresh"))
-    assert bits(tmp_path / "out") == bits(tmp_path / "undisturbed")
+    assert bits(tmp_path / "out") == undisturbed
+
+
+def test_recordings_and_store_on_s3(
+    fleet: Run, endpoint: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in KEYS.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": endpoint})
+    s3 = fsspec.filesystem("s3")
+    s3.mkdir("recordings")
+    s3.mkdir("store")
+    for path in sorted((folder / "arm0").glob("*.mcap"))[:3]:
+        s3.put_file(str(path), f"recordings/arm0/{path.name}")
+    s3.pipe_file("recordings/arm0/week9.mcap", b"no recording")
+    code, answer = fleet("s3://recordings/*/*.mcap", store="s3://store/factors")
+    assert code == 3
+    assert answer["recordings"] == 3
+    assert [one["url"] for one in answer["left_out"]] == ["s3://recordings/arm0/week9.mcap"]
+    assert len(s3.ls("store/factors/factors")) == 3
+    code, _ = fleet(*(f"{folder}/arm0/week{week}.mcap" for week in range(3)), out="local", store=str(tmp_path / "here"))
+    assert code == 0
+    there, here = (
+        json.loads((tmp_path / name / "arms" / "arm0" / "parameters.json").read_text())["base_parameters"]
+        for name in ("out", "local")
+    )
+    assert there == here

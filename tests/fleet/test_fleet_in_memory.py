@@ -1,0 +1,124 @@
+"""A fleet whose recordings and factors are in memory, and a scheduler that is not there."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import fsspec
+import pytest
+from distributed import LocalCluster
+from fsspec.implementations.memory import MemoryFileSystem
+from helpers.fleets import BEGIN, WEEK, kind, write_recording
+
+from ident_service.cli import main
+from ident_service.errors import Unavailable, UsageError
+from ident_service.fleet import reduction, storage
+
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    of, place = kind(rate=100.0, seconds=12.0), tmp_path_factory.mktemp("remote")
+    for week in range(COUNT):
+        write_recording(of, place / "arm0" / f"week{week}.mcap", of.truth, seed=week, at=BEGIN + week * WEEK)
+    return place
+
+
+@pytest.fixture(autouse=True)
+def known_systems() -> Iterator[None]:
+    storage._system.cache_clear()
+    yield
+    storage._system.cache_clear()
+
+
+def test_recordings_and_store_in_memory(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Workers are threads here, as memory is this process's own."""
+    monkeypatch.setattr(MemoryFileSystem, "store", {})
+    memory = fsspec.filesystem("memory")
+    for path in sorted(folder.rglob("*.mcap")):
+        memory.pipe_file(f"/recordings/{path.relative_to(folder)}", path.read_bytes())
+    words = [
+        "fleet",
+        "identify",
+        "memory://recordings/*/*.mcap",
+        "--arm",
+        "planar2",
+        "--store",
+        "memory://store",
+        "--json",
+    ]
+    with LocalCluster(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0", silence_logs=50
+    ) as cluster:
+        assert main([*words, "--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "out")]) == 0
+    assert json.loads(capsys.readouterr().out)["recordings"] == COUNT
+    assert len(memory.find("/store/factors")) == COUNT
+
+
+def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction, "_CONNECT_S", 0.5)
+    request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler="tcp://127.0.0.1:9")
+    with (
+        pytest.raises(Unavailable, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"),
+        reduction.connected(request, lambda _: None),
+    ):
+        pass
+
+
+def test_a_missing_extra_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = importlib.util.find_spec
+
+    def without(name: str, package: str | None = None) -> object:
+        return None if name == "pyarrow" else found(name, package)
+
+    monkeypatch.setattr(importlib.util, "find_spec", without)
+    assert main(["fleet", "status", "--arm", "planar2", "--store", str(tmp_path)]) == 2
+    assert "pyarrow is not installed; pip install 'ident-service[fleet]'" in capsys.readouterr().err
+
+
+def test_the_status_of_an_empty_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "arms" / "one").mkdir(parents=True)
+    (tmp_path / "arms" / "one" / "1.mcap").write_bytes(b"x")
+    words = ["fleet", "status", f"{tmp_path}/arms/*/*.mcap", "--arm", "planar2", "--store", str(tmp_path / "store")]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("0 factors, 0.0 MiB")
+    assert "one: 0 of 1 recordings reduced" in said
+    assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("names", "words"), [("(", "no regular expression"), ("x", "has no group"), ("(?P<arm>Q)", "finds no arm in it")]
+)
+def test_names_that_find_nothing_are_refused(
+    names: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "1.mcap").write_bytes(b"x")
+    store = str(tmp_path / "store")
+    assert main(["fleet", "status", f"{tmp_path}/1.mcap", "--arm", "planar2", "--names", names, "--store", store]) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_dates_in_names_count_in_utc() -> None:
+    named = reduction._naming(r"(?P<arm>R\d+)_(?P<date>[\d-]+)\.mcap")
+    assert named("/weekly/R12_2026-01-01.mcap") == ("R12", BEGIN)
+    with pytest.raises(UsageError, match="is no date"):
+        named("/weekly/R12_2026-13-01.mcap")
+
+
+def test_a_folder_of_somebody_else_is_not_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("mine")
+    words = ["fleet", "identify", str(tmp_path), "--arm", "planar2", "--store", str(tmp_path / "store")]
+    assert main([*words, "--out", str(tmp_path / "mine")]) == 2
+    assert "holds what is no result of a fleet" in capsys.readouterr().err
+    assert (tmp_path / "mine" / "thesis.txt").read_text() == "mine"
