@@ -134,9 +134,9 @@ def _sent(
         _send(connection, stream, seen, tell)
         return dict(connection.ask("POST", f"{_UPLOADS}/{seen['id']}/complete", {}, patience=_CHECKING))
     except (UnknownId, AlreadyThere) as error:
-        if seen["id"] not in str(error):
-            raise
-        # An upload's id means nothing to whoever has a file.
+        if isinstance(error, UnknownId) and seen["id"] not in str(error):
+            raise  # the arm is gone
+        # An upload's id and pieces mean nothing to whoever has a file.
         why = "another program is uploading it; try again when that is done"
         if isinstance(error, UnknownId):
             why = "what had arrived was deleted at the daemon meanwhile; upload it again"

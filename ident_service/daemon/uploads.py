@@ -264,10 +264,11 @@ class Piece:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._begin = self._size = os.fstat(self._fd).st_size
             if offset != self._size:
-                raise AlreadyThere(f"{upload}: the next piece begins at byte {self._size}, not at {offset}")
+                name = seen.announced.name
+                raise AlreadyThere(f"{name}: the next piece begins at byte {self._size}, not at {offset}")
         except BlockingIOError:
             os.close(self._fd)
-            raise AlreadyThere(f"{upload}: another piece is being written") from None
+            raise AlreadyThere(f"{seen.announced.name}: another piece is being written") from None
         except BaseException:
             os.close(self._fd)
             raise
@@ -323,7 +324,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
     arm = known_arm(db, state, announced.arm)
     with Piece(state, upload, seen.received):  # locked, so that nobody else writes it
         if seen.received != announced.bytes:
-            raise AlreadyThere(f"{upload}: has {seen.received} of {announced.bytes} bytes; send the rest first")
+            raise AlreadyThere(f"{announced.name}: has {seen.received} of {announced.bytes} bytes; send the rest first")
         run = new_id(arm.name)
         with _deleted_if_wrong(folder), atomic_folder(state / RUNS / run) as built:
             write_atomically(built / _ARM, arm.config.model_dump_json(indent=1))

@@ -193,19 +193,19 @@ def test_bad_input_is_refused_with_a_reason(commissioned: Path, ident: Ident, tm
     whole = (torn / "parameters.json").read_text()
     (torn / "parameters.json").write_text(whole[: len(whole) // 2])
     cases = [
-        (torn, 1, "not what the manifest names"),
-        (torn / "parameters.json", 1, "not JSON"),
+        (torn, 2, "not what the manifest names"),
+        (torn / "parameters.json", 2, "not JSON"),
         (tmp_path / "nowhere", 2, "no such file"),
         (tmp_path, 2, r"no manifest.json in it"),
-        (table(tmp_path, "foreign.json", expressions=["Lzz9", "lx8", "fv7"]), 1, "no base parameter in common with"),
+        (table(tmp_path, "foreign.json", expressions=["Lzz9", "lx8", "fv7"]), 2, "no base parameter in common with"),
         (
             changed_file(accepted, "seven.json", arm={"joints": [f"j{k}" for k in range(7)]}),
-            1,
+            2,
             "an arm of 7 joints, but",
         ),
         (
             changed_file(accepted, "crooked.json", base_parameters={"covariance": [[0.0]]}),
-            1,
+            2,
             "13 expressions but 1 covariance",
         ),
     ]

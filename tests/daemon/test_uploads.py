@@ -174,7 +174,7 @@ def test_a_piece_has_eight_megabytes_and_one_writer(daemon: Asked) -> None:
     assert daemon.get(f"/api/v1/uploads/{upload}").json()["received"] == most
     with uploads.Piece(daemon.service.state, upload, most):
         refused = sent(daemon, upload, most, b"x")
-        assert (refused.status_code, "another piece" in refused.text) == (409, True)
+        assert (refused.status_code, '"mine.csv: another piece' in refused.text) == (409, True)
 
 
 def test_of_a_refused_piece_nothing_is_kept(daemon: Asked) -> None:

@@ -126,7 +126,7 @@ def test_what_no_body_has_goes_into_three_formats(
 def test_what_no_body_has_goes_into_no_other(
     unreal: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert code_of("export", unreal, "--format", f"csv,{name}", "--out", tmp_path / "out") == 1
+    assert code_of("export", unreal, "--format", f"csv,{name}", "--out", tmp_path / "out") == 2
     assert "these parameters are not feasible" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -138,7 +138,7 @@ def test_one_format_that_fails_leaves_no_file(run: Path, tmp_path: Path, monkeyp
     monkeypatch.setitem(formats.FORMATS, "c", fail)
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("stays")
-    assert code_of("export", run, "--out", tmp_path / "out") == 1
+    assert code_of("export", run, "--out", tmp_path / "out") == 2
     assert names_in(tmp_path / "out") == ["mine.txt"]
     assert names_in(tmp_path) == ["out"]
 
@@ -156,7 +156,7 @@ def test_a_torn_run_is_refused(run: Path, tmp_path: Path, capsys: pytest.Capture
     torn = tmp_path / "torn"
     shutil.copytree(run, torn)
     (torn / "parameters.json").write_text((torn / "parameters.json").read_text()[:-9])
-    assert code_of("export", torn, "--out", tmp_path / "out") == 1
+    assert code_of("export", torn, "--out", tmp_path / "out") == 2
     assert "not what the manifest names" in capsys.readouterr().err
     assert code_of("export", tmp_path / "nowhere", "--out", tmp_path / "out") == 2
     assert not (tmp_path / "out").exists()

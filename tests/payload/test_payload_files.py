@@ -182,11 +182,11 @@ def test_what_cannot_be_meant_is_refused(arms: Path, ident: Ident, tmp_path: Pat
     cases = [
         ((tmp_path / "nowhere", tooled), 2, "not a folder; give the folder of results of the arm without the load"),
         ((bare / "parameters.json", tooled), 2, "not a folder"),
-        ((torn, tooled), 1, "arm.json: not what the manifest names"),
+        ((torn, tooled), 2, "arm.json: not what the manifest names"),
         ((bare, bare / "identification.mcap"), 2, "the arm was identified from it; give a recording with the load"),
         ((bare, tooled, tooled), 2, "the same recording twice"),
         ((bare, tmp_path / "no.mcap"), 2, "no such file"),
-        ((bare, other), 1, "other.csv"),
+        ((bare, other), 2, "other.csv"),
     ]
     for words, wanted, reason in cases:
         code, text, err = ident("payload", *words, "--out", out)
