@@ -203,14 +203,17 @@ def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
         files: EDS or DCF files, for the drives one after the other; none for the arm as it is.
 
     Raises:
-        UsageError: one cannot be read, or the drives are not CANopen's.
+        UsageError: one cannot be read, or is no data sheet, or the drives are not CANopen's.
     """
     if not files:
         return config
     if not isinstance(config.driver, CanopenDriver):
         raise UsageError(f"{config.name}: the driver is not CANopen's, so that no data sheet describes its drives")
-    driver = config.driver
-    emulation = driver.emulation.model_copy(update={"eds": tuple(map(sheet_file, files))})
+    driver, sheets = config.driver, tuple(map(sheet_file, files))
+    for sheet in sheets:
+        if why := data_sheet(sheet.text).mistake:
+            raise UsageError(f"{sheet.name}: not an EDS: {why}")
+    emulation = driver.emulation.model_copy(update={"eds": sheets})
     return config.model_copy(update={"driver": driver.model_copy(update={"emulation": emulation})})
 
 
