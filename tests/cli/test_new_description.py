@@ -231,7 +231,7 @@ def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
     [
         ("no xml", 2, "not a URDF that can be read"),
         ('<robot name="x"><link name="a"/></robot>', 2, "no movable joint"),
-        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 2, "2 links have no parent joint"),
+        ('<robot name="x"><link name="a"/><link name="b"/></robot>', 2, "2 links hang on no joint"),
     ],
 )
 def test_a_file_that_holds_no_arm_leaves_nothing(

@@ -102,12 +102,12 @@ def test_a_header_that_turns_otherwise_is_refused(monkeypatch: pytest.MonkeyPatc
 def test_what_has_no_state_says_so_and_tables_have_the_ways() -> None:
     arm = with_ways("planar2")
     made = {one.format: one for one in export_texts(arm, ["urdf", "mjcf", "sdf", "json", "csv", "c"])}
-    way = "pre-sliding of dry friction (way: shoulder 0.01 rad): here it turns round at once"
+    way = "pre-sliding of dry friction (distance: shoulder 0.01 rad): here it reverses at once"
     for name in ("urdf", "mjcf", "sdf"):
         (said,) = [one for one in made[name].not_carried if one.startswith("pre-sliding")]
         assert said.startswith(way)
         assert "the torque errors of the report are with pre-sliding" in said
-        assert "pre-sliding of dry friction (way: shoulder 0.01 rad)" in made[name].text
+        assert "pre-sliding of dry friction (distance: shoulder 0.01 rad)" in made[name].text
     assert not [one for name in ("json", "csv", "c") for one in made[name].not_carried if "pre-sliding" in one]
     assert "planar2_friction are without pre-sliding" in made["c"].notes[0]
     assert json.loads(made["json"].text)["friction"]["presliding"] == [0.01, 0.0]

@@ -147,7 +147,7 @@ def test_values_before_the_constraints_stand_beside_their_deviations() -> None:
     assert [float(row["unconstrained_value"]) for row in rows] == free.tolist()
     content = json.loads(json_export(arm, "ARM.json"))
     assert content["base_parameters"]["unconstrained_values"] == free.tolist()
-    said = "standard deviations are of the unconstrained fit; values are held in the set pseudo_inertia"
+    said = "standard deviations are of the unconstrained fit; values are constrained to the set pseudo_inertia"
     assert said in content["notes"]
     (exported,) = export_texts(arm, ["c"])
     assert f" * Mind: {said}.\n" in exported.text

@@ -92,7 +92,7 @@ def test_a_latched_fault_stands_in_the_way(state: State, wanted: State) -> None:
 
 def test_a_fault_is_acknowledged_by_its_name_and_no_other() -> None:
     latch = ActiveFaults()
-    with pytest.raises(UsageError, match="latched: none"):
+    with pytest.raises(UsageError, match="active: none"):
         latch.acknowledge("runaway")
     latch.set("runaway", "elbow: fast", 5)
     latch.set("runaway", "elbow: faster", 9)

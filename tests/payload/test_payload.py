@@ -134,7 +134,7 @@ def test_no_payload_is_not_said_where_much_is_left_unexplained() -> None:
     assert loud.excess[1] == pytest.approx(18.0, rel=0.1)
     text = payload_text(loud, arm)
     assert "moves as it was identified" not in text
-    assert f"what is left is 18 times as large at joint {ARM.chain.names[1]} as when the arm was identified" in text
+    assert f"the residual is 18 times as large at joint {ARM.chain.names[1]} as when the arm was identified" in text
 
 
 def test_a_residual_that_does_not_matter_beside_the_torque_is_no_change() -> None:

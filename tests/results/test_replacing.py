@@ -123,7 +123,7 @@ def test_what_is_no_earlier_result_is_refused_and_stays(
     folder = result(tmp_path / "out", parameters_json="old", identified_urdf="old")
     spoil(folder)
     before = {path.name: path.lstat().st_mtime_ns for path in folder.iterdir()}
-    with pytest.raises(UsageError, match=f"{named}.*give a folder that does not exist, or move that elsewhere"):
+    with pytest.raises(UsageError, match=f"{named}.*give a folder that does not exist, or move them elsewhere"):
         write(folder, parameters_json="new")
     assert {path.name: path.lstat().st_mtime_ns for path in folder.iterdir()} == before
 

@@ -97,7 +97,7 @@ def test_a_fault_that_finds_no_room_is_stored_in_the_mark(folder: Path) -> None:
     assert faults.latched() == {"recorder_behind": f"{cause[:300]}..."}
     with (
         ControlFile.take(folder / CONTROLS, None),
-        pytest.raises(MotionRefused, match="edged: recorder_behind"),
+        pytest.raises(MotionRefused, match="unacknowledged faults: recorder_behind"),
     ):
         faults.began(Path("runs/8"))
     assert faults.acknowledge("recorder_behind") == f"{cause[:300]}..."

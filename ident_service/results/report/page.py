@@ -151,7 +151,10 @@ def _tightest(conditions: list[Condition]) -> list[Cell]:
 def friction_table(evidence: Evidence, parameters: ParameterFile) -> str:
     """Return a table, per joint, of the friction curve's shape parameters; empty where there are none."""
     found = parameters.content.get("friction", {})
-    kinds = (("pre-sliding way", "presliding", "rad", "m"), ("Stribeck velocity", "stribeck_velocity", "rad/s", "m/s"))
+    kinds = (
+        ("pre-sliding distance", "presliding", "rad", "m"),
+        ("Stribeck velocity", "stribeck_velocity", "rad/s", "m/s"),
+    )
     shown = [(*kind, found[kind[1]]) for kind in kinds if any(found.get(kind[1], []))]
     if not shown or any(len(values) != len(evidence.joints) for *_, values in shown):
         return ""
