@@ -24,9 +24,7 @@ from ident_service.errors import ConfigError, DriverError, Problem, UsageError
 
 _ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
-_ANOTHER_UNIT = (
-    30.0  # times between a joint's torque limit and what its motors give: no choice of a limit is so far off
-)
+_ANOTHER_UNIT = 100.0  # times between a joint's torque limit and what its motors give: no choice is so far off
 _POSITION_RATES = 100.0, 500.0  # Hz; slower the guard sees too little, faster a torque path is what a drive has
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
 # Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.

@@ -45,7 +45,7 @@ def test_every_command_of_the_page_is_one(tmp_path: Path) -> None:
 def test_the_pages_pendulum_is_commissioned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arm, state, run = bench(tmp_path), ["--state", str(tmp_path / "state")], tmp_path / "run"
     assert main(["bus", "probe", str(arm), "--eds", str(tmp_path / "drive.eds"), *state]) == 0
-    assert "can be driven, foretold by its data sheet" in capsys.readouterr().out
+    assert "can be driven, predicted from its EDS" in capsys.readouterr().out
     assert main(["config", "check", str(arm)]) == 0
     assert main(["preflight", str(arm), "--home", "--confirm", "bench", *state]) == 0, capsys.readouterr().out
     assert main(["preflight", str(arm), "--confirm", "bench", *state]) == 0, capsys.readouterr().out

@@ -63,7 +63,7 @@ def test_it_has_every_object_of_the_profile() -> None:
         assert set(subindices) <= set(od[index].subindices), hex(index)
     assert od[0x0003].data_type == datatypes.INTEGER16  # the dummy for foreign torques
     assert od[0x1400][1].default == 0x200 + NODE
-    assert od[0x6502].default == 1 << 9
+    assert od[0x6502].default == 1 << 9 | 1 << 7
 
 
 def test_its_lists_name_its_sections() -> None:
