@@ -151,11 +151,10 @@ def _analysed(
     for arm, tree in reduced.trees.items():
         if tree.held is not None:
             prior = told.other_arms(arm)
+            one = submit(arm_fit, tree.single, method, shares.recordings)
             judged[arm] = (
-                submit(
-                    held_out_errors, tree.trained, tree.held, prior, told.scale, between(arm, tree.count), described
-                ),
-                submit(held_out_errors, tree.single, tree.held, prior, told.scale, shares.recordings, described),
+                submit(held_out_errors, training[arm], tree.held, prior, told.scale, described),
+                submit(held_out_errors, one, tree.held, prior, told.scale, described),
             )
     errors = {arm: (several.result(), single.result()) for arm, (several, single) in judged.items()}
     several, single = (

@@ -523,26 +523,20 @@ class HeldOut:
 
 @one_blas_thread()
 def held_out_errors(
-    trained: Merged,
-    unseen: Merged,
-    prior: tuple[Array, Array, Array],
-    scale: Array,
-    between: Array | None,
-    described: Described,
+    alone: ArmFit, unseen: Merged, prior: tuple[Array, Array, Array], scale: Array, described: Described
 ) -> tuple[float, float]:
     """Return the torque errors of an arm alone and pooled on recordings held out [percent].
 
     Args:
-        trained: information of the recordings that are fitted to.
-        unseen: of those that are held out.
+        alone: estimate from the recordings that are fitted to.
+        unseen: information of those that are held out.
         prior: mean, its covariance and T of the other arms, in units of `scale`.
         scale: D, shape (base,).
-        between: as of `arm_fit`.
         described: the arm.
     """
-    alone = arm_fit(trained, described.config.identification.method, between)
+    everything = unseen.everything
     errors = [
-        torque_error(unseen.everything, constrained(fit, described)).relative_percent
+        torque_error(everything, constrained(fit, described)).relative_percent
         for fit in (alone.fit, pooled_fit(alone, prior, scale))
     ]
     return errors[0], errors[1]

@@ -108,11 +108,11 @@ def fleet(cluster: LocalCluster, tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def bits(folder: Path) -> dict[str, str]:
-    """Everything that was found, but for the hour at which it was written down."""
+    """Everything that was found, but for when it was written down and by which commit of a checkout."""
     found = {"fleet.json": (folder / "fleet.json").read_text()}
     for path in sorted(folder.glob("arms/*/parameters.json")):
         content = json.loads(path.read_text())
-        del content["provenance"]["created"]
+        del content["provenance"]["created"], content["provenance"]["git"]
         found[str(path.relative_to(folder))] = json.dumps(content)
     found["table"] = (folder / "parameters.parquet").read_bytes().hex()
     return found

@@ -164,7 +164,7 @@ def test_pooling_helps_an_arm_with_one_short_recording(fleet: dict[str, list[Row
         DESCRIBED.groups,
     )
     short, unseen = merged(fleet["0"][0]), merged(fleet["0"][1])
-    alone, pooled = held_out_errors(short, unseen, told.other_arms("0"), told.scale, None, DESCRIBED)
+    alone, pooled = held_out_errors(arm_fit(short, "wls"), unseen, told.other_arms("0"), told.scale, DESCRIBED)
     # What noise leaves is in both; beyond it, most of the error is gone.
     left = arm_fit(unseen, "wls").error.relative_percent
     excess = [np.sqrt(max(error**2 - left**2, 0.0)) for error in (alone, pooled)]
