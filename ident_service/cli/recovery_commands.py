@@ -59,7 +59,7 @@ def _add_recovery(verbs: VerbList) -> None:
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
     add_lease(sub, confirm=False)
-    sub.set_defaults(zero=True, out=None, can_log=False)
+    sub.set_defaults(zero=True, out=None, can_log=False, dry_run=False)
     sub = verbs.add(
         "recover",
         _recover,

@@ -69,10 +69,7 @@ TABLE: dict[str, tuple[tuple[str, Sequence[str]], ...]] = {
     "feasible": (("feasible {}", PARAMETERS), ("feasible other.json --arm {}", ARMS)),
     "figures": (("figures {} --out out", FOLDERS),),
     "finish": (("finish {}", (*NAMES, "planar2")),),
-    "fleet identify": (
-        ("fleet identify {} --arm planar2 --out out", ("nowhere.csv",)),
-        ("fleet identify no.csv --arm {} --out out", ARMS),
-    ),
+    "fleet identify": (("fleet identify no.csv --arm {} --out out", ARMS),),
     "fleet status": (("fleet status {} --arm planar2 --store out", ("nowhere.csv",)),),
     "home": (("home {}", UNREAD),),
     "identify": (
