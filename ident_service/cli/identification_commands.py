@@ -276,6 +276,7 @@ def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
 
 def _fleet_identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
+    from ident_service.model.arm_model import arm_model
     from ident_service.registry.state_folder import new_run_folder
 
     request = _fleet_request(
@@ -288,8 +289,9 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.fleet.identify import identify_fleet
     from ident_service.fleet.results import fleet_text
 
-    name = load_arm(arguments.arm).name
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), name, "fleets")
+    config = load_arm(arguments.arm)
+    arm_model(config)  # what cannot be used is told before workers start
+    folder = arguments.out or new_run_folder(own_state_folder(arguments), config.name, "fleets")
     result = identify_fleet(request, folder, lambda line: tell(arguments, line))
     good = not result.document["left_out"] and not result.changed
     return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
