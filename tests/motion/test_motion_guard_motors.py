@@ -82,7 +82,7 @@ def test_the_sentence_names_the_motor() -> None:
     assert fault.code == "torque_saturated"
     wanted = motors(np.array([20.0, 14.0]))
     assert (np.abs(wanted) > MOST).tolist() == [False, True]
-    assert fault.message.startswith(f"motor 2: a torque of {wanted[1]:.4g} N m was asked for, the limit is 0.5: ")
+    assert fault.message.startswith(f"motor 2: a torque of {wanted[1]:.4g} N m was requested, the limit is 0.5: ")
 
 
 def test_a_joint_alone_is_told_as_before() -> None:
