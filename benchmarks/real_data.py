@@ -12,7 +12,7 @@ from time import process_time
 import numpy as np
 
 from benchmarks.harness import Row
-from ident_service.config.arm import Method, PriorPull
+from ident_service.config.arm import Method, PriorRegularisation
 from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ParameterError
@@ -63,7 +63,7 @@ def case_model(case: Case) -> ArmModel:
 def case_estimate(case: Case, method: Method | None, prior: str = "none", model: ArmModel | None = None) -> Estimate:
     """Identify a case, by the method that the recordings choose when None."""
     model = model or case_model(case)
-    pull = PriorPull(kind=prior)  # type: ignore[arg-type]  # a literal by the callers below
+    pull = PriorRegularisation(kind=prior)  # type: ignore[arg-type]  # a literal by the callers below
     options = model.config.identification.model_copy(update={"prior": pull})
     model = replace(model, config=model.config.model_copy(update={"identification": options}))
     config = model.config

@@ -401,7 +401,7 @@ def _number_entry(coefficients: Mapping[str, Fraction | int], constant: Fraction
     return Affine({name: Fraction(c) for name, c in coefficients.items() if c}, Fraction(constant))
 
 
-def _says(text: str, value: Fraction) -> bool:
+def _is_shortened_form_of(text: str, value: Fraction) -> bool:
     """Tell if a name's number, which is shortened, is this one."""
     try:
         return f"{float(value):g}" == text
@@ -413,7 +413,9 @@ def _mass(words: Mapping[str, str], entries: Entries, _: Sequence[int]) -> list[
     if len(entries) != 2:
         return None
     name, lower, upper = f"m{words['link']}", -entries[0].constant, entries[1].constant
-    if not (lower < upper and _says(words["lower"], lower) and _says(words["upper"], upper)):
+    if not (
+        lower < upper and _is_shortened_form_of(words["lower"], lower) and _is_shortened_form_of(words["upper"], upper)
+    ):
         return None
     return [_number_entry({name: 1}, -lower), _number_entry({name: -1}, upper)]
 
@@ -421,7 +423,7 @@ def _mass(words: Mapping[str, str], entries: Entries, _: Sequence[int]) -> list[
 def _total_mass(words: Mapping[str, str], entries: Entries, links: Sequence[int]) -> list[Affine] | None:
     sign = 1 if words["side"] == "least" else -1
     bound = -sign * entries[0].constant
-    if not (bound > 0 and _says(words["bound"], bound)):
+    if not (bound > 0 and _is_shortened_form_of(words["bound"], bound)):
         return None
     return [_number_entry(dict.fromkeys((f"m{link}" for link in links), sign), -sign * bound)]
 
@@ -473,9 +475,9 @@ def _sign(words: Mapping[str, str], _: Entries, __: Sequence[int]) -> list[Affin
     return [_number_entry({f"{_POSITIVE[words['term']]}{words['link']}": 1})]
 
 
-def _assumed(words: Mapping[str, str], entries: Entries, _: Sequence[int]) -> list[Affine] | None:
+def _assumed_bound_form(words: Mapping[str, str], entries: Entries, _: Sequence[int]) -> list[Affine] | None:
     bound, link = entries[0].constant, words["link"]
-    if not (bound >= _LEAST_ASSUMED and _says(words["bound"], bound)):
+    if not (bound >= _LEAST_ASSUMED and _is_shortened_form_of(words["bound"], bound)):
         return None
     return [
         _number_entry({f"m{link}": -1}, bound),
@@ -500,7 +502,7 @@ _FORMS: tuple[tuple[str, Form], ...] = (
     (rf"link {_LINK}: centre of mass inside its hull", _hull),
     (rf"link {_LINK}: all mass inside its ellipsoid", _ellipsoid),
     (rf"joint {_LINK}: (?P<term>{'|'.join(_POSITIVE)}) positive", _sign),
-    (rf"assumed: link {_LINK} below (?P<bound>{_G}) kg and (?P=bound) kg m\^2", _assumed),
+    (rf"assumed: link {_LINK} below (?P<bound>{_G}) kg and (?P=bound) kg m\^2", _assumed_bound_form),
 )
 _EQUALITY_FORMS: tuple[tuple[str, Form], ...] = (
     (rf"link {_LINK}: symmetric about its (?P<plane>xy|yz|xz) plane", _symmetry),
@@ -913,7 +915,7 @@ def _require_units(document: dict[str, object], arm: Arm) -> None:
 def _require_expressions(claim: Claim, arm: Arm) -> None:
     left = list(arm.K)
     for number, row in enumerate(claim.K, 1):
-        same = [other for other in left if _same_row(row, other)]
+        same = [other for other in left if _rows_agree(row, other)]
         if not same:
             raise VerificationError(
                 f"expression {number} is no base parameter of {arm.name}; `ident base-parameters` prints them"
@@ -924,7 +926,7 @@ def _require_expressions(claim: Claim, arm: Arm) -> None:
         raise VerificationError(f"a base parameter of {arm.name} is missing: {str(terms)[:200]}")
 
 
-def _same_row(a: Row, b: Row) -> bool:
+def _rows_agree(a: Row, b: Row) -> bool:
     return a.keys() == b.keys() and all(abs(a[name] - b[name]) <= _EXPRESSION_TOLERANCE for name in a)
 
 

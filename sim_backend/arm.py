@@ -142,10 +142,19 @@ class SimulatedArm(Arm):
         reading = machine.cycle(command)
         if self.observer is not None:
             self.observer(machine.truth(stamp_ns))
-        shown_ns = self._schedule.shown_ns(machine.faults)
+        sample_stamp_ns = self._schedule.sample_stamp_ns(machine.faults)
         r = reading
         return Sample(
-            cycle, shown_ns, r.position, None, r.torque, r.valid, r.age, r.lost, r.status, status_age=r.status_age
+            cycle,
+            sample_stamp_ns,
+            r.position,
+            None,
+            r.torque,
+            r.valid,
+            r.age,
+            r.lost,
+            r.status,
+            status_age=r.status_age,
         )
 
     def stop(self, kind: StopKind) -> None:

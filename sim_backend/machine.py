@@ -76,7 +76,7 @@ class Schedule:
             self.stamp_ns += max(0, self._clock.now_ns() - self.stamp_ns) // self._period_ns * self._period_ns
         return self.stamp_ns
 
-    def shown_ns(self, faults: Sequence[Fault]) -> int:
+    def sample_stamp_ns(self, faults: Sequence[Fault]) -> int:
         """Return the stamp that a sample gives for the present cycle [ns]."""
         jumps = [fault.size for fault in active_faults(faults, self.tick) if fault.kind is FaultKind.CLOCK_JUMP]
         return self.stamp_ns + round(sum(jumps) * 1e9)
@@ -158,7 +158,7 @@ class Drives:
         self._forget()
 
     @property
-    def gave_up(self) -> bool:
+    def watchdog_expired(self) -> bool:
         """Return whether the watchdog's time has passed without a frame."""
         return self._silent >= self._watchdog
 
@@ -415,9 +415,9 @@ class SimulatedHardware:
         return self._drives.on
 
     @property
-    def gave_up(self) -> bool:
+    def watchdog_expired(self) -> bool:
         """Return whether the drives have received no torque frame for their watchdog's time."""
-        return self._drives.gave_up
+        return self._drives.watchdog_expired
 
     @property
     def torque(self) -> Vector:
@@ -494,13 +494,15 @@ class SimulatedHardware:
             DriverError: the plant ran away; it stays where it was.
         """
         if not self.supported:
-            self.plant.brake(self.stand.damping if self.stand and self._on_stand(self.stand) else self._drives.damping)
+            self.plant.brake(
+                self.stand.damping if self.stand and self._has_sunk_onto_support(self.stand) else self._drives.damping
+            )
             self.plant.step(self._drives.output())
 
-    def _on_stand(self, stand: Stand) -> bool:
+    def _has_sunk_onto_support(self, stand: Stand) -> bool:
         """Return whether an arm that lost its power near its stand has sunk onto it."""
         sunk = float(np.abs(self.plant.position - self._found).max())
-        if self.enabled and not self.gave_up:
+        if self.enabled and not self.watchdog_expired:
             self._near = sunk < _STAND_REACH * stand.sinking
             return False
         return self._near and sunk > stand.sinking

@@ -188,8 +188,8 @@ class PlantProcess:
             while self._client is not None or self._lifeline is not None:
                 self._turn()
                 if self._lock_step or self._lifeline is None:
-                    self._settle()
-            self._settle()
+                    self._simulate_until_rest()
+            self._simulate_until_rest()
         finally:
             self._story.end()
             for sock in (self._client, self._listener, *self._strangers):
@@ -200,14 +200,14 @@ class PlantProcess:
         """Wait for an event and handle it: frames of the client first, then newcomers, then time."""
         sources: list[Any] = [self._listener, *self._strangers]
         sources += [source for source in (self._client, self._lifeline) if source is not None]
-        readable, _, _ = select.select(sources, [], [], self._patience())
+        readable, _, _ = select.select(sources, [], [], self._poll_timeout())
         if self._client is not None and self._client in readable:
             self._serve()
         if self._lifeline is not None and self._lifeline in readable and not os.read(self._lifeline, 4096):
             self._lifeline = None
         for stranger in [sock for sock in self._strangers if sock in readable]:
             self._strangers.remove(stranger)
-            self._meet(stranger)
+            self._accept_client(stranger)
         if self._listener in readable:
             with suppress(OSError):  # the connecting process may be gone already
                 self._strangers.append(self._listener.accept()[0])
@@ -224,13 +224,13 @@ class PlantProcess:
     def _moves_by_clock(self) -> bool:
         return not self._lock_step and (self._client is not None or self._story.state is PlantState.SETTLING)
 
-    def _patience(self) -> float | None:
+    def _poll_timeout(self) -> float | None:
         """Return how long to wait for events [s]; None for ever."""
         if not self._moves_by_clock():
             return None
         return max(0, self._next_ns + self._period_ns - time.monotonic_ns()) * 1e-9
 
-    def _meet(self, stranger: socket.socket) -> None:
+    def _accept_client(self, stranger: socket.socket) -> None:
         """Accept a newcomer as the client, or send it the reason of the refusal."""
         try:
             number, hello = wire.decode_request(stranger.recv(wire.MAX_BYTES), self._joints)
@@ -334,7 +334,7 @@ class PlantProcess:
         self._advance(silent=True)
         machine = self._machine
         slow = bool((np.abs(machine.plant.velocity) <= REST_SPEED).all())
-        self._quiet = self._quiet + 1 if slow and machine.gave_up else 0
+        self._quiet = self._quiet + 1 if slow and machine.watchdog_expired else 0
         if self._story.state is not PlantState.SETTLING:
             return
         self._abandoned += 1
@@ -345,7 +345,7 @@ class PlantProcess:
         elif self._abandoned * self._period >= PATIENCE:
             self._story.become(PlantState.STILL_MOVING)
 
-    def _settle(self) -> None:
+    def _simulate_until_rest(self) -> None:
         """Let an abandoned arm come to rest, as fast as it can be computed."""
         while self._client is None and self._story.state is PlantState.SETTLING:
             self._silent_period()

@@ -275,7 +275,7 @@ class RemoteArm(Arm):
             self.observer(self.truth)
         return Sample(
             cycle,
-            self._schedule.shown_ns(self.faults),
+            self._schedule.sample_stamp_ns(self.faults),
             reply.position,
             None,
             reply.torque,
@@ -297,7 +297,7 @@ class RemoteArm(Arm):
     def close(self) -> None:
         """Take the torque off and release the arm; the plant lives on for the next `open`, until this object ends."""
         self.stop(StopKind.TORQUE_OFF)
-        self._hang_up()
+        self._disconnect()
 
     def end_plant(self) -> None:
         """Close, and end the plant process, if this arm started it, once the arm is at rest."""
@@ -325,13 +325,13 @@ class RemoteArm(Arm):
             return False
         self._socket = sock
         try:
-            self._welcome(sock)
+            self._request_access(sock)
         except BaseException:
-            self._hang_up()
+            self._disconnect()
             raise
         return True
 
-    def _welcome(self, sock: socket.socket) -> None:
+    def _request_access(self, sock: socket.socket) -> None:
         _, uid, _ = struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
         if uid != os.getuid():  # any user's process may listen on an abstract address
             raise DriverError(_REFUSALS[wire.OTHER_USER])
@@ -374,7 +374,7 @@ class RemoteArm(Arm):
             raise DriverError("the simulated arm is not open")
         return self._socket
 
-    def _hang_up(self) -> None:
+    def _disconnect(self) -> None:
         if self._socket is not None:
             self._socket.close()
             self._socket = None

@@ -35,7 +35,7 @@ from drivers.barrett.protocol import (
     SafetyMode,
     Status,
     address_of,
-    answer_of,
+    decoded,
     get,
     pendant_of,
     pendant_value,
@@ -200,7 +200,7 @@ class PuckCodec:
             return
         if frame.extended or frame.remote:
             return
-        answer = answer_of(frame)
+        answer = decoded(frame)
         if isinstance(answer, Position):
             self._on_position(answer)
         elif isinstance(answer, Reply):
@@ -402,7 +402,7 @@ class PuckBus:
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
         while (frame := self.link.receive(until_ns)) is not None:
             self.codec.receive(frame)
-            answer = answer_of(frame)
+            answer = decoded(frame)
             if isinstance(answer, Reply) and (answer.node, answer.number) == (safety.node, question.data[0]):
                 break
         else:

@@ -295,7 +295,7 @@ def request_of(data: bytes) -> Request | None:
     return None
 
 
-def answer_of(frame: Frame) -> Reply | Position | None:
+def decoded(frame: Frame) -> Reply | Position | None:
     """Return what a puck answers with a frame; None for any other frame."""
     if frame.error or frame.remote or frame.extended:
         return None

@@ -39,7 +39,7 @@ from drivers.barrett.protocol import (
     SafetyMode,
     Status,
     address_of,
-    answer_of,
+    decoded,
     get,
     put,
 )
@@ -82,7 +82,7 @@ class PropertyPort:
             self.link.send(get(node, number))
             until_ns = self.clock.now_ns() + round(timeout * 1e9)
             while (frame := self.link.receive(until_ns)) is not None:
-                answer = answer_of(frame)
+                answer = decoded(frame)
                 if isinstance(answer, Reply) and (answer.node, answer.number) == (node, number):
                     return answer.value
         return None
@@ -111,7 +111,7 @@ class PropertyPort:
         wanted, found = set(nodes), dict[int, int]()
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
         while wanted - set(found) and (frame := self.link.receive(until_ns)) is not None:
-            if isinstance(answer := answer_of(frame), Position) and answer.node in wanted:
+            if isinstance(answer := decoded(frame), Position) and answer.node in wanted:
                 found[answer.node] = answer.counts
         return found
 

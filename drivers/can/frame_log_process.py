@@ -127,7 +127,7 @@ def _serve(source: socket.socket) -> int:
     try:
         request = json.loads(source.recv(65536))
         log = OrderedLog(Path(request["path"]), request["utc_offset_ns"])
-        _say(source, {"error": ""})
+        _send_answer(source, {"error": ""})
         while packet := source.recv(MAX_PACKET_BYTES + 1):
             frames = unpack_frames(packet[1:])
             taken += len(frames)
@@ -146,11 +146,11 @@ def _serve(source: socket.socket) -> int:
         except OSError as found:
             error = error or found.strerror or str(found)
     written = 0 if log is None else log.written
-    _say(source, {"error": error, "written": written, "lost": taken - written})
+    _send_answer(source, {"error": error, "written": written, "lost": taken - written})
     return 1 if error else 0
 
 
-def _say(source: socket.socket, answer: dict[str, object]) -> None:
+def _send_answer(source: socket.socket, answer: dict[str, object]) -> None:
     with suppress(OSError):  # the session's process may be gone
         source.send(json.dumps(answer).encode())
 

@@ -305,9 +305,9 @@ class MonitoringArm(Arm):
 
     def _objects(self, number: int) -> Objects:
         bus, node = self._places[number]
-        return Objects(self._links[bus], node, self._hear_on(bus))
+        return Objects(self._links[bus], node, self._frame_handler_of(bus))
 
-    def _hear_on(self, bus: int) -> Callable[[Frame], None]:
+    def _frame_handler_of(self, bus: int) -> Callable[[Frame], None]:
         return lambda frame: self._heard.take(bus, frame)
 
     def _wait(self) -> int:

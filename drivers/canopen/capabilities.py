@@ -48,7 +48,7 @@ def family_of(identity: Mapping[str, int], own: Sequence[Family] = ()) -> Family
     return found[0].over(generic) if found else generic
 
 
-def entry_of(text: str, name: str, unit: str = "") -> Entry:
+def parse_entry(text: str, name: str, unit: str = "") -> Entry:
     """Return an entry that a family names, such as `6071:0/i16`."""
     where, kind = text.split("/")
     index, sub = where.split(":")
@@ -265,9 +265,9 @@ def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
     texts += [family.brake] if family.brake else []
     texts += [family.position.target] if family.position else []
     entries = [*(entry for entry, _ in (*_INDISPENSABLE, *_OPTIONAL)), *_OTHERS]
-    entries += [entry_of(text, "entry of its family") for text in texts]
+    entries += [parse_entry(text, "entry of its family") for text in texts]
     if (mine := drive.watchdog_entry) is not None:
-        entries.append(entry_of(f"{mine.index:04X}:{mine.sub:X}/{mine.type}", "watchdog"))
+        entries.append(parse_entry(f"{mine.index:04X}:{mine.sub:X}/{mine.type}", "watchdog"))
     return {entry.key: entry for entry in reversed(entries)}
 
 
@@ -316,7 +316,7 @@ def assess(
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
     notes += _other_limits(family, found, drive, limit)
-    speeds = [entry_of(text, "largest speed", "turns per minute") for text in family.speed_limit]
+    speeds = [parse_entry(text, "largest speed", "turns per minute") for text in family.speed_limit]
     speed = next((entry for entry in speeds if found.has(entry)), None)
     if speed is None:
         notes.append("no speed limit in the drive: only the host monitors it")
@@ -371,7 +371,7 @@ def where(entry: Entry) -> str:
 
 def named(text: str) -> str:
     """Return an entry of a family, given as text, as people write it."""
-    return where(entry_of(text, ""))
+    return where(parse_entry(text, ""))
 
 
 def _streams(path: TorquePath | PositionPath, found: DriveEntries) -> bool:
@@ -379,13 +379,13 @@ def _streams(path: TorquePath | PositionPath, found: DriveEntries) -> bool:
     needed = [path.target, *([path.slope] if path.slope else []), *([path.by.entry] if path.by else [])]
     modes = found.get(od.SUPPORTED_MODES)
     supported = path.supported is None or modes is None or bool(modes >> path.supported & 1)
-    return supported and all(found.has(entry_of(text, "")) for text in needed)
+    return supported and all(found.has(parse_entry(text, "")) for text in needed)
 
 
 def _no_torque(family: Family, found: DriveEntries) -> str:
     modes = found.get(od.SUPPORTED_MODES)
     said = "has no value" if modes is None else f"is {modes:X}h"
-    lacking = sorted({named(p.target) for p in family.torque if not found.has(entry_of(p.target, ""))})
+    lacking = sorted({named(p.target) for p in family.torque if not found.has(parse_entry(p.target, ""))})
     return f"no torque mode: 6502h {said}" + (f", {', '.join(lacking)} missing" if lacking else "")
 
 
@@ -398,7 +398,7 @@ def _no_position(found: DriveEntries) -> str:
 
 
 def _limits(limit: TorqueLimit, found: DriveEntries) -> bool:
-    return all(found.has(entry_of(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
+    return all(found.has(parse_entry(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
 
 
 def _other_limits(
@@ -407,7 +407,7 @@ def _other_limits(
     """Tell of further limits that are below the described torque: a drive keeps the lowest (Nanotec, 6071h)."""
     most = 1000.0 * drive.max_torque / drive.rated_torque
     for limit in family.torque_limit:
-        held = None if limit is chosen or limit.per else found.get(entry_of(limit.entry, ""))
+        held = None if limit is chosen or limit.per else found.get(parse_entry(limit.entry, ""))
         if held is not None and held < most:
             share = held * drive.rated_torque / 1000.0
             yield f"{named(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
@@ -421,7 +421,7 @@ def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | 
     factor = TORQUE_UNITS[unit.unit] * (drive.torque_constant or 1.0 if unit.unit == "mA" else 1.0)
     if unit.rated is None:
         return factor * (unit.count or 0.0)
-    held = found.get(entry_of(unit.rated, ""))
+    held = found.get(parse_entry(unit.rated, ""))
     return None if not held else held * factor * 1e-3
 
 
@@ -429,7 +429,7 @@ def _unit_problems(family: Family, found: DriveEntries, count: float | None) -> 
     unit = family.unit
     if unit is None or unit.writable or unit.rated is None or not found.asked:
         return
-    if count is None and not found.get(entry_of(unit.rated, "")):
+    if count is None and not found.get(parse_entry(unit.rated, "")):
         words = "is 0 or not there, so the value of a count is unknown: enter the motor data with the maker's tool"
         yield Problem(named(unit.rated), words)
 
@@ -472,7 +472,7 @@ def _watchdogs(family: Family, found: DriveEntries, drive: CanopenDrive) -> Iter
     if found.has(od.RPDO_DEADLINE):
         yield "rpdo_timer"
     mine = drive.watchdog_entry
-    theirs = family.watchdog and found.has(entry_of(family.watchdog.entry, ""))
+    theirs = family.watchdog and found.has(parse_entry(family.watchdog.entry, ""))
     own = mine is not None and mine.index << 8 | mine.sub in found.there
     if own if drive.watchdog == "vendor" else theirs:
         yield "vendor"

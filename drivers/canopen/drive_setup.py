@@ -18,7 +18,7 @@ import numpy as np
 
 from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, entry_of, where
+from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, parse_entry, where
 from drivers.canopen.cia402 import POWER_OFF, state_of
 from drivers.canopen.motor_units import count_limits, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
@@ -78,7 +78,7 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
             if write.entry.sub == od.RPDO_TYPE.sub and not pdo.sent and pdo.type == _AT_SYNC[0]:
                 _synchronous(objects, pdo, write)
             elif write.entry.sub == od.TPDO_INHIBIT.sub:
-                objects.ensure_if_there(write)
+                objects.write_if_present(write)
             else:
                 objects.ensure(write)
         try:
@@ -90,7 +90,7 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
             raise SdoRefused(f"{refused}; {words}", refused.code) from None
     for pdo in pdos:
         if not pdo.sent and not pdo.timer:
-            objects.ensure_if_there(
+            objects.write_if_present(
                 pdo.timing
             )  # a deadline left by another host could report a silence where there is none
 
@@ -287,7 +287,7 @@ class DriveConfiguration:
 
     def pdos(self) -> list[Pdo]:
         """Return the PDOs that the drive shall have; without a timer it reports its status at every n-th SYNC."""
-        target = entry_of(self.torque.target, "target position" if self.positions else "target torque", "counts")
+        target = parse_entry(self.torque.target, "target position" if self.positions else "target torque", "counts")
         found = []
         for pdo in self.profile.pdos(self.drive.node):
             own = tuple(target if slot in (od.TARGET_TORQUE, od.TARGET_POSITION) else slot for slot in pdo.slots)
@@ -387,31 +387,31 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     _max_speed(objects, setup)
     _deceleration(objects, setup)
     for write in setup.options():
-        objects.ensure_if_there(write)
+        objects.write_if_present(write)
     objects.ensure(setup.profile.heartbeat(setup.drive.node))
     # Supervision of the host comes last: from then on the host must be present.
     spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
     for write in setup.profile.watched(setup.drive.node):
-        (objects.ensure_if_there if write.entry in spare else objects.ensure)(write)
+        (objects.write_if_present if write.entry in spare else objects.ensure)(write)
     for write in setup.watchdog():
         objects.ensure(write)
     for write in setup.walls() + setup.interpolation() if setup.positions else ():
-        objects.ensure_if_there(write)  # here they count: a drive moves by them
+        objects.write_if_present(write)  # here they count: a drive moves by them
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):
-            objects.ensure_if_there(write)
+            objects.write_if_present(write)
     return _mode(objects, setup)
 
 
 def _timing(objects: Objects, setup: DriveConfiguration) -> None:
     """Configure SYNC without counter and window; 1019h is only written while 1006h is 0 (CiA 301, 7.5.2.22)."""
     for write in setup.profile.identifiers(setup.drive.node):
-        objects.ensure_if_there(write)
+        objects.write_if_present(write)
     counter = Write(od.SYNC_OVERFLOW, 0)
     if optional(objects.holds, counter) is False:
-        objects.ensure_if_there(Write(od.SYNC_PERIOD, 0))
+        objects.write_if_present(Write(od.SYNC_PERIOD, 0))
         objects.ensure(counter)
-    objects.ensure_if_there(Write(od.SYNC_WINDOW, 0))  # torques come just before the next SYNC
+    objects.write_if_present(Write(od.SYNC_WINDOW, 0))  # torques come just before the next SYNC
 
 
 def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
@@ -419,18 +419,18 @@ def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
     limit, value = setup.can.limit, setup.limit_counts
     assert limit is not None  # noqa: S101 - else it has been refused
     if limit.per is not None:
-        value = value * objects.read(entry_of(limit.per, "what the largest torque is per mille of")) // 1000
+        value = value * objects.read(parse_entry(limit.per, "what the largest torque is per mille of")) // 1000
     for text in (limit.entry, limit.negative):
         try:
             if text is not None:
-                objects.ensure(Write(entry_of(text, "largest torque"), value))
+                objects.ensure(Write(parse_entry(text, "largest torque"), value))
         except SdoRefused as refused:
             words = f"drives.max_torque is {setup.drive.max_torque:g} N m"
             raise SdoRefused(
                 f"{refused}; {words}, which the drive must be able to limit itself to", refused.code
             ) from None
     if setup.torque.slope is not None:  # mode 4 would turn a step into a ramp: the whole torque within 1 ms
-        objects.ensure(Write(entry_of(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
+        objects.ensure(Write(parse_entry(setup.torque.slope, "torque slope"), 1000 * setup.limit_counts))
 
 
 def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
@@ -447,7 +447,7 @@ def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
 
 
 def _mode_entry(text: str) -> Entry:
-    return entry_of(text, "mode of operation of the maker's")
+    return parse_entry(text, "mode of operation of the maker's")
 
 
 def disable_supervision(
@@ -478,7 +478,7 @@ def disable_supervision(
         optional(objects.write, Write(entry, 0))
     if zeros is not None and counts is not None:
         yield
-        zeros.keep_on(objects, number, counts, restarted)
+        zeros.restore_mark(objects, number, counts, restarted)
 
 
 def _encoder(objects: Objects, drive: CanopenDrive) -> None:
@@ -505,7 +505,7 @@ def _rated_torque(objects: Objects, setup: DriveConfiguration) -> None:
     unit, rated = setup.can.family.unit, setup.drive.rated_torque
     if unit is None or unit.rated is None or not unit.writable:
         return  # compared already
-    entry, size = entry_of(unit.rated, "rated torque"), TORQUE_UNITS[unit.unit]
+    entry, size = parse_entry(unit.rated, "rated torque"), TORQUE_UNITS[unit.unit]
     wanted = Write(entry, round(rated / size))
     if wanted.value < 1 or abs(wanted.value * size - rated) > _ROUNDING * rated:
         words = f"rated_torque {rated:g} N m is not whole {unit.unit}, which is what {where(entry)} holds"

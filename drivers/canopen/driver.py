@@ -104,7 +104,7 @@ class StopCommand:
         """
         return None if self.braking and self._untold else zero
 
-    def see_through(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
+    def wait_until_off(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
         """Cycle until the drives report that they are off, or have had their time; a lost command is sent again.
 
         Args:
@@ -440,7 +440,7 @@ class CanopenArm(Arm):
             buses.forget_modes()
             tell = self._names, self._driver.bring_up, now_ns, reports, option, buses.other_modes
             steps = EnableSequence(buses.drives, *tell)
-            self._through(buses, steps)
+            self._cycle_until_states(buses, steps)
         except BaseException:
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
             raise
@@ -456,7 +456,9 @@ class CanopenArm(Arm):
         buses = self._open()
         if self._enabled:
             raise DriverError("the arm is enabled; stop it before its faults are cleared")
-        self._through(buses, Resetting(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns()))
+        self._cycle_until_states(
+            buses, Resetting(buses.drives, self._names, self._driver.bring_up, self.clock.now_ns())
+        )
 
     def exchange(self, torque: Vector | None) -> Sample:
         """Exchange one cycle, as the contract says.
@@ -553,7 +555,7 @@ class CanopenArm(Arm):
     def _leave(self, buses: Buses) -> None:
         """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""
         zero = self._counts if self._streaming else None
-        self._stop.see_through(buses, zero, self._period_ns)
+        self._stop.wait_until_off(buses, zero, self._period_ns)
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
@@ -585,7 +587,7 @@ class CanopenArm(Arm):
         """Find the zero that the drives confirm, before they are configured, which may make them forget it."""
         if self._zeros is not None:
             held = [self._zeros.held(buses.objects(number), number) for number in range(len(buses.drives))]
-            self._coordinates = self._coordinates.zeroed(self._zeros.all_of(held), self._zeros.home)
+            self._coordinates = self._coordinates.zeroed(self._zeros.home_counts(held), self._zeros.home)
 
     def _configured(self, buses: Buses) -> Iterator[str]:
         """Identify and configure all drives one by one; yields the identity of each in words."""
@@ -600,7 +602,7 @@ class CanopenArm(Arm):
             buses.modes[number] = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
-                if not self._zeros.keep_on(objects, number, counts, buses.restarted(number)):
+                if not self._zeros.restore_mark(objects, number, counts, buses.restarted(number)):
                     raise PositionUnknown(self._zeros.lost([drive.node]))
                 identity += f", home at {counts} counts"  # a preflight ticket is for this zero
             yield identity
@@ -610,7 +612,7 @@ class CanopenArm(Arm):
         if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
             raise PositionUnknown(self._zeros.lost(restarted))
 
-    def _through(self, buses: Buses, steps: EnableSequence | Resetting) -> None:
+    def _cycle_until_states(self, buses: Buses, steps: EnableSequence | Resetting) -> None:
         """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
         stops, held = self._stops, False
         while not steps.done:

@@ -49,17 +49,17 @@ class ZeroingArm(MonitoringArm):
         zeros = Zeros(self._config)
         words = self._require_off()
         for number in range(len(self._places)):
-            zeros.require_kept(self._objects(number))
+            zeros.require_volatile_storage(self._objects(number))
         before = self._counts()
         self._heard.restarted.clear()
         self._pause()
         counts = self._counts()
         self._require_still(before, counts)
-        self._require_nobody_else()
+        self._require_no_other_host()
         try:
             self._set(zeros, counts)
         except BaseException as error:
-            left = self._taken_back(zeros)
+            left = self._delete_marks(zeros)
             end = f"; drives {', '.join(left)} could not be cleared: switch their power off and on" if left else ""
             if isinstance(error, DriverError):
                 raise DriverError(f"{error}; no drive has a zero now{end}") from None
@@ -80,7 +80,7 @@ class ZeroingArm(MonitoringArm):
         if restarted := self._heard.restarted.intersection(self._places):
             raise DriverError(f"drives {_nodes(restarted)} restarted meanwhile")
 
-    def _taken_back(self, zeros: Zeros) -> list[str]:
+    def _delete_marks(self, zeros: Zeros) -> list[str]:
         """Delete all marks; returns the nodes in which that failed."""
         left = []
         for number, (_, node) in enumerate(self._places):
@@ -107,7 +107,7 @@ class ZeroingArm(MonitoringArm):
                 f"support it, and keep it still within {STILL:g}"
             )
 
-    def _require_nobody_else(self) -> None:
+    def _require_no_other_host(self) -> None:
         self._heard.drain(self._links)
         self._require_alone()
         host = self._driver.heartbeats.node

@@ -139,7 +139,7 @@ class Objects:
         if not optional(self.holds, write):  # setting a missing entry raises the error
             self.set(write)
 
-    def ensure_if_there(self, write: Write) -> None:
+    def write_if_present(self, write: Write) -> None:
         """Do what `ensure` does, and nothing where the drive has no such entry."""
         if optional(self.holds, write) is False:
             self.set(write)

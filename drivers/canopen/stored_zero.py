@@ -79,7 +79,7 @@ class Zeros:
         objects.set(Write(od.ZERO_COUNTS, counts & 0xFFFF_FFFF))
         objects.set(Write(od.ZERO_MARK, self.mark(number, counts)))
 
-    def keep_on(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
+    def restore_mark(self, objects: Objects, number: int, counts: int, restarted: Callable[[], bool]) -> bool:
         """Store again the counts that a drive confirmed before it was configured, unless it has restarted since.
 
         Args:
@@ -105,7 +105,7 @@ class Zeros:
         """Delete the mark in a drive, so that it confirms nothing, and read it back; raises as `Objects.set`."""
         objects.set(Write(od.ZERO_MARK, 0))
 
-    def require_kept(self, objects: Objects) -> None:
+    def require_volatile_storage(self, objects: Objects) -> None:
         """Check that a drive can hold a zero, and loses it with its power.
 
         Raises:
@@ -130,7 +130,7 @@ class Zeros:
                 f"node {objects.node}: stores parameters by itself (1010h): its zero would outlive its count"
             )
 
-    def all_of(self, held: Sequence[int | None]) -> list[int]:
+    def home_counts(self, held: Sequence[int | None]) -> list[int]:
         """Return the counts at home of all drives.
 
         Args:

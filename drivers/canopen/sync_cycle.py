@@ -332,13 +332,13 @@ class Buses:
     def keep_alive(self) -> None:
         """Send the host's heartbeat at half of its period, so that a late one is not missed; poll guarded drives."""
         now_ns = self.clock.now_ns()
-        self._ask_guarded(now_ns)
+        self._send_node_guarding(now_ns)
         if now_ns >= self._heartbeat_ns and "heartbeat" not in self.withheld:
             self._heartbeat_ns = now_ns + self._heartbeat_period_ns
             for codec, link in self._pairs:
                 link.send(codec.heartbeat(NmtState.OPERATIONAL))
 
-    def _ask_guarded(self, now_ns: int) -> None:
+    def _send_node_guarding(self, now_ns: int) -> None:
         """Ask the guarded drive that has waited longest, where its time has come; in one cycle no more than one."""
         if not self._guards or "node_guarding" in self.withheld:
             return
@@ -421,7 +421,7 @@ class EnableSequence:
                 self._reported_ns[number] = now_ns
         fresh = all(drive.answered for drive in self._drives)
         self._seeded = self._seeded + 1 if fresh else 0
-        while not self.done and self._reached():
+        while not self.done and self._all_in_state():
             if self._target == 1 and not self._may_enable(now_ns):
                 break
             self._target += 1
@@ -464,7 +464,7 @@ class EnableSequence:
         soon = min(ages) > self._inhibit_ns and max(ages) < self._report_ns - self._inhibit_ns // 10
         return soon or now_ns - self._ready_ns > 3 * self._report_ns
 
-    def _reached(self) -> bool:
+    def _all_in_state(self) -> bool:
         return all(self._there(drive) for drive in self._drives)
 
     def _there(self, drive: Drive) -> bool:

@@ -34,7 +34,7 @@ from ident_service.cli.output import (
     VERDICT_NO,
     Answer,
     discard,
-    hear_interrupts,
+    enable_interrupts,
     print_answer,
     print_error,
     print_to_person,
@@ -84,7 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
     """
     words = sys.argv[1:] if argv is None else argv
-    hear_interrupts()
+    enable_interrupts()
     try:
         arguments = parser().parse_args(words)
         arguments.asked_ns = time.monotonic_ns()
@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print_error(UsageError.__name__, wrong.message, USAGE)
         raise
     try:
-        _own_packages_only()
+        _require_own_packages()
         verb: Callable[[argparse.Namespace], Answer] = (
             arguments.verb if arguments.server is None else remote.run_on_daemon
         )
@@ -170,9 +170,9 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFull(f"{place}: cannot be written: {error.strerror}; free disk space, then try again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        from ident_service.registry.state_folder import shut_out
+        from ident_service.registry.state_folder import access_refusal
 
-        hint = shut_out(state_folder(arguments))
+        hint = access_refusal(state_folder(arguments))
         return UsageError(f"{place}: {error.strerror}" + (f"; {hint}" if hint else ""))
     return None
 
@@ -190,7 +190,7 @@ def parser() -> Parser:
     return top
 
 
-def _own_packages_only() -> None:
+def _require_own_packages() -> None:
     """Refuse to run if `drivers` or `sim_backend`, common names, would come from the working directory."""
     home = Path(__file__).resolve().parents[2]
     for name in ("drivers", "sim_backend"):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ident_service.cli.arguments import Parser, VerbList, count
-from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
+from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 from ident_service.errors import IdentError, InUse, UsageError
 
 _LONGEST_NAME = 80
@@ -43,7 +43,7 @@ def terminal_user(arguments: argparse.Namespace) -> str:
     return f"terminal:{name}"
 
 
-def audit_act(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
+def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
     """Enter an act that was done at a terminal in the audit trail, where the state folder has one.
 
     It has been done already: a registry that is kept or full changes nothing, and the line is entered later.
@@ -56,7 +56,7 @@ def audit_act(arguments: argparse.Namespace, what: str, about: str, **detail: An
     """
     import sqlite3
 
-    from ident_service.registry.database import FILE, Database, enter_waiting, note, note_later, registry_error
+    from ident_service.registry.database import FILE, Database, note, note_later, registry_error, write_deferred_entries
 
     state = state_folder(arguments)
     try:
@@ -64,7 +64,7 @@ def audit_act(arguments: argparse.Namespace, what: str, about: str, **detail: An
             return
         try:
             with Database(state, busy=_PATIENCE) as db:
-                enter_waiting(db, state)
+                write_deferred_entries(db, state)
                 note(db, terminal_user(arguments), what, about, **detail)
         except sqlite3.Error as error:
             raise registry_error(state / FILE, error) from None
@@ -120,7 +120,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.state_folder import arm_folder
 
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     with Database(state) as db:
         act = accept(db, state, arguments.run.resolve(), arguments.note, terminal_user(arguments))
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
@@ -132,7 +132,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.state_folder import arm_folder
 
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     with Database(state) as db:
         act = rollback(db, state, arguments.arm, arguments.note, terminal_user(arguments), arguments.to)
     path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
@@ -145,7 +145,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.runs import RUNS
 
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     with Database(state) as db:
         row = import_run(db, state, arguments.run, terminal_user(arguments))
     folder = state / RUNS / row["id"]
@@ -164,7 +164,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.runs import rebuild_runs
 
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     with Database(state) as db:
         untold = rebuild_runs(db, state)
         gone = (
@@ -185,7 +185,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations import deletion
     from ident_service.registry.database import Database
 
-    kind, state = arguments.word.rpartition(" ")[2], own_state_folder(arguments)
+    kind, state = arguments.word.rpartition(" ")[2], writable_state_folder(arguments)
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
     with Database(state) as db, deleted_with_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
@@ -209,15 +209,15 @@ def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
 def _backup(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.backup import back_up
 
-    made = back_up(own_state_folder(arguments), arguments.file, recordings=not arguments.without_recordings)
-    audit_act(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
+    made = back_up(writable_state_folder(arguments), arguments.file, recordings=not arguments.without_recordings)
+    write_audit_entry(arguments, "backed up", "state folder", file=made.file, recordings=made.recordings)
     return DONE, f"{made.file}: {made.files} files, {made.bytes / 2**20:.1f} MiB\n", asdict(made)
 
 
 def _restore(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.backup import restore
 
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     done = restore(arguments.file, state, terminal_user(arguments), replace=arguments.replace)
     when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"

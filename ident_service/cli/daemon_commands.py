@@ -10,7 +10,7 @@ from typing import Any
 
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
-from ident_service.cli.output import DONE, Answer, own_state_folder, print_to_person, state_folder
+from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 
 _PORT = 8470
 
@@ -70,7 +70,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.tokens import add_token
 
-    with Database(own_state_folder(arguments)) as db:
+    with Database(writable_state_folder(arguments)) as db:
         secret = add_token(db, arguments.name, arguments.role, terminal_user(arguments))
     return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
 
@@ -79,7 +79,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.tokens import tokens
 
-    with Database(own_state_folder(arguments)) as db:
+    with Database(writable_state_folder(arguments)) as db:
         rows = tokens(db)
     return (
         DONE,
@@ -98,7 +98,7 @@ def _revoke(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.database import Database
     from ident_service.registry.tokens import revoke_token
 
-    with Database(own_state_folder(arguments)) as db:
+    with Database(writable_state_folder(arguments)) as db:
         revoke_token(db, arguments.name, terminal_user(arguments))
     return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, state_folder, tell
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
 
@@ -99,7 +99,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     config = described = load_arm(arguments.arm)
     if arguments.seed is not None and config.driver is not None:
         config = config.model_copy(update={"driver": config.driver.model_copy(update={"seed": arguments.seed})})
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), config.name)
+    folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name)
     stopping = StopOnSignal()
     with stopping:
         result = simulate(
@@ -131,7 +131,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
 
 
 @contextmanager
-def _few_collections() -> Iterator[None]:
+def _rare_garbage_collection() -> Iterator[None]:
     """Look for garbage hardly ever: modules make objects that stay, and looks at them are a twentieth of the time."""
     atexit.register(gc.freeze)  # nor when the process ends
     usual = gc.get_threshold()
@@ -142,7 +142,7 @@ def _few_collections() -> Iterator[None]:
         gc.set_threshold(*usual)
 
 
-@_few_collections()
+@_rare_garbage_collection()
 def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.operations.identification import Request, identify_files
@@ -168,7 +168,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         solver=arguments.solver,
         second_opinion=arguments.second_opinion,
     )
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name)
+    folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name)
     result = identify_files(request, folder, lambda line: tell(arguments, line))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
@@ -268,7 +268,7 @@ def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
         raise UsageError(f"{', '.join(missing)} is not installed; pip install 'ident-service[fleet]'")
     from ident_service.fleet.reduction import FleetRequest
 
-    store = arguments.store or str(own_state_folder(arguments) / "fleet" / "store")
+    store = arguments.store or str(writable_state_folder(arguments) / "fleet" / "store")
     return FleetRequest(
         arm=arguments.arm, patterns=tuple(arguments.patterns), store=store, names=arguments.names, **more
     )
@@ -291,7 +291,7 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
 
     config = load_arm(arguments.arm)
     arm_model(config)  # what cannot be used is told before workers start
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), config.name, "fleets")
+    folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name, "fleets")
     result = identify_fleet(request, folder, lambda line: tell(arguments, line))
     good = not result.document["left_out"] and not result.changed
     return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
@@ -374,7 +374,7 @@ def _payload(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.state_folder import new_run_folder
     from ident_service.results.comparison.presentation import comparison_text
 
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "payloads")
+    folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "payloads")
     found = payload_files(arguments.run, arguments.recordings, folder, refit_offsets=arguments.refit_offsets)
     text = found.text
     if found.comparison is not None:
@@ -519,7 +519,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.export.formats import export_run, known_formats
 
     formats = known_formats(arguments.format)
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), arguments.run.resolve().name, "exports")
+    folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "exports")
     made = export_run(arguments.run, formats, folder)
     lines, files = [f"files: {folder}"], []
     for export in made:

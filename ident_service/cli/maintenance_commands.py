@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import Parser, VerbList, count
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, own_state_folder, state_folder
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, state_folder, writable_state_folder
 
 if TYPE_CHECKING:
     from ident_service.registry.database import Database, Row
@@ -48,11 +48,11 @@ def add(verbs: VerbList) -> None:
     group = verbs.group("due", "due re-identifications")
     sub = group.add("list", _due, "list due re-identifications")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _remark(group.add("dismiss", _dismiss, "dismiss a due re-identification"))
+    _add_number_and_note(group.add("dismiss", _dismiss, "dismiss a due re-identification"))
     group = verbs.group("alarm", "drift alarms")
     sub = group.add("list", _alarms, "list open alarms (exit code 3: there are some)")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _remark(
+    _add_number_and_note(
         group.add(
             "acknowledge", _ack, "confirm that a person knows of it; the accepted set stays as it is", former="ack"
         )
@@ -64,7 +64,7 @@ def registry(arguments: argparse.Namespace) -> Database:
     from ident_service.registry.arms import know_shipped
     from ident_service.registry.database import Database
 
-    db = Database(own_state_folder(arguments))
+    db = Database(writable_state_folder(arguments))
     know_shipped(db)
     return db
 
@@ -73,7 +73,7 @@ def _arm(sub: Parser) -> None:
     sub.add_argument("arm", metavar="NAME", help="name of a shipped arm, or of one uploaded to a daemon")
 
 
-def _remark(sub: Parser) -> None:
+def _add_number_and_note(sub: Parser) -> None:
     sub.add_argument("number", type=count, metavar="NUMBER")
     sub.add_argument("--note", required=True, help="the reason, for people who read it years later")
     add_by(sub)

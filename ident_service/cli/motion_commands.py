@@ -20,7 +20,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.archive_commands import add_by, audit_act
+from ident_service.cli.archive_commands import add_by, write_audit_entry
 from ident_service.cli.arguments import Parser, VerbList, seconds, share, speed
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
@@ -30,9 +30,9 @@ from ident_service.cli.output import (
     Answer,
     StopOnSignal,
     interrupting,
-    own_state_folder,
     state_folder,
     tell,
+    writable_state_folder,
 )
 from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
 
@@ -158,7 +158,7 @@ def run_and_report(
     from ident_service.operations.motion_run import run_motion
     from ident_service.registry.state_folder import new_run_folder, ticket_path
 
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     path = ticket_path(state, config.name)
     if not path.exists():
         raise MotionRefused(f"{config.name}: no preflight ticket; run `ident preflight` first")
@@ -261,14 +261,14 @@ def _target_text(until: dict[str, Any]) -> str:
         for one in missed
     ]
     head = f"target of {until['share']:.2%}: missed by {len(missed)} parameters (deviation over the larger of size and"
-    return "\n".join([f"{head} reference)", *lines[:_MOST_MISSED], *_further(len(lines))]) + "\n"
+    return "\n".join([f"{head} reference)", *lines[:_MOST_MISSED], *_and_more(len(lines))]) + "\n"
 
 
-def _further(count: int) -> list[str]:
+def _and_more(count: int) -> list[str]:
     return [f"  and {count - _MOST_MISSED} more, in --json"] if count > _MOST_MISSED else []
 
 
-def _in_time(lateness: dict[str, Any]) -> str:
+def _punctuality_text(lateness: dict[str, Any]) -> str:
     late = int(lateness["late_or_lost"])
     return f"{100.0 * (1.0 - late / max(1, lateness['count'] + late)):.2f} % of the cycles in time, {late} late or lost"
 
@@ -286,7 +286,7 @@ def _report_text(report: dict[str, Any]) -> str:
     return (
         f"{ended}\n"
         f"woke late by below {lateness['median_below_us']:g} us (median), {lateness['p999_below_us']:g} us (99.9 %), "
-        f"at worst {lateness['worst_us']:.0f} us; {_in_time(lateness)}\n"
+        f"at worst {lateness['worst_us']:.0f} us; {_punctuality_text(lateness)}\n"
         f"computed for below {compute['median_below_us']:g} us (median), {compute['p999_below_us']:g} us (99.9 %), "
         f"at worst {compute['worst_us']:.0f} us\n"
         f"{frames}"
@@ -427,7 +427,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.home and arguments.motion is not None:
         raise UsageError("give a motion or --home, not both")
     motion = None if arguments.home else _chosen(config, arguments.motion)
-    state = own_state_folder(arguments)
+    state = writable_state_folder(arguments)
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
     require_writable(path.parent)
@@ -468,7 +468,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
     if arguments.json or not sys.stdin.isatty():
         raise UsageError("--scale needs a person at a terminal who turns each joint by hand")
-    found = check_scale(config, own_state_folder(arguments), lambda question: input(f"{question} "))
+    found = check_scale(config, writable_state_folder(arguments), lambda question: input(f"{question} "))
     lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]
     lines.append(f"kept in {FILE} of the arm's folder" if found else "no joint was turned")
     good = bool(found) and all(one.good for one in found)
@@ -562,13 +562,13 @@ def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer
 
 def _stop(arguments: argparse.Namespace) -> Answer:
     """Stop an arm, or all arms; print and note it in the audit trail only afterwards."""
-    from ident_service.registry.state_folder import shut_out
+    from ident_service.registry.state_folder import access_refusal
 
     os.umask(0o077)  # and no more: a stop is not refused for a folder that others can enter, or that is another's
     try:
         return _stopped(arguments, state_folder(arguments))
     except (UsageError, PermissionError):
-        if (refusal := shut_out(state_folder(arguments))) is None:
+        if (refusal := access_refusal(state_folder(arguments))) is None:
             raise
         raise UsageError(
             f"nothing was stopped: {refusal}; or stop through its daemon: ident stop --server URL"
@@ -578,20 +578,20 @@ def _stop(arguments: argparse.Namespace) -> Answer:
 def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
     from ident_service.motion.command_channel import ControlFile
     from ident_service.operations.moving_arms import stop_arms
-    from ident_service.registry.state_folder import control_path, known_arms, leave_to_owner
+    from ident_service.registry.state_folder import control_path, give_to_owner, known_arms
 
     if arguments.arm is None:
         reached = stop_arms(state, None)
         for name in known_arms(state):  # a file was made where there was none
-            leave_to_owner(state, control_path(state, name))
-        audit_act(arguments, "stop", "all arms", reached=reached)
+            give_to_owner(state, control_path(state, name))
+        write_audit_entry(arguments, "stop", "all arms", reached=reached)
         text = f"stop requested of {', '.join(reached)}" if reached else "no arm is moving"
         text += "; motions requested before now will not begin\n"
         return DONE, text, {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
-    leave_to_owner(state, path)
-    audit_act(arguments, "stop", name, reached=[] if pid is None else [name])
+    give_to_owner(state, path)
+    write_audit_entry(arguments, "stop", name, reached=[] if pid is None else [name])
     text = f"{name}: stop requested of process {pid}" if pid is not None else f"{name} is not moving"
     text += "" if pid is not None else "; motions requested before now will not begin"
     return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
@@ -608,16 +608,16 @@ def _ask(arguments: argparse.Namespace) -> Answer:
             arguments, name, "is lowered slowly" if held else "is released by its drives AT ONCE, if they hold it"
         )
         if not held:
-            return _let_go(arguments)
+            return _release_drives(arguments)
     with ControlFile.reach(path) as controls:
         if arguments.asks == "supported":
             controls.confirm_support()
         else:
             if arguments.asks == "finish":
-                controls.ask_finish()
-            controls.ask_pause(arguments.asks == "pause")
+                controls.request_finish()
+            controls.request_pause(arguments.asks == "pause")
         pid = controls.pid
-    audit_act(arguments, arguments.asks, name, reached=[name])
+    write_audit_entry(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {arguments.asks} requested of process {pid}\n", document
 
@@ -635,14 +635,14 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
         raise UsageError(f"confirm that the arm is supported by its name: --confirm {name}; nothing has changed")
 
 
-def _let_go(arguments: argparse.Namespace) -> Answer:
+def _release_drives(arguments: argparse.Namespace) -> Answer:
     """Switch off the drives that still hold an arm after the motion process has ended."""
     from ident_service.config.load import load_arm
     from ident_service.operations.recovery import release_held_drives
 
     config = load_arm(arguments.arm)
-    held = release_held_drives(config, own_state_folder(arguments))
-    audit_act(arguments, "supported", config.name, reached=[config.name])
+    held = release_held_drives(config, writable_state_folder(arguments))
+    write_audit_entry(arguments, "supported", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "supported", "let_go": list(held)}
     return DONE, f"{config.name}: drives released {', '.join(held)}\n", document
 
@@ -651,8 +651,8 @@ def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.state_folder import fault_file
 
     name = _name(arguments)
-    cause = fault_file(own_state_folder(arguments), name).acknowledge(arguments.fault)
-    audit_act(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
+    cause = fault_file(writable_state_folder(arguments), name).acknowledge(arguments.fault)
+    write_audit_entry(arguments, "fault acknowledged", name, code=arguments.fault, cause=cause)
     return DONE, f"{name}: acknowledged {arguments.fault} ({cause})\n", {"arm": name, "acknowledged": arguments.fault}
 
 

@@ -99,20 +99,20 @@ def state_folder(arguments: argparse.Namespace) -> Path:
     return (Path(base) if base else Path.home() / ".local" / "state") / "ident"
 
 
-def own_state_folder(arguments: argparse.Namespace) -> Path:
+def writable_state_folder(arguments: argparse.Namespace) -> Path:
     """Return the state folder for a verb that writes there, after checking that only its owner can enter it.
 
     Raises:
         UsageError: as `state_folder`; or others can enter it.
     """
-    from ident_service.registry.state_folder import keep_private
+    from ident_service.registry.state_folder import require_private
 
     state = state_folder(arguments)
-    keep_private(state)
+    require_private(state)
     return state
 
 
-def hear_interrupts() -> None:
+def enable_interrupts() -> None:
     """Make Ctrl-C interrupt this process although the shell that started it had SIGINT ignored.
 
     A shell without job control, that of a script for example, starts `command &` with SIGINT ignored (POSIX.1-2017,

@@ -11,7 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import Parser, VerbList, count, frequency, seconds, seed, share, weight, workers
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, own_state_folder, print_to_person, tell
+from ident_service.cli.output import (
+    DONE,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    print_to_person,
+    tell,
+    writable_state_folder,
+)
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
@@ -50,7 +58,7 @@ def _add_motions(verbs: VerbList) -> None:
     sub.add_argument("--postures", type=count, metavar="N", help="number of postures")
     sub.add_argument("--position-margin", type=weight, metavar="RAD", help="margin to every position limit")
     sub.add_argument("--torque-margin", type=share, metavar="SHARE", help="margin, as a share of every torque limit")
-    _know(sub)
+    _add_prior_data_options(sub)
     sub.add_argument("--seed", type=seed, default=0, help="seed of the random starts")
     searched = "time for the search, not the motion's length (default: 60, or none with --starts)"
     sub.add_argument("--search-time", type=seconds, metavar="SECONDS", help=searched)
@@ -65,11 +73,11 @@ def _add_motions(verbs: VerbList) -> None:
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
-    _know(sub)
+    _add_prior_data_options(sub)
     sub.add_argument("--out", type=Path, metavar="DIR", help="also write the text and the figures there")
 
 
-def _know(sub: Parser) -> None:
+def _add_prior_data_options(sub: Parser) -> None:
     sub.add_argument(
         "--model", type=Path, metavar="FILE", help="parameters.json to predict torques with, instead of the prior"
     )
@@ -115,7 +123,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         resume=arguments.resume,
         length=arguments.length,
     )
-    folder = arguments.out or new_run_folder(own_state_folder(arguments), load_arm(arguments.arm).name, "motions")
+    folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name, "motions")
     stopping = StopOnSignal()
     with stopping:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
@@ -275,7 +283,7 @@ def _bus_report(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.fieldbus import bus_report
     from ident_service.registry.state_folder import arm_folder, ticket_path
 
-    config, state = load_arm(arguments.arm), own_state_folder(arguments)
+    config, state = load_arm(arguments.arm), writable_state_folder(arguments)
     if arguments.run is not None and not (arguments.run / "can.log").is_file():
         raise UsageError(f"{arguments.run}: has no can.log; `ident run --can-log` makes one")
     named = f"report-{datetime.now(UTC):%Y%m%d-%H%M%S}.zip"
@@ -336,7 +344,7 @@ def _driver_test(arguments: argparse.Namespace) -> Answer:
             return str(arguments.confirm)
         return input(question) if sys.stdin.isatty() and not arguments.json else ""
 
-    with ControlFile.take(control_path(own_state_folder(arguments), config.name), None):
+    with ControlFile.take(control_path(writable_state_folder(arguments), config.name), None):
         found = try_driver(config, confirm)
     broken = any(one.outcome is Outcome.BROKEN for one in found)
     document = {"arm": config.name, "kept": not broken, "promises": [asdict(one) for one in found]}
@@ -370,7 +378,7 @@ def _probe(arguments: argparse.Namespace) -> Answer:
     found = bus_probe(config, [sheet_file(name) for name in arguments.eds])
     text, document = probe_text(config, found), probe_document(config, found)
     if not arguments.eds:
-        path = arm_folder(own_state_folder(arguments), config.name) / FILE
+        path = arm_folder(writable_state_folder(arguments), config.name) / FILE
         document |= {"changed": keep_outcome(path, document), "kept": str(path)}
         text += "".join(f"CHANGED: {line}\n" for line in document["changed"]) + f"kept in {path}\n"
     return DONE if found.good else VERDICT_NO, text, document

@@ -26,9 +26,9 @@ from ident_service.cli.output import (
     VERDICT_NO,
     Answer,
     StopOnSignal,
-    own_state_folder,
     state_folder,
     tell,
+    writable_state_folder,
 )
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
@@ -86,14 +86,14 @@ def _home(arguments: argparse.Namespace) -> Answer:
         return _zero(arguments, config)
     if arguments.confirm is not None:
         raise UsageError("--confirm is for `ident set-home`; a motion needs the ticket of `ident preflight`")
-    if held := _lead_held(arguments, config):
+    if held := _move_held_arm_home(arguments, config):
         return held
-    return _slowly(arguments, config, Destination.HOME)
+    return _move_slowly(arguments, config, Destination.HOME)
 
 
-def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | None:
+def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Answer | None:
     """Have the process that holds the arm after a stop move it home; return None where no process holds it."""
-    from ident_service.cli.archive_commands import audit_act
+    from ident_service.cli.archive_commands import write_audit_entry
     from ident_service.cli.output import state_folder
     from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile, Homing, in_use
     from ident_service.registry.state_folder import control_path
@@ -109,7 +109,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
     lease, stopping = requested_lease(arguments, config), StopOnSignal()
     with stopping, ControlFile.reach(path) as controls:
         asked, pid, stopped = stop_or_lapsed(stopping.requested, lease), controls.pid, False
-        controls.ask_home()
+        controls.request_home()
         tell(arguments, f"{config.name}: keep out of its reach; process {pid} moves it home, slowly. Ctrl-C stops.")
         while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
             if not stopped and asked():
@@ -117,7 +117,7 @@ def _lead_held(arguments: argparse.Namespace, config: ArmConfig) -> Answer | Non
                 stopped = True
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)
-    audit_act(arguments, "home", config.name, reached=[config.name])
+    write_audit_entry(arguments, "home", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
         return DONE, f"{config.name}: at home; held there until `ident supported {arguments.arm}`\n", document
@@ -141,7 +141,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             return str(arguments.confirm)
         return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
-    done = set_home(config, own_state_folder(arguments), confirm)
+    done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
     lines += [f"  still active: {fault.code}: {fault.cause}" for fault in done.faults]
     if config.can_buses and all(bus.interface == "lock_step" for bus in config.can_buses):
@@ -164,14 +164,14 @@ def _recover(arguments: argparse.Namespace) -> Answer:
     if arguments.leave_limit:
         from ident_service.motion.run_plan import Destination
 
-        return _slowly(arguments, config, Destination.INSIDE)
+        return _move_slowly(arguments, config, Destination.INSIDE)
     if arguments.out is not None:
         raise UsageError("--out is for the recording of --leave-limit; without it nothing moves")
     if arguments.lease_from_stdin:
         raise UsageError("--lease-from-stdin is for --leave-limit; without it nothing moves")
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
-    found = recover(config, own_state_folder(arguments), called=arguments.arm)
+    found = recover(config, writable_state_folder(arguments), called=arguments.arm)
     document = {
         "arm": found.arm,
         "usable": found.usable,
@@ -188,7 +188,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
     return DONE if found.usable else VERDICT_NO, _text(found), document
 
 
-def _slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
+def _move_slowly(arguments: argparse.Namespace, config: ArmConfig, destination: Destination) -> Answer:
     from ident_service.motion.faults import HOLD
 
     ends = {
@@ -257,7 +257,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.motions import new_id
     from ident_service.registry.runs import RUNS, index_run
 
-    state, config, begun = own_state_folder(arguments), load_arm(arguments.arm), time.time()
+    state, config, begun = writable_state_folder(arguments), load_arm(arguments.arm), time.time()
     who = terminal_user(arguments)
     with registry(arguments) as db:
         number = require_comparable(state, config)

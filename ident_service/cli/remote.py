@@ -27,7 +27,7 @@ from ident_service.cli.output import (
     tell,
     with_answer_lines,
 )
-from ident_service.cli.remote_recordings import file_of, recording, require_known
+from ident_service.cli.remote_recordings import file_of, recording, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.errors import AccessRefused, IdentError, UnknownId, UsageError
 
@@ -132,7 +132,7 @@ def job_verb(
             body["confirm"] = confirmation(client, arguments)
         made = client.post("/api/v1/jobs", body)
         tell(arguments, f"job {made['id']}")
-        return ended(client, arguments, _followed(client, arguments, made, moves=moves))
+        return ended(client, arguments, _wait_for_job(client, arguments, made, moves=moves))
 
     return verb
 
@@ -272,7 +272,7 @@ def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 def _watch(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     job = client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}")
-    return with_answer_lines(client, arguments, _followed(client, arguments, job, moves=False, ours=False))
+    return with_answer_lines(client, arguments, _wait_for_job(client, arguments, job, moves=False, ours=False))
 
 
 def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -332,7 +332,7 @@ _CARRIED: dict[str, frozenset[str]] = {
 }
 
 
-def _followed(
+def _wait_for_job(
     client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
 ) -> Answer:
     """Wait for the end of a job and renew its lease; on Ctrl-C cancel it, if this command began it."""
@@ -408,13 +408,13 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     if motion.is_file():
         content = motion.read_text(encoding="utf-8", errors="replace")
         return str(client.post("/api/v1/motions", {"arm": arm, "motion": content})["id"])
-    require_known(client, "motion", str(motion), motion)
+    require_registered(client, "motion", str(motion), motion)
     return str(motion)
 
 
 def _client(arguments: argparse.Namespace) -> IdentClient:
     from ident_service.client import IdentClient
-    from ident_service.registry.state_folder import shut_out
+    from ident_service.registry.state_folder import access_refusal
     from ident_service.registry.tokens import TOKEN_FILE, read_token
 
     state, url = state_folder(arguments), arguments.server
@@ -422,7 +422,7 @@ def _client(arguments: argparse.Namespace) -> IdentClient:
         try:
             url = (state / "serve.url").read_text(encoding="ascii").strip()
         except OSError:
-            if (refusal := shut_out(state)) is not None:
+            if (refusal := access_refusal(state)) is not None:
                 raise UsageError(refusal) from None
             raise UsageError(f"no daemon serves {state}; start one with `ident serve`, or give --server URL") from None
     token = os.environ.get("IDENT_TOKEN")

@@ -38,11 +38,11 @@ def recording(
         text = "" if columns is None else _text(columns)
         return {**client.upload(arm, file, columns=text, tell=_percent(arguments, file)), **bounded}
     run, _, name = str(file).partition("/")
-    require_known(client, "run", run, path)
+    require_registered(client, "run", run, path)
     return {"run": run, **({"name": name} if name else {}), **bounded}
 
 
-def require_known(client: IdentClient, kind: str, named: str, path: Path) -> None:
+def require_registered(client: IdentClient, kind: str, named: str, path: Path) -> None:
     """Refuse what is neither a file here nor something that the daemon knows.
 
     Args:

@@ -51,7 +51,7 @@ def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
 
 
-def _recovered(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+def _recovery_answer(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """The commands of the next steps are for the daemon, too."""
     code, text, document = with_answer_lines(client, arguments, answer)
     return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
@@ -86,12 +86,12 @@ def named_files(path: Path) -> dict[str, str]:
     Returns:
         Name to content; what cannot be read as text is left out, and the daemon says that it is not there.
     """
-    from ident_service.config.yaml_source import read_alone
+    from ident_service.config.yaml_source import read_without_base
 
     found: dict[str, str] = {}
     waiting = [path]
     while waiting:
-        for word in _words(read_alone(waiting.pop()).value):
+        for word in _words(read_without_base(waiting.pop()).value):
             beside = path.parent / word
             if word in found or word == path.name or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}", word):
                 continue
@@ -184,7 +184,7 @@ def keep_rehearsal_lease(
 
 VERBS: dict[str, Verb] = {
     "watch": job_verb(_watch, with_answer_lines),
-    "recover": job_verb(_recover, _recovered),
+    "recover": job_verb(_recover, _recovery_answer),
     "base-parameters": job_verb(_base, with_answer_lines),
     "preview": job_verb(_preview, with_answer_lines),
     "bus load": job_verb(_bus_load, with_answer_lines),

@@ -177,7 +177,7 @@ class Connection:
                         yield kind, number, data
                         kind, number, data = "", None, None
         except (httpx.HTTPError, ValueError) as error:
-            raise self._unreachable(error) from None
+            raise self._connection_error(error) from None
 
     def _exchange(
         self, method: str, path: str, body: Any, headers: Mapping[str, str], patience: float | None = None
@@ -200,10 +200,10 @@ class Connection:
                     return answer.status_code, bytes(taken[:_MOST]), after
             except (httpx.HTTPError, httpx.InvalidURL) as error:
                 if last or isinstance(error, httpx.ConnectError):
-                    raise self._unreachable(error) from None
+                    raise self._connection_error(error) from None
         raise AssertionError("the second try ends the loop")
 
-    def _unreachable(self, error: Exception) -> ArmError:
+    def _connection_error(self, error: Exception) -> ArmError:
         # httpx has no class of its own for this.
         unknown = "CERTIFICATE_VERIFY_FAILED" in str(error)
         hint = "; SSL_CERT_FILE=FILE.pem names the authority that signed the daemon's certificate" if unknown else ""

@@ -247,7 +247,7 @@ class FrictionShape(Section):
     stribeck_velocity: Positive | tuple[Positive, ...] | Literal["fit"] = "fit"
 
 
-class PriorPull(Section):
+class PriorRegularisation(Section):
     """Regularisation of constrained estimates towards the prior (CAD) parameters: divergence and weight.
 
     `weight` is that of one unit of divergence against one residual variance, or `held_out`: the one that explains best
@@ -273,7 +273,7 @@ class Identification(ExtendedSection):
     smoothing: Smoothing = Smoothing()
     reversal: Reversal = Reversal()
     friction: FrictionShape = FrictionShape()
-    prior: PriorPull = PriorPull()
+    prior: PriorRegularisation = PriorRegularisation()
     edge: NonNegative | Literal["choose"] = "choose"
     block: Positive = 1.0
     delay: Number | Literal["estimate", "choose"] = "choose"

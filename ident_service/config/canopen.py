@@ -161,7 +161,7 @@ class CanopenDrive(ExtendedSection):
         return self
 
     @model_validator(mode="after")
-    def _notices_are_none_of_the_bus(self) -> CanopenDrive:
+    def _require_drive_notices(self) -> CanopenDrive:
         if bad := [f"{code:04X}h" for code in self.notices if code in BUS_EMERGENCIES]:
             raise ValueError(f"notices: {', '.join(bad)} tells that the drive does not hear its host; it always counts")
         return self
@@ -308,7 +308,7 @@ class CanopenDriver(ExtendedSection):
         return self.status.inhibit
 
     @model_validator(mode="after")
-    def _nodes_apart(self) -> CanopenDriver:
+    def _require_distinct_nodes(self) -> CanopenDriver:
         places = [(drive.bus, drive.node) for drive in self.drives]
         for bus, node in places:
             if bus >= len(self.buses):

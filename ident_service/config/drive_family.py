@@ -72,7 +72,7 @@ class TorqueUnit(Section):
     writable: bool = False
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> TorqueUnit:
+    def _require_rated_or_count(self) -> TorqueUnit:
         if (self.rated is None) == (self.count is None):
             raise ValueError("either `rated` names an entry, or `count` is a number")
         if self.writable and (self.rated is None or self.unit == "mA"):

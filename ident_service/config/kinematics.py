@@ -107,7 +107,7 @@ class Kinematics(Section):
         return self
 
     @model_serializer(mode="wrap")
-    def _unless_whole(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_part_defaults(self, serialized: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Left out at their defaults, so that older descriptions keep the hash that results and tickets store.
         document: dict[str, Any] = serialized(self)
         return {key: value for key, value in document.items() if key not in ("base", "tip", "lock", "snap") or value}

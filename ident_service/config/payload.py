@@ -88,7 +88,7 @@ class Payload(Section):
         return f"{self.mass:g} kg at ({x:g}, {y:g}, {z:g}) m of {where}"
 
 
-def knowledge_with_payload(config: ArmConfig) -> ArmConfig:
+def constraints_with_payload(config: ArmConfig) -> ArmConfig:
     """Return the description with what is known of its bodies said of the arm that carries its payload.
 
     Bounds of masses move by the payload's mass. What is known about the shape of the link that carries it (box, hull,

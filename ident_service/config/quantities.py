@@ -98,7 +98,7 @@ class TextFile(Section):
     text: str
 
 
-def read_beside(value: Any, info: ValidationInfo) -> Any:
+def read_relative_file(value: Any, info: ValidationInfo) -> Any:
     """Read the file that a `LocatedStr` names, relative to the YAML file it stands in; bounded in size, and UTF-8.
 
     Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
@@ -136,7 +136,7 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
         raise ValueError(f"{path} is not UTF-8 text") from None
 
 
-TextBeside = Annotated[TextFile, BeforeValidator(read_beside)]
+TextBeside = Annotated[TextFile, BeforeValidator(read_relative_file)]
 AnyTextBeside = Annotated[TextFile, BeforeValidator(_read_any)]
 """Text of any encoding: makers' data sheets are often not UTF-8."""
 
@@ -151,7 +151,7 @@ class ParameterTable(Section):
     @classmethod
     def _from_file_or_mapping(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, str):
-            value = read_beside(value, info)
+            value = read_relative_file(value, info)
             try:
                 content = json.loads(value["text"])
                 return {"names": tuple(content["names"]), "values": tuple(float(v) for v in content["values"])}

@@ -78,7 +78,7 @@ class Column(Section):
 
     @field_validator("unit")
     @classmethod
-    def _spelled(cls, unit: str | None) -> str | None:
+    def _normalised_unit(cls, unit: str | None) -> str | None:
         return None if unit is None else re.sub(r"[\s*\u00b7]", "", unit).replace("\u00b5", "u")
 
     @field_validator("factor")
@@ -144,7 +144,7 @@ class Transmission(ExtendedSection):
 
     @field_validator("ratios")
     @classmethod
-    def _turning(cls, ratios: tuple[float, ...]) -> tuple[float, ...]:
+    def _require_nonzero_ratios(cls, ratios: tuple[float, ...]) -> tuple[float, ...]:
         if 0.0 in ratios:
             raise ValueError("a ratio of zero moves nothing")
         return ratios
@@ -165,7 +165,7 @@ class Transmission(ExtendedSection):
 
     @field_validator("offsets", "motor_torque")
     @classmethod
-    def _one_each(cls, values: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
+    def _require_one_per_ratio(cls, values: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
         if values is not None and "ratios" in info.data and len(values) != len(info.data["ratios"]):
             what = "offsets" if info.field_name == "offsets" else "torques"
             raise ValueError(f"{len(values)} {what} for {len(info.data['ratios'])} ratios")
@@ -256,7 +256,7 @@ class RecordingFormat(Section):
 
     @field_validator("joint_names")
     @classmethod
-    def _distinct(cls, joint_names: dict[str, str]) -> dict[str, str]:
+    def _require_distinct_names(cls, joint_names: dict[str, str]) -> dict[str, str]:
         _once("name", joint_names)
         return joint_names
 

@@ -78,7 +78,7 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False
     path = path.resolve()
     if path in _chain:
         raise ConfigError([Problem(path, 1, 1, "extends itself: " + " -> ".join(p.name for p in (*_chain, path)))])
-    tree = read_alone(path)
+    tree = read_without_base(path)
     if not isinstance(tree.value, dict):
         raise ConfigError([Problem(path, 1, 1, "an arm description is a mapping of keys to values")])
     parent = tree.value.pop("extends", None)
@@ -113,7 +113,7 @@ def _merge(base: Any, over: Any) -> Any:
     return base | {key: _merge(base[key], value) if key in base else value for key, value in over.items()}
 
 
-def read_alone(path: Path) -> Tree:
+def read_without_base(path: Path) -> Tree:
     """Read a single YAML file without the one that it `extends`.
 
     Raises:

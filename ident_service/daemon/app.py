@@ -17,7 +17,7 @@ from ident_service import __version__
 from ident_service.daemon.authentication import Authenticator
 from ident_service.daemon.connections import Connections
 from ident_service.daemon.dependencies import Service
-from ident_service.daemon.errors import answer_mistakes
+from ident_service.daemon.errors import install_error_handlers
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.live import LiveRuns
 from ident_service.daemon.maintenance.scheduler import MaintenanceScheduler
@@ -43,7 +43,7 @@ from ident_service.daemon.routes import (
 )
 from ident_service.daemon.routes.checks import Checks
 from ident_service.daemon.settings import Settings
-from ident_service.daemon.uploads import delete_half_uploads
+from ident_service.daemon.uploads import delete_stale_uploads
 from ident_service.daemon.web import (
     arm_pages,
     job_pages,
@@ -55,7 +55,7 @@ from ident_service.daemon.web import (
 from ident_service.operations.acceptance import synchronise
 from ident_service.operations.deletion import remove_deleted
 from ident_service.registry.arms import know_shipped
-from ident_service.registry.database import Database, enter_waiting
+from ident_service.registry.database import Database, write_deferred_entries
 from ident_service.registry.runs import rebuild_runs
 from ident_service.registry.tokens import first_token
 
@@ -140,11 +140,13 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     )
     app.state.service = service
     app.state.live = LiveRuns()
-    app.state.watch = EventPoller(db, settings.state, lambda row: jobs.answer_of(service, row).model_dump(mode="json"))
+    app.state.watch = EventPoller(
+        db, settings.state, lambda row: jobs.job_answer_document(service, row).model_dump(mode="json")
+    )
     for router in ROUTERS:
         app.include_router(router)
     describe(app)
-    answer_mistakes(app)
+    install_error_handlers(app)
     book = Connections() if connections is None else connections
     app.add_middleware(RequestGuardMiddleware, settings=settings, metrics=service.metrics, connections=book)
     return app
@@ -157,9 +159,9 @@ async def _refresh(service: Service) -> None:
         try:
             if time.monotonic() >= clean:
                 clean = time.monotonic() + _CLEAN
-                for upload in await run_in_threadpool(delete_half_uploads, service.state):
+                for upload in await run_in_threadpool(delete_stale_uploads, service.state):
                     _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
-            await run_in_threadpool(enter_waiting, service.db, service.state)
+            await run_in_threadpool(write_deferred_entries, service.db, service.state)
             await run_in_threadpool(service.gate.refresh)
             await run_in_threadpool(service.db.rest)
         except (sqlite3.Error, OSError) as error:

@@ -30,7 +30,7 @@ _AT_ONCE = 16  # connections accepted before the event loop turns to other work
 Peer = tuple[str, int]
 
 
-def most_connections() -> int:
+def raise_connection_limit() -> int:
     """Raise the limit of open files as far as allowed, and return how many connections it leaves room for."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _DESCRIPTORS)
@@ -94,7 +94,7 @@ class Connections:
         self._waiting[connection.peer] = self._now() + HEADER_SECONDS
         return True
 
-    def headers_came(self, peer: Peer | None, *, body: bool) -> None:
+    def headers_received(self, peer: Peer | None, *, body: bool) -> None:
         """Note that a request's headers are complete; with a body its deadline begins, else it is being answered."""
         if peer in self._open:
             # The next request of a connection may arrive before the end of this one is noted.
@@ -103,7 +103,7 @@ class Connections:
             if body:
                 self._waiting[peer] = self._now() + BODY_SECONDS
 
-    def request_came(self, peer: Peer | None) -> None:
+    def request_received(self, peer: Peer | None) -> None:
         """Note that a request is complete."""
         if peer is not None:
             self._waiting.pop(peer, None)

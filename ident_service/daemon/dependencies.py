@@ -153,7 +153,7 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
     return await operator(found)
 
 
-async def while_known(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
+async def while_authorised(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
     """Return a filter that ends an event stream when its token or session is no longer valid."""
     gate, secret = service_of(request).gate, None if bearer is None else bearer.credentials
 
@@ -187,6 +187,6 @@ Serving = Annotated[Service, Depends(serving)]
 Near = Annotated[str, Depends(local_or_authenticated)]
 LeaseKeeper = Annotated[Access, Depends(lease_keeper)]
 Viewer = Annotated[Access, Depends(viewer)]
-WhileAuthorized = Annotated[WhileKnown, Depends(while_known)]
+WhileAuthorized = Annotated[WhileKnown, Depends(while_authorised)]
 Operator = Annotated[Access, Depends(operator)]
 """Dependencies that routes declare."""

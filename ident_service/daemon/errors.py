@@ -86,7 +86,7 @@ def status_of(error: IdentError) -> int:
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
 
 
-def answer_mistakes(app: FastAPI) -> None:
+def install_error_handlers(app: FastAPI) -> None:
     """Install the exception handlers that turn every error into a `Failure`."""
 
     async def _resources(request: Request, error: Exception) -> JSONResponse:

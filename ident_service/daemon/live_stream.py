@@ -32,7 +32,7 @@ def log_of(service: Service, row: Row) -> str:
 
 
 def _shown(service: Service, row: Row) -> str:
-    answer = jobs.answer_of(service, row)
+    answer = jobs.job_answer_document(service, row)
     return json.dumps({"job": answer.model_dump(mode="json"), "log": log_of(service, row)[-4096:]})
 
 

@@ -22,7 +22,7 @@ from typing import Any, Final
 from ident_service.errors import IdentError
 from ident_service.operations.moving_arms import moving_arms
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import Database, Row, last_line, trail_after
+from ident_service.registry.database import Database, Row, audit_entries_after, last_line
 from ident_service.registry.state_folder import fault_file
 
 LOOK: Final = 0.25  # s between polls, however many viewers there are
@@ -121,11 +121,11 @@ class EventPoller:
 
     def behind(self, seen: ViewerPosition) -> bool:
         """Return whether a viewer misses lines that are no longer in memory."""
-        return self._line is not None and seen.line < self._line and not self._remembers(seen.line)
+        return self._line is not None and seen.line < self._line and not self._has_buffered_line(seen.line)
 
     def earlier(self, seen: ViewerPosition) -> list[ViewerEvent]:
         """Return a page of lines from the registry for a viewer who is behind."""
-        found = [_line(row) for row in trail_after(self._db, seen.line, _PAGE)]
+        found = [_line(row) for row in audit_entries_after(self._db, seen.line, _PAGE)]
         # No lines: the registry has been restored to an earlier state.
         seen.line = (found[-1].number if found else self._line) or 0
         return found
@@ -144,14 +144,14 @@ class EventPoller:
         seen.version = version
         return found + [one for _, one in sorted(standing, key=lambda pair: pair[0])]
 
-    def _remembers(self, line: int) -> bool:
+    def _has_buffered_line(self, line: int) -> bool:
         first = next(iter(self._lines), None)
         return first is not None and first.number is not None and first.number <= line + 1
 
     def _read_lines(self) -> None:
         if self._line is None:
             self._line = last_line(self._db)
-        while found := trail_after(self._db, self._line, _PAGE):
+        while found := audit_entries_after(self._db, self._line, _PAGE):
             for row in found:
                 self._lines.append(_line(row))
                 if row["what"].startswith("job "):
@@ -163,9 +163,9 @@ class EventPoller:
         for job in self._ending - live.keys():
             row = self._db.row("SELECT id FROM jobs WHERE id = ?", job)
             if row is not None:
-                self._stand("job", job, self._shown(rows.known_job(self._db, job)), gone=True)
+                self._update_state("job", job, self._shown(rows.known_job(self._db, job)), gone=True)
         for job, row in live.items():
-            self._stand("job", job, self._shown(row))
+            self._update_state("job", job, self._shown(row))
         self._ending = set(live)
         for key, one in list(self._standing.items()):
             if one.gone is not None and self._now() - one.gone > _GONE:
@@ -182,9 +182,11 @@ class EventPoller:
                 faults = sorted(fault_file(self._state, folder.name).latched())
             except IdentError:
                 faults = ["unreadable"]  # a damaged file prevents motion like a fault
-            self._stand("arm", folder.name, {"arm": folder.name, "moves": folder.name in moving, "faults": faults})
+            self._update_state(
+                "arm", folder.name, {"arm": folder.name, "moves": folder.name in moving, "faults": faults}
+            )
 
-    def _stand(self, kind: str, name: str, value: dict[str, Any], *, gone: bool = False) -> None:
+    def _update_state(self, kind: str, name: str, value: dict[str, Any], *, gone: bool = False) -> None:
         data, before = json.dumps(value, allow_nan=False), self._standing.get((kind, name))
         if before is None or before.data != data:
             self._standing[kind, name] = _Standing(self._version + 1, data, self._now() if gone else None)

@@ -85,7 +85,7 @@ class RequestGuardMiddleware:
         peer: Peer | None = scope.get("client")
         urgent = scope["path"].endswith(_URGENT)
         busy = not urgent and self._connections.busy(peer)
-        self._connections.headers_came(peer, body=_has_body(scope))
+        self._connections.headers_received(peer, body=_has_body(scope))
 
         async def answer(message: Message) -> None:
             nonlocal status, started
@@ -144,7 +144,7 @@ class RequestGuardMiddleware:
         return None
 
     def _counted(self, scope: Scope, receive: Receive, *, urgent: bool) -> Receive:
-        most, seen, peer = _most_body(scope["method"], scope["path"]), 0, scope.get("client")
+        most, seen, peer = _body_limit(scope["method"], scope["path"]), 0, scope.get("client")
         whole = not _has_body(scope)
 
         async def counted() -> Message:
@@ -159,13 +159,13 @@ class RequestGuardMiddleware:
                     # While the body arrived, other requests may have used up the places.
                     if not urgent and self._connections.busy(peer):
                         raise _Busy
-                    self._connections.request_came(peer)
+                    self._connections.request_received(peer)
             return message
 
         return counted
 
 
-def _most_body(method: str, path: str) -> int:
+def _body_limit(method: str, path: str) -> int:
     if method == "PATCH" and path.startswith(_PIECES):
         return MOST_PIECE
     return MOST_UPLOAD if method == "POST" and path in UPLOADS else MOST_BODY

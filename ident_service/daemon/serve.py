@@ -31,14 +31,14 @@ import uvicorn
 from fastapi import FastAPI
 
 from ident_service.daemon.app import create_app
-from ident_service.daemon.connections import Connections, Listener, most_connections
+from ident_service.daemon.connections import Connections, Listener, raise_connection_limit
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.recordings.files import write_atomically
-from ident_service.registry.state_folder import URL_FILE, keep_private, single_instance
+from ident_service.registry.state_folder import URL_FILE, require_private, single_instance
 
 
-def tell_manager(line: str) -> bool:
+def notify_systemd(line: str) -> bool:
     """Send one line, `READY=1` for example, without ever waiting for the manager to read.
 
     Returns:
@@ -174,8 +174,8 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             be spoken with its certificate and key.
     """
     _require_tls(settings)
-    keep_private(settings.state)
-    book = Connections(most_connections())
+    require_private(settings.state)
+    book = Connections(raise_connection_limit())
     with single_instance(settings.state), _listening(settings, book) as listening:
         host, port = listening.getsockname()[:2]
         url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
@@ -229,7 +229,7 @@ class _Server(uvicorn.Server):
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Handle a signal: stop the arms first; a second interrupt also skips waiting for open requests."""
-        tell_manager("STOPPING=1")
+        notify_systemd("STOPPING=1")
         # Not in the signal handler: the interrupted code may hold the lock that is needed.
         if not self.should_exit:
             threading.Thread(target=self._service.engine.begin_closing, name="closing", daemon=True).start()
@@ -244,7 +244,7 @@ class _Server(uvicorn.Server):
 
     async def main_loop(self) -> None:
         """Serve; report ready to the service manager, then feed its watchdog while the queue is looked after."""
-        task = asyncio.create_task(self._tell_manager())
+        task = asyncio.create_task(self._notify_systemd())
         try:
             await super().main_loop()
         finally:
@@ -252,14 +252,14 @@ class _Server(uvicorn.Server):
             with suppress(asyncio.CancelledError):
                 await task
 
-    async def _tell_manager(self) -> None:
+    async def _notify_systemd(self) -> None:
         # Without READY=1 the manager would count the service as failed; any other line may be lost.
-        while not tell_manager("READY=1"):
+        while not notify_systemd("READY=1"):
             await asyncio.sleep(_READY_AGAIN)
         seconds = watchdog_seconds()
         while seconds is not None:
             if self._service.engine.healthy:
-                tell_manager("WATCHDOG=1")
+                notify_systemd("WATCHDOG=1")
             else:
                 _LOG.error("the queue is not looked after")
             await asyncio.sleep(seconds)

@@ -210,7 +210,7 @@ def require_header(db: Database, state: Path, upload: str) -> None:
     if not line.endswith(b"\n") and len(line) < LONGEST_HEADER and seen.received < announced.bytes:
         return  # it has not all arrived
     form = format_of(announced.columns, announced.name, known_arm(db, state, announced.arm).config)
-    with _deleted_if_wrong(folder):
+    with _delete_on_hash_mismatch(folder):
         parse_header(Path(announced.name), line.decode("utf-8-sig", "replace").rstrip("\r\n"), form.columns)
     with _known(upload):
         (folder / _JUDGED).touch(0o600)
@@ -326,7 +326,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
         if seen.received != announced.bytes:
             raise AlreadyThere(f"{announced.name}: has {seen.received} of {announced.bytes} bytes; send the rest first")
         run = new_id(arm.name)
-        with _deleted_if_wrong(folder), atomic_folder(state / RUNS / run) as built:
+        with _delete_on_hash_mismatch(folder), atomic_folder(state / RUNS / run) as built:
             write_atomically(built / _ARM, arm.config.model_dump_json(indent=1))
             write_atomically(built / UPLOAD, json.dumps({"format": "ident-upload", "version": 1, **asdict(announced)}))
             if announced.columns:
@@ -363,7 +363,7 @@ def _known(upload: str) -> Iterator[None]:
 
 
 @contextmanager
-def _deleted_if_wrong(folder: Path) -> Iterator[None]:
+def _delete_on_hash_mismatch(folder: Path) -> Iterator[None]:
     """Delete the folder of an upload whose content is not what was announced."""
     try:
         yield
@@ -382,7 +382,7 @@ def delete_upload(state: Path, upload: str) -> None:
     shutil.rmtree(state / UPLOADS / upload, ignore_errors=True)
 
 
-def delete_half_uploads(state: Path, now: float | None = None) -> list[str]:
+def delete_stale_uploads(state: Path, now: float | None = None) -> list[str]:
     """Delete uploads of which nothing has arrived for a day.
 
     Returns:

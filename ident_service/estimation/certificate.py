@@ -615,7 +615,7 @@ def _implied(conditions: FeasibleSet) -> list[ExactBlock]:
 
 def _witness(statement: Statement, conditions: FeasibleSet, delta: Array) -> dict[str, Any] | None:
     rounded = {name: printed(value) for name, value in zip(statement.names, delta, strict=True)}
-    values = _meeting(statement, rounded, statement.rows, statement.right)
+    values = _exact_solution(statement, rounded, statement.rows, statement.right)
     return None if values is None else {"kind": "witness", **_set_document(statement, conditions), "delta": values}
 
 
@@ -629,10 +629,10 @@ def _body(statement: Statement, conditions: FeasibleSet) -> dict[str, str] | Non
         return None
     rounded = {name: printed(value) for name, value in zip(statement.names, delta, strict=True)}
     base = len(statement.K)
-    return _meeting(statement, rounded, statement.rows[base:], statement.right[base:])
+    return _exact_solution(statement, rounded, statement.rows[base:], statement.right[base:])
 
 
-def _meeting(
+def _exact_solution(
     statement: Statement,
     values: Mapping[str, Fraction],
     equations: Sequence[Mapping[str, Fraction]],

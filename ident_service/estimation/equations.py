@@ -340,7 +340,7 @@ def _pairs(labels: Sequence[Label]) -> list[tuple[int, int | None]]:
     return sorted(partner.items())
 
 
-def kept_motion(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:
+def smoothed_samples(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:
     """Return all smoothed samples of a recording at once, for scoring and drawing short recordings."""
     parts = list(smoothed(recording, options, coupling))
     return Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in Motion.__dataclass_fields__))

@@ -22,7 +22,7 @@ from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import residual_deviation
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
-from ident_service.estimation.friction_fit import fit_friction, free_friction_numbers, friction_trials
+from ident_service.estimation.friction_fit import fit_friction, fitted_friction_parameters, friction_trials
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
@@ -131,9 +131,9 @@ def prepare(
             choices += () if choice is None else (choice,)
         model = with_delay(model, seconds)
         trials = trials if seconds == 0.0 else None
-    if trials is None and free_friction_numbers(model):
+    if trials is None and fitted_friction_parameters(model):
         trials = friction_trials(recordings, model, base)
-    fitted = free_friction_numbers(model)
+    fitted = fitted_friction_parameters(model)
     model, shapes = fit_friction(trials, model, base, conditions)
     choices += shapes
     gathered = gather(recordings, model, base)
@@ -229,32 +229,34 @@ def _with_known_shape(
     shares = standstill_weights(prepared.equations)
     gathered = prepared.equations.with_near(shares)
     if method == "ols":
-        return _doubted("ols", ordinary_least_squares(gathered.total), gathered, shares)
+        return _fit_with_uncertainty("ols", ordinary_least_squares(gathered.total), gathered, shares)
     fit = weighted_least_squares(gathered.total)
     if method == "wls":
-        return _doubted("wls", fit, gathered, shares)
+        return _fit_with_uncertainty("wls", fit, gathered, shares)
     choices: tuple[Choice, ...] = ()
     if method == "choose":
         choices = (
             best_choice("method", held_out_errors(recordings, model, base, fit, prepared.torque_scales, shares)),
         )
         if choices[0].value == "wls":
-            return replace(_doubted("wls", fit, gathered, shares), choices=choices)
+            return replace(_fit_with_uncertainty("wls", fit, gathered, shares), choices=choices)
     if method != "iv":
         fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares)
-        found = replace(_doubted("huber", fit, reweighted, shares), weighed=gathered)
-        return replace(found, choices=choices, remarks=_unsettled("Huber's weights", change, robust_regression.SETTLED))
+        found = replace(_fit_with_uncertainty("huber", fit, reweighted, shares), weighed=gathered)
+        return replace(
+            found, choices=choices, remarks=_convergence_warnings("Huber's weights", change, robust_regression.SETTLED)
+        )
     delta = constrained_least_squares(fit, base, conditions).delta
     refined = instrumental_variables(recordings, model, base, conditions, fit, delta)
     moved = replace(fit, beta=refined.beta, rho1=fit.R1 @ refined.beta, standard_deviations=refined.standard_deviations)
     # The instrumental estimate's variances come from as many equally weighted blocks: same degrees of freedom.
-    remarks = _unsettled("the instrumental estimate", refined.change, instruments.SETTLED)
+    remarks = _convergence_warnings("the instrumental estimate", refined.change, instruments.SETTLED)
     degrees = uncertainty(gathered, fit).degrees
     deviations = np.sqrt(np.diag(refined.covariance)) * widening(degrees)
     return Fit(moved, gathered, gathered, refined.covariance, deviations, degrees, None, shares, "iv", remarks)
 
 
-def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
+def _convergence_warnings(what: str, change: float, settled: float) -> tuple[str, ...]:
     if change < settled:
         return ()
     return (
@@ -263,7 +265,7 @@ def _unsettled(what: str, change: float, settled: float) -> tuple[str, ...]:
     )
 
 
-def _doubted(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
+def _fit_with_uncertainty(method: Method, fit: LeastSquares, equations: Equations, shares: Array) -> Fit:
     found = uncertainty(equations, fit)
     return Fit(
         fit, equations, equations, found.covariance, found.deviations, found.degrees, found.noise, shares, method

@@ -207,7 +207,7 @@ class FrictionTrials:
             F = self._new_columns(new, used)
             for products, part in zip(found, wanted, strict=True):
                 product = np.empty((size, size))
-                product[fixed[:, None], fixed] = self._kept_products(joint, part)
+                product[fixed[:, None], fixed] = self._normal_matrix(joint, part)
                 if new:
                     across = table[part].T @ F[part]
                     product[fixed[:, None], places] = across
@@ -220,7 +220,7 @@ class FrictionTrials:
             for products, count in zip(found, counts, strict=True)
         ]
 
-    def _kept_products(self, joint: int, part: slice) -> Array:
+    def _normal_matrix(self, joint: int, part: slice) -> Array:
         """Return X^T X of a joint's kept columns and torque, computed once for each part."""
         key = (joint, part.start, part.stop)
         if key not in self._products:
@@ -246,7 +246,7 @@ class FrictionTrials:
         return Equations(tuple(blocks), self._rows, tuple(near))
 
     @one_blas_thread()
-    def later_torques(self, stribeck_velocity: Array) -> Callable[[float], tuple[Information, ...]]:
+    def delayed_rows(self, stribeck_velocity: Array) -> Callable[[float], tuple[Information, ...]]:
         """Return a function of the torque's delay [s] that returns the rows in motion, per third.
 
         The torque between its samples is that of its first two derivatives: good for delays that are short beside the
@@ -441,7 +441,7 @@ def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: Base
     return FrictionTrials(recordings, _thinned(model, recordings), base)
 
 
-def free_friction_numbers(model: ArmModel) -> tuple[str, ...]:
+def fitted_friction_parameters(model: ArmModel) -> tuple[str, ...]:
     """Return the names of the friction numbers that are left to be fitted and apply to this arm."""
     shape, terms = model.config.identification.friction, set(model.layout.terms)
     if not {"coulomb", "stribeck"} & terms:
@@ -472,7 +472,7 @@ def fit_friction(
         The arm with its numbers, and for each kind whether it was fitted or left out.
     """
     shape = model.config.identification.friction
-    wanted = free_friction_numbers(model)
+    wanted = fitted_friction_parameters(model)
     joints = model.chain.joints
     values = {
         key: np.full(joints, 0.1 if key == "stribeck_velocity" else 0.0)
@@ -484,7 +484,8 @@ def fit_friction(
     if wanted and trials is not None:
         search = _Search(trials, model, base)
         found = [
-            search.finer(start, wanted) for start in (search.in_turn(values, wanted), search.pairs(values, wanted))
+            search.finer(start, wanted)
+            for start in (search.coordinate_search(values, wanted), search.pairs(values, wanted))
         ]
         start, values = values, search.nearer(search.best(values, found, predicting=True), wanted)
         if conditions is not None:
@@ -521,7 +522,7 @@ class _Search:
     model: ArmModel
     base: BaseParameters
 
-    def in_turn(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
+    def coordinate_search(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
         """Search one number after the other over its whole grid."""
         for key in wanted:
             trials = [{key: np.full(self.model.chain.joints, value)} for value in _GRIDS[key]]
@@ -588,7 +589,7 @@ class _Search:
                 continue
             without = start | {key: np.full_like(values[key], _NONE[key])}
             others = [other for other in wanted if other != key and not np.all(values[other] <= _NONE[other])]
-            without = self.finer(self.in_turn(without, others), others)
+            without = self.finer(self.coordinate_search(without, others), others)
             errors = {
                 name: held_out_thirds(self._equations(way).with_near(shares).blocks, weights, self.base, conditions)
                 for name, way in (("fit", values), ("none", without))

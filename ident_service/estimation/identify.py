@@ -221,7 +221,7 @@ def identify(
 
     prepared = prepare(recordings, model, base, conditions, validation)
     found = unconstrained(wanted, recordings, prepared, base, conditions)
-    unseen = [(recording, _unseen(recording, prepared, base)) for recording in validation]
+    unseen = [(recording, _validation_equations(recording, prepared, base)) for recording in validation]
     prior = _prior(prepared.model, found, base, conditions)
     test = feasibility_test(found.fit.beta, base, conditions)
     corrected = feasibility_correction(found.fit.beta, base, conditions)
@@ -364,7 +364,7 @@ def _check_convex(
     require_solver(solver)
 
 
-def _unseen(recording: Recording, prepared: Prepared, base: BaseParameters) -> Equations:
+def _validation_equations(recording: Recording, prepared: Prepared, base: BaseParameters) -> Equations:
     return equations(recording, prepared.model, base).with_torques_times(prepared.torque_scales)
 
 

@@ -180,7 +180,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     from_blocks = uncertainty(reduced, fit)
     noise = from_blocks.covariance
     G = _dependence(recorded.total, T, fit)
-    covariance, doubt = _with_doubt(arm, noise, G)
+    covariance, doubt = _payload_covariance(arm, noise, G)
     deviations = np.sqrt(from_blocks.deviations**2 + np.diag(doubt))
     total = recorded.total
     seen = np.isfinite(np.diag(covariance))
@@ -295,7 +295,7 @@ def _dependence(information: Information, T: Array, fit: LeastSquares) -> Array:
     return np.asarray(fit.inverse @ fit.inverse.T @ normal)
 
 
-def _with_doubt(arm: KnownArm, noise: Array, G: Array) -> tuple[Array, Array]:
+def _payload_covariance(arm: KnownArm, noise: Array, G: Array) -> tuple[Array, Array]:
     """Return the covariance of the payload, and the part of it that comes from the arm's uncertainty."""
     unseen = ~np.isfinite(np.diag(arm.covariance))
     known = np.where(unseen[:, None] | unseen[None, :], 0.0, arm.covariance)

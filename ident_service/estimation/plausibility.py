@@ -44,7 +44,7 @@ def reasons_against(estimate: Estimate) -> tuple[str, ...]:
     The words name the most likely cause where the numbers tell one.
     """
     own = estimate.candidates[estimate.chosen]
-    return (*_errors(own), *_against_the_unconstrained(estimate))
+    return (*_errors(own), *_compare_with_unconstrained(estimate))
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
@@ -144,7 +144,7 @@ def _errors(own: Candidate) -> Iterator[str]:
         )
 
 
-def _against_the_unconstrained(estimate: Estimate) -> Iterator[str]:
+def _compare_with_unconstrained(estimate: Estimate) -> Iterator[str]:
     free, own = estimate.candidates[0], estimate.candidates[estimate.chosen]
     before, after = free.moving.relative_percent, own.moving.relative_percent
     # With a prior or custom knowledge a larger error is the user's choice.

@@ -151,7 +151,7 @@ def _period(positions: _Positions) -> float | None:
     q, scale = positions.q, positions.scale
     for lag in _candidates(q, q, scale, round(_SHORTEST / positions.step)):
         same = _same(q[lag:], q[:-lag], scale)
-        if _enough(q[:-lag], same, scale, positions.step) and np.sum(same) >= _LEAST * lag:
+        if _covers_most_of_path(q[:-lag], same, scale, positions.step) and np.sum(same) >= _LEAST * lag:
             return _refined(positions, lag) * positions.step
     return None
 
@@ -212,7 +212,7 @@ def _offset(motion: _Motion, positions: _Positions) -> float | None:
     for lag in _candidates(reference, q, motion.scale, None):
         offset = lag * step
         shown = motion.shown(positions, offset)
-        if _enough(positions.q, shown, motion.scale, positions.step):
+        if _covers_most_of_path(positions.q, shown, motion.scale, positions.step):
             share = float(np.mean(shown))
             best = max(best or (0.0, 0.0), (share, offset))
     return None if best is None else best[1]
@@ -265,7 +265,7 @@ def _same(one: Array, other: Array, scale: Array) -> Mask:
     return np.asarray(np.nan_to_num(np.abs(one - other) / scale, nan=np.inf).max(axis=1) < _SAME)
 
 
-def _enough(q: Array, same: Mask, scale: Array, step: float) -> bool:
+def _covers_most_of_path(q: Array, same: Mask, scale: Array, step: float) -> bool:
     """Return whether the samples that agree make up most of the travelled distance, not only a rest."""
     way = np.nansum(np.abs(np.diff(q, axis=0)) / scale, axis=1)
     return bool(same.sum() * step >= _SHORTEST) and float(way @ same[1:]) >= _PART * float(way.sum()) > 0.0

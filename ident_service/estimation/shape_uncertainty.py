@@ -132,7 +132,7 @@ def shape_uncertainty(
     wider = np.maximum(white / np.where(told > 0.0, told, 1.0), 1.0)
     found = found * np.outer(wider, wider)
     found[blind, blind] = np.inf
-    bounded = _at_most(found, most)
+    bounded = _bounded_deviations(found, most)
     added = follow @ bounded @ follow.T
     # A bound of the search is certain; what data say of the other numbers is not.
     by_data = np.sqrt(np.diag(found)) < most
@@ -166,7 +166,7 @@ def _moved(model: ArmModel, key: str) -> ArmModel:
     return with_friction(model, shape.model_copy(update={key: larger}))
 
 
-def _at_most(covariance: Array, most: Array) -> Array:
+def _bounded_deviations(covariance: Array, most: Array) -> Array:
     """Bound deviations; what the data do not see, or one block alone, has the bound and no correlation."""
     variances = np.diag(covariance)
     known = np.isfinite(variances)

@@ -121,7 +121,7 @@ def windows(
     period = stamps.period_s
     options = with_filter([recording], options, fmt)
     smoother = _Smoother(recording, options, period)
-    way = _Way(recording.joints, options, period, coupling)
+    way = _FrictionDirection(recording.joints, options, period, coupling)
     left_out = float(options.edge)
     edge = int(np.ceil(left_out / period))
     # A window that is not the last must never hold samples of the recording's end edge.
@@ -274,7 +274,7 @@ class _Smoother:
         return np.asarray((8.0 * (padded[3:-1] - padded[1:-3]) - (padded[4:] - padded[:-4])) / (12.0 * self._period))
 
 
-class _Way:
+class _FrictionDirection:
     """Direction of friction; its windows must come in order, because friction has a memory."""
 
     def __init__(self, joints: int, options: Identification, period: float, coupling: Array | None) -> None:

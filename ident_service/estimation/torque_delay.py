@@ -76,7 +76,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
     seconds = 0.0
     for _ in range(_MOST_ROUNDS):
         shifted = with_delay(model, seconds)
-        change, deviation = _first_order(recordings, shifted, base)
+        change, deviation = _linearised_delay(recordings, shifted, base)
         seconds += change
         if abs(seconds) > _LARGEST:
             break
@@ -103,7 +103,7 @@ def choose_delay(
     Returns:
         The delay [s], and how it was chosen; None where a joint does not move in every third.
     """
-    thirds_at = trials.later_torques(np.full(trials.joints, 0.1))
+    thirds_at = trials.delayed_rows(np.full(trials.joints, 0.1))
     at_once = thirds_at(0.0)
     if any(not part.rows.all() for part in at_once):
         return 0.0, None
@@ -131,7 +131,7 @@ def choose_delay(
     return step * ways[choice.value], choice
 
 
-def _first_order(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> tuple[float, float]:
+def _linearised_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> tuple[float, float]:
     """Return the remaining delay [s] and its standard deviation [s], to first order."""
     fit = weighted_least_squares(equations(recordings, model, base).total)
     joint_supports = sparsity(model.chain, model.layout, base.base)

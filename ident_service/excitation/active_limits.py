@@ -108,7 +108,7 @@ def needed_stiffness(task: Task, coefficients: Array, per_period: int) -> Array:
     return problem.error_at_velocity_limit(problem.variables(coefficients)) / (USABLE * task.limits.following_error)
 
 
-def binding_words(
+def active_limit_lines(
     found: Sequence[ActiveLimit],
     task: Task,
     limits: MotionLimits,

@@ -17,8 +17,8 @@ from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.excitation.active_limits import (
     ActiveLimit,
+    active_limit_lines,
     binding,
-    binding_words,
     gain_words,
     needed_stiffness,
     stiffer_gains,
@@ -239,8 +239,8 @@ def design_motion(
         lengths = ["rad" if turns else "m" for turns in model.chain.revolute]
         gains = _gains(best, bound, limits, stable)
         held = (
-            *(() if coefficients is whole else (_shrunk_words(task, base, best),)),
-            *binding_words(bound, task, limits, proof.demands.velocity, lengths, gains),
+            *(() if coefficients is whole else (_scaling_text(task, base, best),)),
+            *active_limit_lines(bound, task, limits, proof.demands.velocity, lengths, gains),
         )
     return Designed(excitation, proof, kappa, found, held)
 
@@ -307,7 +307,7 @@ def _gains(
     return stiffer_gains(bound, late, needed, limits, stable)
 
 
-def _shrunk_words(task: Task, base: BaseParameters, attempt: Attempt) -> str:
+def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     """Say what it costs that a motion was made smaller until it could be proven."""
     lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
     gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
@@ -344,7 +344,7 @@ def criterion_of(task: Task, path: FourierPath | PosturePath, base: BaseParamete
 
 def _require_holdable_home(model: ArmModel, limits: MotionLimits) -> None:
     standing = PosturePath(np.array([limits.home, limits.home]), np.ones(1), 0.0)
-    if weak := demands(standing, model).forces_beyond(model.chain.names, limits, model.config.supply):
+    if weak := demands(standing, model).torque_and_power_violations(model.chain.names, limits, model.config.supply):
         raise MotionRefused(
             f"{model.config.name}: the arm cannot be held at home, where motions begin, within what the margins leave: "
             f"{'; '.join(weak)}"

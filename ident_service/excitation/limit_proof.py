@@ -34,7 +34,7 @@ from ident_service.config.motion_design import Supply
 from ident_service.config.motion_limits import MotionLimits, motor_limits
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.excitation.optimal_design import Task
-from ident_service.excitation.tracking import Tracking, track, way_width
+from ident_service.excitation.tracking import Tracking, segment_tube_width, track
 from ident_service.excitation.trajectory import STEP_PEAKS, Basis, FourierPath, Path, PosturePath
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.chain import Array
@@ -136,9 +136,11 @@ class PeakBounds:
                 peak, limit = getattr(self, key), getattr(limits, key)
                 if not peak[k] <= limit[k]:
                     found.append(f"{name}: {key} {peak[k]:.3f} exceeds {limit[k]:g}")
-        return found + self.forces_beyond(names, limits, supply)
+        return found + self.torque_and_power_violations(names, limits, supply)
 
-    def forces_beyond(self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None) -> list[str]:
+    def torque_and_power_violations(
+        self, names: tuple[str, ...], limits: MotionLimits, supply: Supply | None = None
+    ) -> list[str]:
         """Return the violations of torque and power alone, in words."""
         found = []
         if self.torque is not None:
@@ -464,7 +466,7 @@ def proof_of(
     proof = replace(proof, clearance=clear(path, tracking.width))
     if violations(proof, model, limits):
         return proof
-    return replace(proof, approach=clear(ways, way_width(ways, model, margin)))
+    return replace(proof, approach=clear(ways, segment_tube_width(ways, model, margin)))
 
 
 def _approach_paths(path: FourierPath | PosturePath, limits: MotionLimits) -> PosturePath:
@@ -481,7 +483,7 @@ def _approach_paths(path: FourierPath | PosturePath, limits: MotionLimits) -> Po
 def violations(proof: Proof, model: ArmModel, limits: MotionLimits) -> list[str]:
     """Return every limit that is not proven to be kept, in words; empty when all are."""
     found = proof.demands.violations(model.chain.names, limits, model.config.supply)
-    forces = proof.ways.forces_beyond(model.chain.names, limits, model.config.supply)
+    forces = proof.ways.torque_and_power_violations(model.chain.names, limits, model.config.supply)
     found += [f"at home, or on the way from it or back: {one}" for one in forces]
     if proof.tracking is not None:
         found += proof.tracking.objections(model.chain.names, limits)

@@ -336,7 +336,7 @@ def search(
     with _crew(task, safe, seed, budget, per_period, cancelled) as crew:
         run.starts(crew)
         run.polish(crew)
-        while run.goes_on():
+        while run.has_time_for_starts():
             run.starts(crew)
             run.polish(crew)
     return run.found()
@@ -403,7 +403,7 @@ class _Run:
         elapsed = self._before + time.monotonic() - self._begun
         return SearchResult(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
-    def goes_on(self) -> bool:
+    def has_time_for_starts(self) -> bool:
         """Return whether there is time for further starts, and the budget allows them."""
         seconds, starts = self._budget.seconds, self._budget.starts
         return seconds is not None and starts is None and not self._over(self._begun + seconds)

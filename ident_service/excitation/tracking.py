@@ -171,7 +171,7 @@ def track(path: Path, model: ArmModel, margin: float) -> Tracking:
     return Tracking(error, velocity, beyond, worst, tube, repeated, from_)
 
 
-def way_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Array], Array]:
+def segment_tube_width(path: Path, model: ArmModel, margin: float) -> Callable[[Array, Array], Array]:
     """Simulate the arm over slow segments as `track`, long ones in parts, whose largest error then counts throughout.
 
     A joint that dry friction holds moves only when the reference has left it behind by `|M^-1| f / kp`, which on a slow

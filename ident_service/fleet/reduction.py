@@ -201,7 +201,7 @@ def _require_workers(client: Client, address: str, tell: Tell) -> None:
     tell(f"{len(versions['workers'])} workers of {address}, dashboard {client.dashboard_link}")
 
 
-def in_turn(
+def in_order(
     client: Client, function: Callable[..., _Result], tasks: Sequence[tuple[Any, ...]], failed: Callable[[int], _Result]
 ) -> Iterator[tuple[int, _Result]]:
     """Run a function on each tuple of arguments and yield number and result as they come.
@@ -374,7 +374,7 @@ def _mapped(client: Client, parts: Sequence[Part], described: Described, store: 
         return Outcome(part, None, Problem(part.source.url, part.label, "worker", text))
 
     step = max(len(parts) // 10, 1)
-    for count, (number, outcome) in enumerate(in_turn(client, reduce_recording, tasks, died), 1):
+    for count, (number, outcome) in enumerate(in_order(client, reduce_recording, tasks, died), 1):
         if outcome.problem is not None and outcome.problem.kind == "version":
             raise UsageError(outcome.problem.message)
         outcomes[number] = outcome

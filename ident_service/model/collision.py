@@ -208,7 +208,7 @@ def _of_body(scene: Scene, body: Body) -> Array:
     for k in reversed(chain.ancestors(body.joint)):
         result[k] = hull.radius if chain.revolute[k] else 1.0
         if chain.parents[k] != WORLD:
-            hull = _seen_from_parent(scene, k, hull)
+            hull = _bounds_in_parent_frame(scene, k, hull)
     return result
 
 
@@ -245,7 +245,7 @@ def _hull(points: Array, axis: Array, across: float, along: float, ball: float) 
     )
 
 
-def _seen_from_parent(scene: Scene, joint: int, hull: _Hull) -> _Hull:
+def _bounds_in_parent_frame(scene: Scene, joint: int, hull: _Hull) -> _Hull:
     """Return bounds of the points, wherever the joint stands, about the parent joint."""
     chain = scene.chain
     axis = chain.rotation[joint] @ chain.axes[joint]

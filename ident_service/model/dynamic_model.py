@@ -17,7 +17,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.friction_state import advance_dahl_state, presliding_ways
+from ident_service.model.friction_state import advance_dahl_state, presliding_distances
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.parameter_layout import WrittenArm, joint_drives
 from ident_service.model.pinocchio_models import chain_of, pinocchio_model
@@ -53,7 +53,7 @@ class DynamicModel:
         chain, layout = arm.chain, arm.layout
         links_only = np.array(delta, dtype=float)
         links_only[layout.term_columns("drive_inertia")] = 0.0
-        self.arm, self.delta, self.presliding = arm, delta, presliding_ways(arm)
+        self.arm, self.delta, self.presliding = arm, delta, presliding_distances(arm)
         self.model = pinocchio_model(replace(chain, coupling=np.eye(chain.joints)), layout, links_only)
         self.model.name = arm.config.name
         drives = joint_drives(chain, layout, delta)

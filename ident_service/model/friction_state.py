@@ -24,7 +24,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
 
 
-def presliding_ways(model: ArmModel) -> Array:
+def presliding_distances(model: ArmModel) -> Array:
     """Return the pre-sliding distance x0 per drive [rad or m], shape (joints,).
 
     Zero where dry friction turns round at once: nothing was fitted, or the arm has no dry friction.

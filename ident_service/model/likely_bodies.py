@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from ident_service.config.motion_design import Capsule
-from ident_service.config.payload import knowledge_with_payload
+from ident_service.config.payload import constraints_with_payload
 from ident_service.model.arm_model import ArmModel, control_model, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.mechanism import read_mechanism
@@ -55,7 +55,7 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     """
     chain, layout = model.chain, model.layout
     # A prior has the payload already; guesses are of the arm alone, and it comes on top of them.
-    config = model.config if model.prior is None else knowledge_with_payload(model.config)
+    config = model.config if model.prior is None else constraints_with_payload(model.config)
     delta, guessed = np.zeros(layout.size), []
     for link, name in enumerate(chain.names):
         place = layout.inertial(link)

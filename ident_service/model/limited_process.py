@@ -15,7 +15,7 @@ from typing import Any
 from ident_service.errors import ModelError
 
 
-def ask_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
+def run_limited_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
     """Run a module on a file and return what it answers.
 
     Args:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
-from ident_service.model.limited_process import ask_process
+from ident_service.model.limited_process import run_limited_process
 
 Kind = Literal["urdf", "mjcf"]
 MOST_BYTES: Final = 2 * 2**20
@@ -403,7 +403,7 @@ def _mjcf_document(file: TextFile, part: str | None, *, own: bool) -> dict[str, 
 
             return mjcf_document(str(path), part)
         try:
-            return ask_process(
+            return run_limited_process(
                 "ident_service.model.mechanism_process", path, _DEADLINE, *([] if part is None else [part])
             )
         except ModelError as error:

@@ -90,7 +90,7 @@ def arm_part(
         ModelError: a link or joint that does not exist, a value outside a joint's limits, a tip that does not hang on
             the base, a joint that follows one of the arm, or locks that contradict each other.
     """
-    inside = _between(model, part, file)
+    inside = _joints_between(model, part, file)
     held = {name: _checked(model, name, value, file) for name, value in part.lock.items()}
     outside = {str(name) for name in model.names[1:]} - inside - set(held)
     held |= {name: _rest(model, name) for name in outside if name not in followers}
@@ -142,7 +142,7 @@ def _require_agreement(name: str, follower: Mimic, held: Mapping[str, float], fi
         )
 
 
-def _between(model: pin.Model, part: ArmSelection, file: str) -> set[str]:
+def _joints_between(model: pin.Model, part: ArmSelection, file: str) -> set[str]:
     """Return the joints between base and tip, without those on the way to the base or off the way to the tip."""
     ids = set(range(1, model.njoints))
     if part.base is not None:

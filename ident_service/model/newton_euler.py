@@ -126,7 +126,7 @@ def mass_matrix(
     n = chain.joints
     steps = [_Step(tape, chain, k, q) for k in range(n)]
     composite = [
-        _seen_from(
+        _moved_to_origin(
             _link_body(layout, parameters, k), _rows(chain.link_rotation[k]), to_vector(chain.link_translation[k])
         )
         for k in range(n)
@@ -145,7 +145,7 @@ def mass_matrix(
             at = parent
             M[at][k] = M[k][at] = steps[at].felt(force, moment)
         if (parent := chain.parents[k]) != WORLD:
-            composite[parent] = _sum(composite[parent], _seen_from(body, _transposed(step.rotation), step.arm))
+            composite[parent] = _sum(composite[parent], _moved_to_origin(body, _transposed(step.rotation), step.arm))
     for drive, column in enumerate(layout.term_columns("drive_inertia")):
         inertia = parameters.get(int(column), 0.0)
         share = to_vector(chain.coupling[drive])
@@ -265,7 +265,7 @@ def _link_wrench(chain: Chain, link: int, motion: tuple[Vector, Vector, Vector],
     return force, add(rotate(back, moment), cross(arm, force))
 
 
-def _seen_from(body: _Body, rotation: Rotation, arm: Vector) -> _Body:
+def _moved_to_origin(body: _Body, rotation: Rotation, arm: Vector) -> _Body:
     """Return the body about the origin that its own lies `arm` away from, turned by `rotation` (Steiner, eq. 8)."""
     first = rotate(rotation, body.first)
     half = _transposed([rotate(rotation, row) for row in body.L])  # R L, since L is symmetric

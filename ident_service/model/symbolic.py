@@ -289,7 +289,7 @@ class _Backwards:
                 self._add(value.index, seed)
         for at in range(len(tape.steps) - 1, -1, -1):
             if at in self.adjoints:
-                self._through(at, self.adjoints[at])
+                self._propagate_adjoint(at, self.adjoints[at])
 
     def _input(self, kind: str, number: int) -> Symbol:
         self.order.append((kind, number))
@@ -308,7 +308,7 @@ class _Backwards:
             self.known[at] = self._input("kept", number)
         return self.known[at]
 
-    def _through(self, at: int, adjoint: Value) -> None:
+    def _propagate_adjoint(self, at: int, adjoint: Value) -> None:
         """Propagate the adjoint of a step to its operands."""
         operation, a, b = self._steps[at]
         if operation == "mul":

@@ -26,7 +26,7 @@ _POSTURES, _SEED = 64, 1
 HOME_AFTER: Final = frozenset({"lease_lost", "recorder_behind", "no_way_back", "late_cycles", "controls_failed"})
 
 
-class AfterStop(Enum):
+class StopSecuring(Enum):
     """Name the ways to secure a stopped arm that rests."""
 
     BRAKE = "brake"  # held for a while, then a quick stop: brakes close, or nothing weighs
@@ -53,7 +53,7 @@ def falling_joints(model: ArmModel, limits: MotionLimits) -> tuple[str, ...]:
     return tuple(name for name, falls in zip(model.chain.names, weight > WEIGHS * limits.torque, strict=True) if falls)
 
 
-def after_stop(model: ArmModel, limits: MotionLimits) -> AfterStop:
+def after_stop(model: ArmModel, limits: MotionLimits) -> StopSecuring:
     """Return how this arm is secured after a stop: braked, held or lowered.
 
     Args:
@@ -65,11 +65,11 @@ def after_stop(model: ArmModel, limits: MotionLimits) -> AfterStop:
     """
     asked = model.config.control.after_stop
     if asked in ("hold", "lower"):
-        return AfterStop(asked)
+        return StopSecuring(asked)
     loose = [name for name in falling_joints(model, limits) if not model.config.has_brake(name)]
     if loose:
         raise MotionRefused(
             f"{model.config.name}: {', '.join(loose)} would fall after a stop: gravity moves them, and no brake is "
             f"described; set control.after_stop to hold or lower, or joints.{loose[0]}.brake to true where there is one"
         )
-    return AfterStop.BRAKE
+    return StopSecuring.BRAKE

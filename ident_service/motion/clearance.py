@@ -134,7 +134,9 @@ def _touches(what: str, time: float, pair: str | None, distance: float) -> str:
     return f"a stop out of the {what} at {time:.2f} s would touch: {pair}, {distance:.4f} m"
 
 
-def way_clearance(collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float) -> Clearance:
+def trajectory_clearance(
+    collision: CollisionModel, reference: Reference, limits: MotionLimits, least: float
+) -> Clearance:
     """Compute the certified clearance of a trajectory within the velocity limits; proven if at least `least` [m]."""
 
     def position(time: Vector) -> Vector:
@@ -186,12 +188,12 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
         return
     least = model.config.workspace.clearance
     _require_proven("the motion", certified_clearance(collision, path, least), least)
-    require_ways_clear(model, [("the path to or from the motion", way) for way in ways], limits)
+    require_clear_trajectories(model, [("the path to or from the motion", way) for way in ways], limits)
     if touching := touching_stop(path, limits, model):
         raise MotionRefused(touching)
 
 
-def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], limits: MotionLimits) -> None:
+def require_clear_trajectories(model: ArmModel, ways: Sequence[tuple[str, Reference]], limits: MotionLimits) -> None:
     """Refuse trajectories that come too near to anything, or out of which a stop would touch something.
 
     Args:
@@ -207,7 +209,7 @@ def require_ways_clear(model: ArmModel, ways: Sequence[tuple[str, Reference]], l
         return
     least = model.config.workspace.clearance
     for what, way in ways:
-        _require_proven(what, way_clearance(collision, way, limits, least), least)
+        _require_proven(what, trajectory_clearance(collision, way, limits, least), least)
         if touching := run_to_end(stops_touching(collision, way, limits)):
             raise MotionRefused(touching)
 

@@ -320,7 +320,7 @@ class ControlFile:
         """Return whether the arm is to pause."""
         return self._memory[_PAUSE] != 0
 
-    def ask_pause(self, wanted: bool) -> None:
+    def request_pause(self, wanted: bool) -> None:
         """Pause the arm, or let it go on."""
         self._memory[_PAUSE] = int(wanted)
 
@@ -329,7 +329,7 @@ class ControlFile:
         """Return whether the run is to end early, where it began."""
         return self._memory[_FINISH] != 0
 
-    def ask_finish(self) -> None:
+    def request_finish(self) -> None:
         """Let the run end early, in order; cannot be taken back. A pause stays one until that is taken back."""
         self._memory[_FINISH] = 1
 
@@ -369,7 +369,7 @@ class ControlFile:
             self._memory[_WAITING] = 0
         self._memory[_HOMING] = stage
 
-    def ask_home(self) -> None:
+    def request_home(self) -> None:
         """Have the arm, which is held after a stop, led home; `renew_home` from now on, four times a second.
 
         Raises:
@@ -388,7 +388,7 @@ class ControlFile:
         """Renew the lease of the requester of the motion home."""
         self._words[_HOME_RENEWED // 8] = self._now_ns()
 
-    def home_lease_ok(self) -> bool:
+    def home_lease_is_valid(self) -> bool:
         """Return whether the lease of the requester of the motion home was renewed within `LEASE_SECONDS`."""
         return self._now_ns() - self._words[_HOME_RENEWED // 8] <= round(LEASE_SECONDS * 1e9)
 
@@ -428,7 +428,7 @@ def controlling_pid(path: Path) -> int | None:
         return None
 
 
-def stop_asked_ns(path: Path) -> int:
+def stop_requested_ns(path: Path) -> int:
     """Return when a stop of the arm was asked for last [ns of the machine's monotonic clock]; 0 where none is known."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
@@ -533,7 +533,7 @@ class SupervisedCommands:
         The motion home of a held arm has another requester, whose lease counts instead.
         """
         if self._controls.homing is Homing.GOING:
-            return self._lock_step or self._controls.home_lease_ok()
+            return self._lock_step or self._controls.home_lease_is_valid()
         return not self.cut and (self._lock_step or self._controls.lease_ok(now_ns))
 
 
@@ -557,7 +557,7 @@ class InterruptibleArm(Arm):
 
     def enable(self) -> None:
         """Enable the wrapped arm; raises DriverError instead once a stop was asked for."""
-        self._require_not_asked()
+        self._require_no_stop_request()
         self._arm.enable()
 
     def reset(self) -> None:
@@ -567,12 +567,12 @@ class InterruptibleArm(Arm):
     def exchange(self, torque: Vector | None) -> Sample:
         """Exchange with the wrapped arm; raises DriverError instead of sending a torque once a stop was asked for."""
         if torque is not None:
-            self._require_not_asked()
+            self._require_no_stop_request()
         return self._arm.exchange(torque)
 
     def exchange_position(self, position: Vector) -> Sample:
         """Exchange with the wrapped arm; raises DriverError instead of sending a position likewise."""
-        self._require_not_asked()
+        self._require_no_stop_request()
         return self._arm.exchange_position(position)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
@@ -608,6 +608,6 @@ class InterruptibleArm(Arm):
         """Close the wrapped arm."""
         self._arm.close()
 
-    def _require_not_asked(self) -> None:
+    def _require_no_stop_request(self) -> None:
         if self._asked():
             raise DriverError("a stop was requested")

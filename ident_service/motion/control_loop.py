@@ -25,7 +25,7 @@ import numpy as np
 from drivers.arm import Arm, Flags, Sample, Vector
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, DriverError
-from ident_service.motion.after_stop import HOME_AFTER, AfterStop
+from ident_service.motion.after_stop import HOME_AFTER, StopSecuring
 from ident_service.motion.command_channel import Controls, Homing
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines
@@ -92,7 +92,7 @@ class Loop:
     limits: MotionLimits
     hold_seconds: float
     peaks: Peaks
-    after_stop: AfterStop = AfterStop.BRAKE
+    after_stop: StopSecuring = StopSecuring.BRAKE
     floor_reached: Callable[[Vector], bool] = lambda position: False
     gives_positions: bool = False
     ended_by: Fault | None = None
@@ -166,9 +166,9 @@ class Loop:
             if found is not None:
                 self._react(found, stamp_ns)
         self._remember(sample, usable, reference)
-        if self._rests(stamp_ns):
+        if self._check_end_of_phase(stamp_ns):
             return None
-        self._obey(woken_ns, stamp_ns)
+        self._apply_commands(woken_ns, stamp_ns)
         return target
 
     def _law(self, sample: Sample, usable: Flags, reference: Setpoint, free: bool) -> Vector:
@@ -212,7 +212,7 @@ class Loop:
     def _lower(self, stamp_ns: int, after: float = 0.0) -> None:
         self._lowering, self._since_ns = Lowering(self.limits, stamp_ns, after), stamp_ns
 
-    def _rests(self, stamp_ns: int) -> bool:
+    def _check_end_of_phase(self, stamp_ns: int) -> bool:
         """Check for the ends of stops, pauses, holds and lowerings; returns whether this was the last cycle.
 
         Raises:
@@ -232,11 +232,11 @@ class Loop:
             self._rested += 1
             self._needed = self._needed + self.control.correction + self.control.feedforward
         else:
-            self._forget_rest()
+            self._reset_rest_count()
         if self._rested >= REST_CYCLES:
             if state is State.PAUSING:
                 self.course.stood()
-                self._forget_rest()
+                self._reset_rest_count()
                 return False
             self.states.enter(State.STOPPED)
             self._since_ns = stamp_ns
@@ -247,27 +247,27 @@ class Loop:
 
     def _held(self, stamp_ns: int, since: float) -> bool:
         """Check for the end of a hold, which for an arm without brakes is the beginning of its lowering."""
-        if self.after_stop is AfterStop.BRAKE:
+        if self.after_stop is StopSecuring.BRAKE:
             return since >= self.hold_seconds
-        if self.after_stop is AfterStop.LOWER:
+        if self.after_stop is StopSecuring.LOWER:
             if since >= self.hold_seconds:
                 self.tell(Severity.WARNING, stamp_ns, LOWERS)
                 self._lower(stamp_ns)
             return False
         if not self._waiting:
             self._waiting, self._anchor = True, Anchor(self.limits, self.control.position)
-            if self._asked_controls(lambda: self.controls.homing is Homing.GOING, stamp_ns):
-                self._tell_homing(Homing.ENDED, stamp_ns)
-            self._asked_controls(self.controls.wait_for_support, stamp_ns)
+            if self._read_hold_commands(lambda: self.controls.homing is Homing.GOING, stamp_ns):
+                self._report_homing(Homing.ENDED, stamp_ns)
+            self._read_hold_commands(self.controls.wait_for_support, stamp_ns)
             self.tell(Severity.WARNING, stamp_ns, WAITS)
-        elif self._asked_controls(lambda: self.controls.supported, stamp_ns):
+        elif self._read_hold_commands(lambda: self.controls.supported, stamp_ns):
             self.tell(Severity.WARNING, stamp_ns, LOWERS)
             self._lower(stamp_ns)
-        elif self._asked_controls(lambda: self.controls.homing is Homing.ASKED, stamp_ns):
-            self._lead_home(stamp_ns)
+        elif self._read_hold_commands(lambda: self.controls.homing is Homing.ASKED, stamp_ns):
+            self._plan_motion_home(stamp_ns)
         return False
 
-    def _lead_home(self, stamp_ns: int) -> None:
+    def _plan_motion_home(self, stamp_ns: int) -> None:
         """Search for a trajectory home of a held arm, a slice in each cycle, and start it when found."""
         refusal = None
         if self.ended_by is not None and self.ended_by.code not in HOME_AFTER:
@@ -276,25 +276,25 @@ class Loop:
             # From where the stop has left the reference, unless the arm was led away by hand: the torque has no step.
             wanted, here = self.course.reference.position, self.control.position
             near = (np.abs(wanted - here) <= 0.5 * self.limits.following_error).all()
-            self.course.lead_home(wanted if near else here)
+            self.course.plan_homing(wanted if near else here)
             self._leading = True
         else:
             refusal = self.course.look_for_way_back()
         if refusal is not None:
             self._leading = False
             self.tell(Severity.WARNING, stamp_ns, f"not moved home: {refusal}")
-            self._tell_homing(Homing.REFUSED, stamp_ns)
-        elif self.course.leads_home(stamp_ns):
+            self._report_homing(Homing.REFUSED, stamp_ns)
+        elif self.course.try_homing(stamp_ns):
             self._leading = self._waiting = False
             self._anchor, self._level = None, Reaction.WARN
-            self._forget_rest()
+            self._reset_rest_count()
             self.tell(Severity.WARNING, stamp_ns, LEADS)
-            self._tell_homing(Homing.GOING, stamp_ns)
+            self._report_homing(Homing.GOING, stamp_ns)
 
-    def _tell_homing(self, stage: Homing, stamp_ns: int) -> None:
-        self._asked_controls(lambda: self.controls.tell_homing(stage), stamp_ns)
+    def _report_homing(self, stage: Homing, stamp_ns: int) -> None:
+        self._read_hold_commands(lambda: self.controls.tell_homing(stage), stamp_ns)
 
-    def _asked_controls(self, ask: Callable[[], object], stamp_ns: int) -> bool:
+    def _read_hold_commands(self, ask: Callable[[], object], stamp_ns: int) -> bool:
         """Ask the controls about a held arm, which must not fall because they fail."""
         try:
             return bool(ask())
@@ -312,7 +312,7 @@ class Loop:
         self.lowered = lowering.update(stamp_ns, self.control.position, self.control.velocity) or (
             lowering.share < 1.0 and self.floor_reached(self.control.position)
         )
-        braked = self.after_stop is AfterStop.BRAKE and since >= LOWER_AFTER + LOWER
+        braked = self.after_stop is StopSecuring.BRAKE and since >= LOWER_AFTER + LOWER
         if not self.lowered and not braked:
             return False
         if self.states.state is State.STOPPED:
@@ -321,10 +321,10 @@ class Loop:
             raise AssertionError("an arm that was not stopped is lowered because of a fault only")
         raise self._end(self.ended_by)
 
-    def _forget_rest(self) -> None:
+    def _reset_rest_count(self) -> None:
         self._rested, self._needed = 0, np.zeros_like(self._needed)
 
-    def _obey(self, now_ns: int, stamp_ns: int) -> None:
+    def _apply_commands(self, now_ns: int, stamp_ns: int) -> None:
         """Obey the controls; whatever goes wrong while reading them stops the arm, too."""
         try:
             stop, pause, lease = self.controls.stop, self.controls.pause, self.controls.lease_ok(now_ns)
@@ -337,7 +337,7 @@ class Loop:
         if stop:
             self.course.stop(stamp_ns)
         elif not lease:
-            self._lapse(stamp_ns)
+            self._react_to_lost_lease(stamp_ns)
         else:
             if pause:
                 self.course.pause(stamp_ns)
@@ -345,25 +345,25 @@ class Loop:
                 self.course.finish(stamp_ns)
         if self.states.state is State.PAUSED:
             refusal = self.course.look_for_way_back()
-            self._tell_of_no_finish(stamp_ns)
+            self._report_finish_refused(stamp_ns)
             if refusal is not None:
                 self._react(self.guard.findings.found("no_way_back", refusal), stamp_ns)
             elif not pause:
                 self.course.go_on(stamp_ns)
 
-    def _tell_of_no_finish(self, stamp_ns: int) -> None:
+    def _report_finish_refused(self, stamp_ns: int) -> None:
         why = self.course.not_finished
         if why and "finish" not in self._told:
             self._told.add("finish")
             self.tell(Severity.WARNING, stamp_ns, f"not finished early, continues to its end: {why}")
 
-    def _lapse(self, stamp_ns: int) -> None:
+    def _react_to_lost_lease(self, stamp_ns: int) -> None:
         """React to a lost lease; a stop that is under way already does not become a fault by it."""
         if self.states.state not in (State.STOPPING, State.STOPPED):
             self._react(self.guard.findings.found("lease_lost", "the lease has ended"), stamp_ns)
 
     def _record(self, sample: Sample, reference: Setpoint, compute_ns: int) -> Fault | None:
-        if self.states.state is State.STOPPED and self.after_stop is not AfterStop.BRAKE:
+        if self.states.state is State.STOPPED and self.after_stop is not StopSecuring.BRAKE:
             # No identification uses these samples, and a person may let an arm wait for hours.
             self._recorded = self._recorded or (sample.stamp_ns - self._since_ns) * 1e-9 > self.hold_seconds
         if self._recorded:

@@ -31,7 +31,7 @@ from ident_service.model.pinocchio_models import InverseDynamics
 # the direction of one that slid, since friction is larger at rest and other joints react.
 STANDING, SLIDING = 3.0, 1.0
 SLID = 20  # cycles within which a second step in the same direction shows that a joint slides
-OWED, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
+HIDDEN_SHARE, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
 
 
 class FrozenEncoderObserver:
@@ -58,7 +58,7 @@ class FrozenEncoderObserver:
         """
         self._dynamics, self._least, self._period = dynamics, least or dynamics, period
         self._standing, self._sliding = STANDING * friction, SLIDING * friction
-        self._hidden = OWED * limits.following_error + STEPS * resolution
+        self._hidden = HIDDEN_SHARE * limits.following_error + STEPS * resolution
         self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
         self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
         self._base_fed = np.zeros_like(friction)
@@ -104,12 +104,12 @@ class FrozenEncoderObserver:
         change = pushed - self._base
         allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
         if not (np.abs(change) > allowed).any():
-            self._forgive()
+            self._reset_estimate()
             return self._none
         if not correction.any():
             self._base, self._base_answer = correction.copy(), answer.copy()
             self._base_fed = np.zeros_like(correction)
-            self._forgive()
+            self._reset_estimate()
             return self._none
         inertia = np.diag(self._dynamics.mass_matrix(position))
         own = np.sign(change) * (inertia * (answer - self._base_answer) + feedforward - self._base_fed)
@@ -120,7 +120,7 @@ class FrozenEncoderObserver:
         self._owing = True
         return np.asarray(self._way > self._hidden)
 
-    def _forgive(self) -> None:
+    def _reset_estimate(self) -> None:
         if self._owing:
             self._speed, self._way, self._owing = np.zeros_like(self._speed), np.zeros_like(self._way), False
 

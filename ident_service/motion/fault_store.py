@@ -95,7 +95,7 @@ class FaultStore:
         Raises:
             UsageError: a file is damaged.
         """
-        return self._remembered(moving=in_use(self._controls))
+        return self._read_stored(moving=in_use(self._controls))
 
     def began(self, run: Path) -> None:
         """Mark that this process, which has taken the control file, is about to move the arm.
@@ -107,7 +107,7 @@ class FaultStore:
             MotionRefused: there is an unacknowledged fault.
             UsageError: a file is damaged, or cannot be written.
         """
-        self.require_none({one.code: one.cause for one in self._remembered(moving=False)})
+        self.require_none({one.code: one.cause for one in self._read_stored(moving=False)})
         self._mark.parent.mkdir(parents=True, exist_ok=True)
         mark = {"pid": os.getpid(), "run": str(run), "began": time.time()}
         write_atomically(self._mark, json.dumps(mark) + "\n" + " " * _ROOM)
@@ -120,7 +120,7 @@ class FaultStore:
         Raises:
             UsageError: a file is damaged, or cannot be written.
         """
-        with self._alone():
+        with self._locked():
             mark = self._marked()
             if mark is not None and mark.faults:
                 self._write_into_mark(mark, json.dumps(_ENDED), mark.size)
@@ -143,7 +143,7 @@ class FaultStore:
             UsageError: the file is damaged, or neither can be written.
         """
         fault = StoredFault(code, cause, time.time())
-        with self._alone():
+        with self._locked():
             try:
                 rows = self._rows()
                 if all(row.code != code for row in rows):
@@ -163,7 +163,7 @@ class FaultStore:
             UsageError: no fault of this name is latched, or a file was damaged by somebody; or the arm is still held
                 after it, whereupon it would be latched again.
         """
-        with self._alone():
+        with self._locked():
             return self._acknowledged(code)
 
     def _acknowledged(self, code: str) -> str:
@@ -187,7 +187,7 @@ class FaultStore:
         return faults[code]
 
     @contextmanager
-    def _alone(self) -> Iterator[None]:
+    def _locked(self) -> Iterator[None]:
         """Let one process at a time read the faults and write them."""
         try:
             self._faults.parent.mkdir(parents=True, exist_ok=True)
@@ -201,7 +201,7 @@ class FaultStore:
             fcntl.flock(fd, fcntl.LOCK_UN)  # a process that is being started has the open folder, too
             os.close(fd)
 
-    def _remembered(self, *, moving: bool) -> tuple[StoredFault, ...]:
+    def _read_stored(self, *, moving: bool) -> tuple[StoredFault, ...]:
         mark = self._marked()
         rows = self._stored(mark)
         if moving or mark is None or mark.ended:

@@ -77,7 +77,7 @@ class PositionFile:
                 }
                 write_atomically(self._path, json.dumps(document, indent=1) + "\n")
 
-    def require_not_turned(self, arm: Arm) -> None:
+    def require_no_lost_turns(self, arm: Arm) -> None:
         """Look at an open arm once, and refuse to move one whose motors seem to have turned by whole turns.
 
         Raises:

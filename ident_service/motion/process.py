@@ -184,7 +184,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) 
                 raise MotionRefused(f"nothing would be recorded: {sink.error or 'the recorder cannot keep up'}")
             if lifeline.cut:
                 raise MotionRefused("the program that started the motion has ended")
-            positions.require_not_turned(arm)
+            positions.require_no_lost_turns(arm)
             positions.forget()
             moves = True
             report = follow(arm, model, plan, sink, lifeline, latch=latch)

@@ -28,7 +28,7 @@ from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import Contact
 from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.pinocchio_models import InverseDynamics
-from ident_service.motion.after_stop import ONLY_BRAKED, AfterStop, after_stop
+from ident_service.motion.after_stop import ONLY_BRAKED, StopSecuring, after_stop
 from ident_service.motion.clearance import ClearanceChecker
 from ident_service.motion.command_channel import Controls, StopCondition
 from ident_service.motion.control_loop import REST_CYCLES, REST_SPEED, Loop, Peaks
@@ -267,11 +267,11 @@ class _Run:
                 self.states.enter(State.DONE)
         except BaseException as error:
             self._halt(error, loop)
-            _tell_before(error, loop)
+            _add_earlier_faults(error, loop)
             raise
         if loop.ended_by is not None:
             fault = ArmFault(loop.ended_by.code, loop.ended_by.message, loop.last)
-            _tell_before(fault, loop)
+            _add_earlier_faults(fault, loop)
             raise fault
         peaks = loop.peaks
         return RunReport(
@@ -326,7 +326,7 @@ class _Run:
             raise MotionRefused(f"{model.config.name}: computed torque needs prior parameters")
         self.after_stop = after_stop(model, limits)
         described = arm.describe()
-        if described.streams_position and self.after_stop is not AfterStop.BRAKE:
+        if described.streams_position and self.after_stop is not StopSecuring.BRAKE:
             raise MotionRefused(f"{model.config.name}: {ONLY_BRAKED}")
         if described.joint_names != chain.names:
             raise MotionRefused(
@@ -449,7 +449,7 @@ class _Run:
             loop.tell(rule.severity, now_ns, cause)
 
 
-def _tell_before(error: BaseException, loop: Loop) -> None:
+def _add_earlier_faults(error: BaseException, loop: Loop) -> None:
     """Add the first fault and the warnings before a fault to its error, as notes."""
     first, warnings = loop.ended_by, loop.guard.findings.warnings
     if first is not None and first.message not in str(error):

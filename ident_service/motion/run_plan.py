@@ -21,10 +21,10 @@ from ident_service.motion.clearance import (
     position_limit_violations,
     relaxed_limits,
     require_clear,
+    require_clear_trajectories,
     require_near,
-    require_ways_clear,
 )
-from ident_service.motion.speed_scaling import Slowed
+from ident_service.motion.speed_scaling import ScaledMotion
 from ident_service.motion.state_machine import State
 from ident_service.motion.stop_trajectory import require_stops_within_limits
 from ident_service.motion.trajectory import PathReference, Reference, plan_reduced_trajectory, rest
@@ -84,7 +84,7 @@ class ExcitationPlan:
             plan_reduced_trajectory(rest(start), begin, limits),
             plan_reduced_trajectory(end, rest(start), limits),
         )
-        slowed = [Slowed(way, self.speed) for way in (there, exciting, back)]
+        slowed = [ScaledMotion(way, self.speed) for way in (there, exciting, back)]
         require_clear(model, self.excitation.path, [slowed[0], slowed[-1]], limits)
         return list(zip((State.APPROACHING, State.EXCITING, State.RETURNING), slowed, strict=True))
 
@@ -125,7 +125,7 @@ class PointToPointPlan:
         end = limits.home if self.destination is Destination.HOME else just_inside(start, limits)
         way = plan_reduced_trajectory(rest(start), rest(end), relaxed_limits(start, limits))
         try:
-            require_ways_clear(model, [(f"the path {self.destination.value}", way)], limits)
+            require_clear_trajectories(model, [(f"the path {self.destination.value}", way)], limits)
         except MotionRefused as error:
             raise MotionRefused(f"{error}; move the arm by hand to where the straight path is free") from None
-        return [(State.RETURNING, Slowed(way, self.speed))]
+        return [(State.RETURNING, ScaledMotion(way, self.speed))]

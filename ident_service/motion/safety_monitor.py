@@ -128,7 +128,7 @@ class MonitoredSample:
 def checks(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
     """Yield all checks of a sample, ordered by how far the data they need can be believed."""
     yield from _what_cannot_be_believed(seen, limits)
-    yield from _what_has_failed(seen)
+    yield from _quick_stop_checks(seen)
     yield from _what_must_end(seen, limits)
     yield from _what_can_be_bridged(seen, limits)
 
@@ -144,14 +144,14 @@ def _what_cannot_be_believed(seen: MonitoredSample, limits: MotionLimits) -> Ite
     yield Check("emergency_stop", _has_status(seen, AxisStatus.EMERGENCY_STOP), "the drive reports an emergency stop")
     what = "position unchanged to the last bit although the joint moved or was pushed"
     yield Check("frozen_encoder", seen.frozen, what)
-    beyond, limit = _beyond(position, limits)
+    beyond, limit = _limit_excess(position, limits)
     what = "at {} {u}, more than a following error beyond the position limit of {} {u}"
     yield Check("far_outside", beyond > limits.following_error, what, (position, limit))
     what = f"moves at {{}} {{u}}/s, more than {VELOCITY_OFF:g} times the limit of {{}} {{u}}/s"
     yield Check("runaway", speed > VELOCITY_OFF * limits.velocity, what, (seen.velocity, limits.velocity))
 
 
-def _what_has_failed(seen: MonitoredSample) -> Iterator[Check]:
+def _quick_stop_checks(seen: MonitoredSample) -> Iterator[Check]:
     """Check for faults that lead to a quick stop."""
     yield Check("drive_fault", _has_status(seen, AxisStatus.FAULT), "the drive reports a fault")
     yield Check("drive_watchdog", _has_status(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
@@ -167,7 +167,7 @@ def _what_must_end(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Chec
     what = "{} {u} from where it should be, {} {u} allowed"
     yield Check("following_lost", away > FOLLOWING_LOST * allowed, what, (away, allowed))
     yield Check("encoder_jumps", seen.jumps >= 2, "position jumped in consecutive cycles")
-    beyond, limit = _beyond(position, limits)
+    beyond, limit = _limit_excess(position, limits)
     yield Check("position_limit", beyond > 0.0, "at {} {u}, beyond the limit of {} {u}", (position, limit))
     towards = np.where(velocity > 0.0, limits.upper - position, position - limits.lower)
     envelope = approach_speed(towards, limits)
@@ -227,7 +227,7 @@ def describe_check(check: Check, names: Sequence[str], units: Sequence[str]) -> 
     return f"{', '.join(dict.fromkeys(names[k] for k in hit))}: {check.what.format(*texts, u=unit, f=force)}"
 
 
-def _beyond(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
+def _limit_excess(position: Vector, limits: MotionLimits) -> tuple[Vector, Vector]:
     """Return how far positions [rad or m] are outside their limits, and the limit concerned, shape (joints,) each."""
     above, below = position - limits.upper, limits.lower - position
     return np.maximum(above, below), np.where(above > below, limits.upper, limits.lower)
@@ -360,7 +360,7 @@ class SafetyMonitor:
         self.findings.cycle += 1
         self._elapsed, self._known = self._period if elapsed is None else elapsed, known
         answered = bool(sample.valid.all())
-        self._count_still(sample, np.maximum(np.abs(correction + feedforward), np.abs(unexplained)))
+        self._count_stationary_cycles(sample, np.maximum(np.abs(correction + feedforward), np.abs(unexplained)))
         self._count_unchanged(sample, velocity)
         if self._owed is not None and answer is not None:
             up, down = sample.position > self._shown, sample.position < self._shown
@@ -424,7 +424,7 @@ class SafetyMonitor:
             change = (leaves - before) / self._period
             what = "the torque was to change by {} {f}/s, {} allowed"
             found = self._found(Check("torque_rate", fast, what, (change, self.rate / self._period)))
-            leaves = self._slowed(before, leaves)
+            leaves = self._rate_limited(before, leaves)
             fault = found if fault is None or found.reaction > fault.reaction else fault
         self._sent = leaves
         return leaves, fault
@@ -444,7 +444,7 @@ class SafetyMonitor:
             return self._target, self._found(
                 Check("position_not_finite", ~finite, "the position asked for is no number")
             )
-        beyond, limit = _beyond(wanted, self._limits)
+        beyond, limit = _limit_excess(wanted, self._limits)
         if (outside := beyond > _ROUNDING).any():
             what = "a position of {} {u} was asked for, the limit is {} {u}"
             return self._target, self._found(Check("position_outside", outside, what, (wanted, limit)))
@@ -457,7 +457,7 @@ class SafetyMonitor:
         self._target = wanted
         return wanted, fault
 
-    def _slowed(self, before: Vector, wanted: Vector) -> Vector:
+    def _rate_limited(self, before: Vector, wanted: Vector) -> Vector:
         """Return the torque on the way from the last one to the one wanted that the rate allows."""
         if self._limits.motors is None:
             return np.clip(wanted, before - self.rate, before + self.rate)
@@ -499,7 +499,7 @@ class SafetyMonitor:
         """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""
         if not (self._none_still and self._all_change) and bool(self._frozen().any()):
             return False
-        if sample.status is not self._healthy and not self._all_well(sample.status):
+        if sample.status is not self._healthy and not self._all_drives_healthy(sample.status):
             return False
         if self._sent is not None and not bool((np.abs(sample.torque - self._sent) <= self._not_applied).all()):
             return False
@@ -516,7 +516,7 @@ class SafetyMonitor:
         self._depths = self._contact.depths(sample.position)
         return bool((self._depths <= 0.0).all())
 
-    def _all_well(self, status: tuple[int, ...]) -> bool:
+    def _all_drives_healthy(self, status: tuple[int, ...]) -> bool:
         """Return whether no drive has tripped or lost its power; remembers healthy status words."""
         if status != self._healthy:
             powered = np.array([bool(word & AxisStatus.POWERED) for word in status])
@@ -539,7 +539,7 @@ class SafetyMonitor:
         self._all_fresh = not self._age.any()
         self._shown = np.where(sample.valid, position, self._shown)
         if sample.status:
-            self._all_well(sample.status)
+            self._all_drives_healthy(sample.status)
         if self._contact is not None and bool(np.isfinite(self._position).all()):
             self._depths = self._contact.depths(self._position)
         seen = MonitoredSample(
@@ -575,7 +575,7 @@ class SafetyMonitor:
             Check("torque_unexplained", long, "the drive measures {} {f} beside the model's, of {}", numbers)
         )
 
-    def _count_still(self, sample: Sample, pushes: Vector) -> None:
+    def _count_stationary_cycles(self, sample: Sample, pushes: Vector) -> None:
         """Count for how many cycles each position has stood still while the controller, or the drive, pushed."""
         pushed = pushes > self._push
         if pushed.any():

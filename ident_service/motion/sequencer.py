@@ -22,11 +22,11 @@ from ident_service.motion.trajectory import (
     Reference,
     RuckigReference,
     Setpoint,
-    calm_way_in_slices,
     hold,
+    plan_reduced_trajectory_in_slices,
+    plan_trajectory_in_slices,
     rest,
     run_to_end,
-    way_in_slices,
 )
 
 _SEARCH_STEP = 0.1  # s
@@ -90,7 +90,7 @@ class Paused:
         here, limits = rest(self._stop.end), limits or self._limits
         for time in _joining_times(self.time, self._motion.duration):
             try:
-                back = yield from way_in_slices(here, self._motion.at(time), limits)
+                back = yield from plan_trajectory_in_slices(here, self._motion.at(time), limits)
                 if surroundings is not None:
                     yield from surroundings.require_clear(back, limits)
                 return Resumed(back, self._motion, time)
@@ -111,7 +111,7 @@ class Paused:
         Raises:
             MotionRefused: the straight way is not free; from any of the steps.
         """
-        away = yield from calm_way_in_slices(rest(self._stop.end), end, limits)
+        away = yield from plan_reduced_trajectory_in_slices(rest(self._stop.end), end, limits)
         if surroundings is not None:
             yield from surroundings.require_clear(away, limits)
         return away
@@ -253,7 +253,7 @@ class TrajectorySequencer:
         """Enter PAUSED, when the arm has come to rest, and begin to search for a trajectory back to the motion."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
-            self._search = self._way_out(self._paused)
+            self._search = self._plan_out_of_pause(self._paused)
 
     def finish(self, stamp_ns: int) -> None:
         """End the run early by way of a pause and a straight return; once, and only before the last reference."""
@@ -262,9 +262,9 @@ class TrajectorySequencer:
         self._finishing = True
         self.pause(stamp_ns)
         if self._states.state is State.PAUSED and self._paused is not None:
-            self._back, self._search = None, self._way_out(self._paused)
+            self._back, self._search = None, self._plan_out_of_pause(self._paused)
 
-    def _way_out(self, paused: Paused) -> Generator[None, None, Resumed | RuckigReference]:
+    def _plan_out_of_pause(self, paused: Paused) -> Generator[None, None, Resumed | RuckigReference]:
         """Search for a trajectory out of a pause: straight back to the start where the run is to be finished early."""
         if self._finishing and self._later and not self.not_finished:
             try:
@@ -300,7 +300,7 @@ class TrajectorySequencer:
             self._states.enter(State.RESUMING)
             self._begin_ns, self._way = stamp_ns, self._back
 
-    def lead_home(self, start: Vector) -> None:
+    def plan_homing(self, start: Vector) -> None:
         """Begin to search for a slow, straight trajectory home of a stopped arm; `look_for_way_back` continues.
 
         Args:
@@ -309,14 +309,14 @@ class TrajectorySequencer:
         limits = slowed_limits(self._limits, HOMING_SPEED)
 
         def search() -> Generator[None, None, Resumed | RuckigReference]:
-            home = yield from calm_way_in_slices(rest(start), rest(self._limits.home), limits)
+            home = yield from plan_reduced_trajectory_in_slices(rest(start), rest(self._limits.home), limits)
             if self._surroundings is not None:
                 yield from self._surroundings.require_clear(home, limits)
             return home
 
         self._away, self._search = None, search()
 
-    def leads_home(self, stamp_ns: int) -> bool:
+    def try_homing(self, stamp_ns: int) -> bool:
         """Begin to go home as soon as a trajectory is found; returns whether that is in this cycle."""
         if self._away is None:
             return False

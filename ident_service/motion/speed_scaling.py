@@ -42,7 +42,7 @@ class Peaks(Protocol):
         """Return the largest jerk [rad/s^3 or m/s^3], shape (joints,)."""
 
 
-class Slowed:
+class ScaledMotion:
     """Represent a motion at a constant share of its speed: a rehearsal.
 
     Attributes:
@@ -151,16 +151,18 @@ def require_factor(factor: float) -> float:
 
 
 def _change_length(before: float, after: float, peaks: Peaks, limits: MotionLimits) -> float:
-    if not _keeps(_LONGEST, before, after, peaks, limits):
+    if not _is_within_limits(_LONGEST, before, after, peaks, limits):
         raise MotionRefused("the motion leaves the limits at the speed asked for, so the speed cannot be changed to it")
     low, high = np.log(_SHORTEST), np.log(_LONGEST)
     for _ in range(24):
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if _keeps(float(np.exp(middle)), before, after, peaks, limits) else (middle, high)
+        low, high = (
+            (low, middle) if _is_within_limits(float(np.exp(middle)), before, after, peaks, limits) else (middle, high)
+        )
     return 1.01 * float(np.exp(high))  # more than what happens between two shares
 
 
-def _keeps(length: float, before: float, after: float, peaks: Peaks, limits: MotionLimits) -> bool:
+def _is_within_limits(length: float, before: float, after: float, peaks: Peaks, limits: MotionLimits) -> bool:
     """Check whether a change of `length` [s] stays within the limits even where all peaks meet."""
     step = after - before
     rate = (before + step * _step(_SHARES))[:, None]

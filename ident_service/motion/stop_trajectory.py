@@ -192,13 +192,13 @@ def _braked(start: Setpoint, limits: MotionLimits, side: Vector) -> StopProfile:
     """Return the quickest stop; where `side` is 1 or -1, the hardest braking before that position limit comes first."""
     pieces: list[Piece] = []
     state = start
-    for piece in (_led_back, _ramped, _held):
+    for piece in (_return_to_limit, _ramped, _held):
         pieces.append(piece(state, limits, side))
         state = after(state, *pieces[-1])
-    return StopProfile(start, [*pieces, *_settled(state, limits)])
+    return StopProfile(start, [*pieces, *_quickest_stop(state, limits)])
 
 
-def _led_back(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
+def _return_to_limit(state: Setpoint, limits: MotionLimits, side: Vector) -> Piece:
     """Return the piece that leads an acceleration beyond its limit back to it."""
     excess = np.maximum(np.abs(state.acceleration) - limits.acceleration, 0.0)
     return -np.sign(state.acceleration) * limits.jerk, excess / limits.jerk
@@ -231,7 +231,7 @@ def _braking(state: Setpoint, limits: MotionLimits, side: Vector) -> Vector:
     return np.minimum(limits.acceleration, np.minimum(standing, turning))
 
 
-def _settled(state: Setpoint, limits: MotionLimits) -> list[Piece]:
+def _quickest_stop(state: Setpoint, limits: MotionLimits) -> list[Piece]:
     """Return the quickest stop from an acceleration within its limit: ramp, hold, ramp back."""
     jerk, largest = limits.jerk, limits.acceleration
     # Where it would go on to if the acceleration were led straight to zero: that is what braking works against.

@@ -142,10 +142,12 @@ def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits
     Raises:
         MotionRefused: as `way`.
     """
-    return run_to_end(calm_way_in_slices(start, end, limits))
+    return run_to_end(plan_reduced_trajectory_in_slices(start, end, limits))
 
 
-def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
+def plan_reduced_trajectory_in_slices(
+    start: Setpoint, end: Setpoint, limits: MotionLimits
+) -> Generator[None, None, RuckigReference]:
     """Plan as `calm_way` does, in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:
@@ -158,7 +160,7 @@ def calm_way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> 
         velocity=np.minimum(limits.velocity, np.maximum(_CALM * limits.velocity, 1.1 * velocity)),
         acceleration=np.minimum(limits.acceleration, np.maximum(_CALM * limits.acceleration, 1.1 * acceleration)),
     )
-    return (yield from way_in_slices(start, end, calm))
+    return (yield from plan_trajectory_in_slices(start, end, calm))
 
 
 def plan_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> RuckigReference:
@@ -167,10 +169,12 @@ def plan_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Ruc
     Raises:
         MotionRefused: no such way exists within the limits, or it would leave the position limits.
     """
-    return run_to_end(way_in_slices(start, end, limits))
+    return run_to_end(plan_trajectory_in_slices(start, end, limits))
 
 
-def way_in_slices(start: Setpoint, end: Setpoint, limits: MotionLimits) -> Generator[None, None, RuckigReference]:
+def plan_trajectory_in_slices(
+    start: Setpoint, end: Setpoint, limits: MotionLimits
+) -> Generator[None, None, RuckigReference]:
     """Plan as `way` does, in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:

@@ -39,7 +39,13 @@ from ident_service.errors import DiskFull, MotionRefused, UsageError
 from ident_service.motion.fault_store import CONTROLS
 from ident_service.operations.moving_arms import moving_arms
 from ident_service.registry.database import FILE, Database, note, registry_error, shortage
-from ident_service.registry.state_folder import LOCK, RESTORING, URL_FILE, require_whole, single_instance
+from ident_service.registry.state_folder import (
+    LOCK,
+    RESTORING,
+    URL_FILE,
+    require_no_interrupted_restore,
+    single_instance,
+)
 from ident_service.registry.tokens import TOKEN_FILE, revoke_first_tokens
 
 FORMAT: Final = "ident-backup"
@@ -88,7 +94,7 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
         DiskFull: the disk of `file` has no room.
         RegistryBusy: another process keeps the registry.
     """
-    require_whole(state)
+    require_no_interrupted_restore(state)
     if not (state / FILE).is_file():
         raise UsageError(f"{state}: has no registry, so there is nothing to back up")
     if file.exists():
@@ -150,7 +156,7 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
         if moving := moving_arms(state):
             raise MotionRefused(f"{', '.join(moving)}: is being moved; stop it first")
         broken_off = (state / RESTORING).exists()
-        if _standing(state) and not (replace or broken_off):
+        if _present_entries(state) and not (replace or broken_off):
             raise UsageError(f"{state}: is not empty; with --replace, what is there goes into a folder in it")
         staging = state / f".{secrets.token_hex(4)}.partial"
         try:
@@ -328,7 +334,7 @@ def _read_document(tar: tarfile.TarFile, entry: tarfile.TarInfo, most: int) -> d
     return document
 
 
-def _standing(state: Path) -> list[str]:
+def _present_entries(state: Path) -> list[str]:
     """Return the names of the state folder's entries that restoring would replace."""
     return [
         path.name
@@ -344,7 +350,7 @@ def _exchange(state: Path, staging: Path) -> str | None:
     `.restoring` exists, and every process refuses the state folder; a restore that is run again begins anew, and the
     old content is kept.
     """
-    standing = [name for name in _standing(state) if name != RESTORING]
+    standing = [name for name in _present_entries(state) if name != RESTORING]
     marker, folder = state / RESTORING, None
     os.sync()  # what was unpacked, before anything moves
     for left in marker.iterdir() if marker.exists() else ():  # left by a restore that was interrupted

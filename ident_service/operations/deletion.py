@@ -51,7 +51,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
     row = known_run(db, run)
     found = _of_run(db, row)
     _require_idle(db, f"the run {run}", _jobs_about(db, row["arm"], run))
-    _require_none(f"the run {run}", found, anyway=anyway)
+    _require_no_dependents(f"the run {run}", found, anyway=anyway)
     forget_run(db, state, run, who)
     return found
 
@@ -61,7 +61,7 @@ def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: b
     row = known_motion(db, motion)
     found = _of_motion(db, row)
     _require_idle(db, f"the motion {motion}", _jobs_about(db, row["arm"], motion))
-    _require_none(f"the motion {motion}", found, anyway=anyway)
+    _require_no_dependents(f"the motion {motion}", found, anyway=anyway)
     _delete_motion(db, state, row, who)
     return found
 
@@ -93,7 +93,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         *_numbered(db, "schedule", "SELECT id FROM schedules WHERE arm = ? ORDER BY id", arm),
         *_numbered(db, "acceptance", "SELECT number AS id FROM acceptances WHERE arm = ? ORDER BY number", arm),
     ]
-    _require_none(f"the arm {arm}", found, anyway=anyway)
+    _require_no_dependents(f"the arm {arm}", found, anyway=anyway)
     with ExitStack() as held:
         try:  # held, so that nobody at a terminal can move the arm
             held.enter_context(ControlFile.take(control_path(state, arm), None))
@@ -177,7 +177,7 @@ def _require_idle(db: Database, what: str, busy: list[str]) -> None:
         raise InUse(f"{what} is used by {', '.join(busy[:10])}; wait for the end, or cancel it")
 
 
-def _require_none(what: str, found: list[Dependent], *, anyway: bool) -> None:
+def _require_no_dependents(what: str, found: list[Dependent], *, anyway: bool) -> None:
     if found and not anyway:
         names = ", ".join(f"{one.kind} {one.id}" for one in found[:10]) + (", ..." if len(found) > 10 else "")
         raise InUse(f"{what} is referred to by {names}", found)

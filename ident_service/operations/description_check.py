@@ -14,7 +14,7 @@ from ident_service.config.quantities import ParameterTable
 from ident_service.errors import ModelError, MotionRefused, ParameterError
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
-from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
+from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.operations.fieldbus import bus_lines, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
@@ -37,7 +37,7 @@ class CheckedDescription:
     model: ArmModel
     budget: Budget | None
     gains: StabilityReport | None
-    after_stop: AfterStop | str | None
+    after_stop: StopSecuring | str | None
     warnings: tuple[str, ...] = ()
     falling: tuple[str, ...] = ()
 
@@ -78,7 +78,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     except MotionRefused:  # an arm that is only identified needs none
         return CheckedDescription(model, budget, None, None, warnings)
     try:
-        follows: AfterStop | str | None = None if model.prior is None else after_stop(model, limits)
+        follows: StopSecuring | str | None = None if model.prior is None else after_stop(model, limits)
     except MotionRefused as refusal:
         follows = str(refusal)
     falling = () if model.prior is None else falling_joints(model, limits)
@@ -122,10 +122,10 @@ def description_document(checked: CheckedDescription) -> dict[str, Any]:
         "warnings": list(checked.warnings),
         "payload": None if config.payload is None else config.payload.model_dump(mode="json"),
         "stability": None if report is None or gains is None else asdict(report) | gains,
-        "after_stop": checked.after_stop.value if isinstance(checked.after_stop, AfterStop) else None,
+        "after_stop": checked.after_stop.value if isinstance(checked.after_stop, StopSecuring) else None,
         "objection": checked.after_stop if isinstance(checked.after_stop, str) else None,
         "falling": list(checked.falling),
-        "assumed_brakes": list(checked.assumed_brakes) if checked.after_stop is AfterStop.BRAKE else [],
+        "assumed_brakes": list(checked.assumed_brakes) if checked.after_stop is StopSecuring.BRAKE else [],
     }
 
 
@@ -153,13 +153,13 @@ def _after_stop_text(checked: CheckedDescription) -> str:
             " that has one needs `brake: true`, or control.after_stop is hold or lower"
         )
     words = {
-        AfterStop.BRAKE: f"held for two seconds, then released to its brakes; {held}",
-        AfterStop.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
-        AfterStop.LOWER: "lowered until it rests",
+        StopSecuring.BRAKE: f"held for two seconds, then released to its brakes; {held}",
+        StopSecuring.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
+        StopSecuring.LOWER: "lowered until it rests",
     }
     if follows is None:
         return ""
-    return f"after a stop: {words[follows]}\n" if isinstance(follows, AfterStop) else f"CANNOT MOVE: {follows}\n"
+    return f"after a stop: {words[follows]}\n" if isinstance(follows, StopSecuring) else f"CANNOT MOVE: {follows}\n"
 
 
 def _gains_text(report: StabilityReport) -> str:

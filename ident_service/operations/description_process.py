@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ident_service.errors import ConfigError, IdentError, ModelError, Problem
-from ident_service.model.limited_process import answer_within, ask_process
+from ident_service.model.limited_process import answer_within, run_limited_process
 
 MOST_MEMORY: Final = 2 * 2**30  # bytes of address space
 MOST_SECONDS: Final = 20  # s of CPU time; ordinary arms take one
@@ -29,7 +29,7 @@ def judge_apart(path: Path) -> dict[str, Any]:
         ModelError: any other error of it, or judging it takes too long or crashes.
     """
     try:
-        answer = ask_process("ident_service.operations.description_process", path, _DEADLINE)
+        answer = run_limited_process("ident_service.operations.description_process", path, _DEADLINE)
     except ModelError as error:
         raise ModelError(f"{path.name}: {error}") from None
     if (problems := answer.get("problems")) is not None:

@@ -26,7 +26,15 @@ from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import SessionLog, logged_links
 from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_scan import FoundNode, asking, hearing, scan
-from drivers.canopen.capabilities import Capabilities, assess, capabilities, entries_from_sheet, entry_of, named, where
+from drivers.canopen.capabilities import (
+    Capabilities,
+    assess,
+    capabilities,
+    entries_from_sheet,
+    named,
+    parse_entry,
+    where,
+)
 from drivers.canopen.cia402 import drive_words, emergency_words, register_words, state_of
 from drivers.canopen.drive_setup import IDENTITY, differences
 from drivers.canopen.pdo_mapping import bus_profiles
@@ -281,14 +289,14 @@ def scan_text(config: ArmConfig, found: Scan) -> str:
 
 
 def _verdict(found: Scan) -> str:
-    bad = [f"node {line.node} on bus {line.bus} {_MATCHES[line.match]}" for line in found.lines if _bad(line)]
+    bad = [f"node {line.node} on bus {line.bus} {_MATCHES[line.match]}" for line in found.lines if _is_unexpected(line)]
     return "; ".join(bad) if bad else "every configured drive is there"
 
 
 _MATCHES = {Match.MISSING: "IS MISSING", Match.OTHER: "IS ANOTHER ONE", Match.SILENT: "DOES NOT ANSWER"}
 
 
-def _bad(line: ScannedNode) -> bool:
+def _is_unexpected(line: ScannedNode) -> bool:
     return line.match not in _GOOD
 
 
@@ -296,7 +304,7 @@ def _node_lines(line: ScannedNode) -> Iterator[str]:
     drive = "-" if line.drive is None else str(line.drive)
     node = line.found
     state = "-" if node is None or node.status is None else drive_words(node.status)
-    match = line.match.upper() if _bad(line) else line.match
+    match = line.match.upper() if _is_unexpected(line) else line.match
     yield f"  {line.node:>4}  {drive:<6}{match:<17}{state:<28}{'-' if node is None else node.nmt}".rstrip()
     if line.why:
         yield f"{'':8}{line.why}"
@@ -447,16 +455,18 @@ def _of_drive(driver: CanopenDriver, number: int, objects: Objects) -> Probed:
     except BusError:
         raise
     except DriverError as error:
-        return Probed(title, drive.node, str(error), _foretold(driver, number, driver.sheet_file(number)))
+        return Probed(
+            title, drive.node, str(error), _capabilities_from_sheet(driver, number, driver.sheet_file(number))
+        )
 
 
 def _of_file(driver: CanopenDriver, number: int, file: TextFile) -> Probed:
     mistake = data_sheet(file.text).mistake
     why = f"is no EDS: {mistake}" if mistake else ""
-    return Probed(file.name, driver.drives[number].node, why, _foretold(driver, number, file))
+    return Probed(file.name, driver.drives[number].node, why, _capabilities_from_sheet(driver, number, file))
 
 
-def _foretold(driver: CanopenDriver, number: int, file: TextFile) -> Capabilities | None:
+def _capabilities_from_sheet(driver: CanopenDriver, number: int, file: TextFile) -> Capabilities | None:
     sheet, drive = data_sheet(file.text), driver.drives[number]
     if not sheet.entries:
         return None
@@ -494,7 +504,7 @@ def _lines(one: Probed, found: Probe) -> Iterator[str]:
         yield f"  {'REFUSED':<16}{problem}"
     for change in can.changes:
         yield f"  {'to change':<16}{change}"
-    for name, words in _facts(one, found).items():
+    for name, words in _capability_rows(one, found).items():
         yield f"  {name.replace('_', ' '):<16}{words}"
     for note in can.notes if can.torque is not None else ():
         yield f"  {'lacks':<16}{note}"
@@ -502,7 +512,7 @@ def _lines(one: Probed, found: Probe) -> Iterator[str]:
         yield f"  {'family':<16}{can.family.notes}"
 
 
-def _facts(one: Probed, found: Probe) -> dict[str, str]:
+def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     """Return the chosen torque path, limits, watchdogs and frames of a drive, in words."""
     can = one.can
     if can is None:
@@ -524,7 +534,7 @@ def _facts(one: Probed, found: Probe) -> dict[str, str]:
     facts["torque_frames"] = f"{shares}, as far as its file and family know"
     facts["status_reports"] = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
     if (brake := can.family.brake) is not None:
-        held = can.found.get(entry_of(brake, ""))
+        held = can.found.get(parse_entry(brake, ""))
         facts["brake"] = f"{named(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
     facts["proved"] = "on hardware" if can.family.proved else "not on hardware"
     return facts
@@ -568,7 +578,7 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
             "changes": [{"where": change.where, "why": change.why} for change in can.changes],
             "missing": list(can.notes),
         },
-        "facts": _facts(one, found),
+        "facts": _capability_rows(one, found),
     }
 
 

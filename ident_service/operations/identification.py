@@ -32,7 +32,7 @@ from ident_service.operations.recordings import (
     open_together,
     own_formats,
     recording_quality,
-    standstill_left_out,
+    removed_standstill,
     torque_in,
 )
 from ident_service.recordings.quality import Quality
@@ -133,7 +133,7 @@ def identify_files(
     recordings = opened.recordings[: len(request.recordings)]
     validation = opened.recordings[len(request.recordings) :]
     for recording in (*recordings, *validation):
-        start, end = standstill_left_out(recording)
+        start, end = removed_standstill(recording)
         if start or end:
             tell(f"{recording.path.name}: standstill left out, {start:.2f} s at the start and {end:.2f} s at the end")
     found = [(recording, recording_quality(recording, model)) for recording in opened.recordings]
@@ -244,7 +244,7 @@ def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
         "repeats": seen.repeats,
         "skipped": seen.skipped,
         "torque": torque_in(recording),
-        "standstill_left_out_seconds": list(standstill_left_out(recording)),
+        "standstill_left_out_seconds": list(removed_standstill(recording)),
         "torn": seen.torn,
         "per_joint": [
             {"joint": joint.name, "saturated": joint.saturated, "standstill": joint.standstill} for joint in seen.joints

@@ -169,7 +169,7 @@ def supervise_motion_process(
             try:
                 watch.hear()
             except KeyboardInterrupt:
-                if not watch.hear_the_end():
+                if not watch.wait_for_result():
                     raise
         except BaseException:
             process.stdin.close()  # ends the motion process's input: the motion has no owner any more
@@ -219,7 +219,7 @@ class _Watch:
                     self.ask_stop()
                 if not self._finishing and self._finish_requested():
                     self._finishing = True
-                    self._controls.ask_finish()
+                    self._controls.request_finish()
             ready, _, _ = select.select([stdout], [], [], _RENEW_SHARE * self._lease)
             if not ready:
                 continue
@@ -230,11 +230,11 @@ class _Watch:
                 self._take(json.loads(line))
         return False
 
-    def hear_the_end(self) -> bool:
+    def wait_for_result(self) -> bool:
         """After an interrupt, wait up to a bound for the end of the stop; return whether a result was reported."""
         if self._controls is None:
             return False  # the motion process has not taken the arm yet
-        with _deaf():
+        with _ignoring_interrupts():
             self.ask_stop()
             self._tell(f"interrupted: the arm is being stopped under control; waiting {_LAST_WORDS:g} s at most")
             ended = self.hear(time.monotonic() + _LAST_WORDS)
@@ -278,7 +278,7 @@ class _Watch:
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
+def _ignoring_interrupts() -> Iterator[None]:
     """Ignore SIGINT in the block, after an interrupt was received; the main thread only."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -355,10 +355,10 @@ class TargetMonitor:
         stdout = self._process.stdout
         assert stdout is not None  # noqa: S101 - asked for
         while not self._over and select.select([stdout], [], [], 0.0)[0]:
-            self._hear(os.read(stdout.fileno(), _MOST))
+            self._read_output(os.read(stdout.fileno(), _MOST))
         return self.said is not None
 
-    def _hear(self, part: bytes) -> None:
+    def _read_output(self, part: bytes) -> None:
         self._heard = (self._heard + part)[:_MOST]
         if part and b"\n" not in self._heard:
             return

@@ -23,22 +23,22 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
 
 def pause_arm(state: Path, arm: str, *, wanted: bool) -> bool:
     """Pause an arm, or let it go on (`wanted` False); return whether a process moves it."""
-    return bool(_reach(state, arm, _asking(lambda controls: controls.ask_pause(wanted))))
+    return bool(_reach(state, arm, _command_of(lambda controls: controls.request_pause(wanted))))
 
 
 def finish_arm(state: Path, arm: str) -> bool:
     """End a run early by its regular end, out of a pause too; return whether a process moves the arm."""
 
     def ask(controls: ControlFile) -> None:
-        controls.ask_finish()
-        controls.ask_pause(False)
+        controls.request_finish()
+        controls.request_pause(False)
 
-    return bool(_reach(state, arm, _asking(ask)))
+    return bool(_reach(state, arm, _command_of(ask)))
 
 
 def confirm_support(state: Path, arm: str) -> bool:
     """Release an arm held after a stop, since a person sees it supported; return whether one was held."""
-    return bool(_reach(state, arm, _asking(ControlFile.confirm_support)))
+    return bool(_reach(state, arm, _command_of(ControlFile.confirm_support)))
 
 
 def held_arm(state: Path, arm: str) -> bool:
@@ -55,7 +55,7 @@ def moving_arms(state: Path) -> list[str]:
     return _reach(state, None, controlling_pid)
 
 
-def _asking(ask: Callable[[ControlFile], None]) -> Callable[[Path], int]:
+def _command_of(ask: Callable[[ControlFile], None]) -> Callable[[Path], int]:
     def asked(path: Path) -> int:
         with ControlFile.reach(path) as controls:
             ask(controls)

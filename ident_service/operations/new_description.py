@@ -334,7 +334,7 @@ def new_description(
             trial.write_text(in_yaml(draft), encoding="utf-8")
             return arm_model(load_arm(trial), bodies=False)  # what is none is guessed
 
-        draft.remarks += _which(loaded(), draft)
+        draft.remarks += _part_remark(loaded(), draft)
         tell("joints and bodies")
         _joints(draft, loaded(), urdf_limits(text))
         _bodies(draft, loaded, urdf.parent)
@@ -377,7 +377,7 @@ def _plain(name: str) -> str:
     return found or "arm"
 
 
-def _which(model: ArmModel, draft: Draft) -> list[str]:
+def _part_remark(model: ArmModel, draft: Draft) -> list[str]:
     """Return a remark on which part of the URDF is the arm, where the file holds more."""
     file = model.config.kinematics.urdf
     if file is None or "tip" not in draft.part:
@@ -589,7 +589,7 @@ def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
             if found:
                 break
             raise
-        paces = _paces(loaded())
+        paces = _joint_speeds(loaded())
         standstill = loaded().config.identification.reversal.speed
         moves = float((paces > standstill).mean(axis=1).min())
         found.append((moves, draft.frequency, draft.use, draft.seeds))
@@ -597,13 +597,13 @@ def _motions(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
             return
     moves, draft.frequency, draft.use, draft.seeds = max(found)
     # Half of the time each joint is faster than the median of its speeds.
-    draft.standstill = short(0.5 * float(np.median(_paces(loaded()), axis=1).min()), 2)
+    draft.standstill = short(0.5 * float(np.median(_joint_speeds(loaded()), axis=1).min()), 2)
     draft.remarks.append(
         f"identification.reversal.speed: {draft.standstill:g} rad/s or m/s; a joint with a small range is never fast"
     )
 
 
-def _paces(model: ArmModel) -> Array:
+def _joint_speeds(model: ArmModel) -> Array:
     """Return speeds of every joint in each of both motions, shape (2 joints, samples)."""
     found = []
     for which in ("identification", "validation"):

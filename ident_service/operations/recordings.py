@@ -205,7 +205,7 @@ def own_formats(
     return found
 
 
-def standstill_left_out(recording: Recording) -> tuple[float, float]:
+def removed_standstill(recording: Recording) -> tuple[float, float]:
     """Return how much standstill was left out at the start and at the end [s]."""
     return recording.standstill if isinstance(recording, RangeRecording) else (0.0, 0.0)
 

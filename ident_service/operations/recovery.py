@@ -113,7 +113,7 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
         support = _HELD.format(called)
     before = _before(called, faults, seen, unreachable, zero_lost, tripped, refusal, limits, support)
     usable = not before
-    steps = (*before, _at_last(called, seen, limits, bool(out)))
+    steps = (*before, _last_step(called, seen, limits, bool(out)))
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
 
 
@@ -206,7 +206,7 @@ def _before(
     return [support, *steps] if steps or support is not _SUPPORT else steps
 
 
-def _at_last(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:
+def _last_step(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:
     away = seen is None or out or bool((np.abs(seen.position - limits.home) > AT_HOME).any())
     home = f"`ident preflight {name} --home`, then `ident home {name}` moves it home; then " if away else ""
     return f"{home}`ident preflight {name}` for the next motion."

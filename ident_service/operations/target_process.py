@@ -58,7 +58,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
         samples = tail.read()
         if samples is not None:
             growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
-        elif tail.ended or _left_alone():
+        elif tail.ended or _parent_is_gone():
             return None
         if not growing.step() or tail.exciting_ns is None or (doubt := growing.doubt()) is None:
             continue
@@ -111,11 +111,11 @@ def _opened(folder: Path) -> RecordingFollower | None:
                 return RecordingFollower(folder / name)
             except FileNotFoundError:
                 continue
-        if _left_alone():
+        if _parent_is_gone():
             return None
 
 
-def _left_alone() -> bool:
+def _parent_is_gone() -> bool:
     """Wait a little; return whether standard input has ended, or has data, so that nobody waits for the answer."""
     return bool(select.select([sys.stdin.fileno()], [], [], _LOOK)[0])
 

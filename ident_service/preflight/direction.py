@@ -20,7 +20,7 @@ from ident_service.errors import MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.zero_phase import local_polynomial
-from ident_service.motion.clearance import way_clearance
+from ident_service.motion.clearance import trajectory_clearance
 from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, measures
 from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
 from ident_service.preflight.delay import FREQUENCY, Delay, delay_measures, dither
@@ -118,7 +118,7 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
     for joint, name in enumerate(model.chain.names):
         if only not in (None, joint):
             continue
-        if (free := _free_stroke(session.home, joint, collision, slow, model.config.workspace.clearance)) is None:
+        if (free := _clear_test_motion(session.home, joint, collision, slow, model.config.workspace.clearance)) is None:
             raise MotionRefused(f"{name}: no room to move by at least {min(np.abs(AMPLITUDES)):g} either way")
         found.append(free)
     return found
@@ -143,11 +143,11 @@ def follow_stroke(session: Session, stroke: TestMotion) -> tuple[Rows, Rows]:
 
 def judge_response(trace: Trace, stroke: TestMotion, session: Session) -> JointResponse:
     """Evaluate a test motion that the loop could follow to its end."""
-    answers, doubt = _answer_to_torque(trace, stroke.joint, session)
+    answers, doubt = _response_to_torque(trace, stroke.joint, session)
     return JointResponse(_displaced(trace, stroke) / stroke.amplitude, answers, doubt)
 
 
-def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
+def _response_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float, float]:
     """Return measured over expected acceleration and its standard deviation; NaN where the joint hardly moved."""
     nothing = float("nan"), float("nan")
     rate = trace.rate[:, joint]
@@ -158,7 +158,7 @@ def _answer_to_torque(trace: Trace, joint: int, session: Session) -> tuple[float
     measured = local_polynomial(trace.position[:, joint], window, 2, 2, trace.period)
     speed = local_polynomial(trace.position[:, joint], window, 2, 1, trace.period)
     # The same filter on the way that the model expects, so that what it distorts it distorts on both sides.
-    expected = local_polynomial(_own_way(trace, session, joint), window, 2, 2, trace.period)
+    expected = local_polynomial(_expected_displacement(trace, session, joint), window, 2, 2, trace.period)
     sliding = (np.minimum(np.abs(rate), np.abs(speed)) > _MOVING * largest) & (np.sign(speed) == np.sign(rate))
     if int(sliding.sum()) < 2 * window:
         return nothing
@@ -313,7 +313,7 @@ def _of_odd_answers(odd: Sequence[tuple[str, str]], model: ArmModel) -> str:
     )
 
 
-def _free_stroke(
+def _clear_test_motion(
     home: Vector, joint: int, collision: CollisionModel, slow: MotionLimits, clearance: float
 ) -> TestMotion | None:
     for amplitude in AMPLITUDES:
@@ -328,7 +328,7 @@ def _free_stroke(
             )
         except MotionRefused:
             continue
-        if not collision.pairs or way_clearance(collision, there, slow, clearance).proven:
+        if not collision.pairs or trajectory_clearance(collision, there, slow, clearance).proven:
             return TestMotion(joint, amplitude, there, back)
     return None
 
@@ -339,7 +339,7 @@ def expected_displacement(trace: Trace, session: Session, sign: Vector | float =
     return _integrated_twice(np.asarray(acceleration, dtype=np.float64), trace.period)
 
 
-def _own_way(trace: Trace, session: Session, joint: int) -> Vector:
+def _expected_displacement(trace: Trace, session: Session, joint: int) -> Vector:
     """Return how far the model expects a joint's own torque to have moved it while the others stand, shape (cycles,).
 
     Others are held by friction and by torques that move nothing.

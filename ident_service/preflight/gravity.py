@@ -93,7 +93,7 @@ def gravity_check(
     return check
 
 
-def diagnose_holding(
+def holding_fault_check(
     session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, error: ArmFault
 ) -> Check:
     """Find out why a fault ended the holding of an arm.

@@ -65,13 +65,13 @@ from ident_service.preflight.passive_checks import (
 )
 from ident_service.preflight.session import Rows, Session, remedy_of, trace_of
 from ident_service.preflight.static_checks import (
-    away_from_home,
     configuration_check,
+    distance_from_home_text,
     motion_fits_check,
     motion_proven_check,
+    path_home_check,
+    paths_check,
     stability_check,
-    way_home_check,
-    ways_check,
 )
 from ident_service.preflight.watchdog import CODE, Confirm, Consent, confirm_watchdog_test, watchdog_check
 
@@ -245,12 +245,12 @@ class _Preflight:
             return None
         home = looked.samples[-1].position.copy()
         if self.excitation is not None:
-            self.away = away_from_home(self.model, limits, home)
+            self.away = distance_from_home_text(self.model, limits, home)
         if self.excitation is None:
-            self._passed(way_home_check(self.model, limits, home))
+            self._passed(path_home_check(self.model, limits, home))
             limits = relaxed_limits(home, limits)
         elif self.checks["motion_fits"].verdict is Verdict.PASSED:
-            self._passed(ways_check(self.model, limits, self.excitation, home), of_place=True)
+            self._passed(paths_check(self.model, limits, self.excitation, home), of_place=True)
         self._passed(rate_check(looked, self.arm.clock.lock_step))
         friction = _felt_friction(self.model, limits)
         session = Session(self.arm, self.model, limits, self.described, home, friction)
@@ -393,7 +393,7 @@ class _Preflight:
     def _faulted(self, session: Session, gravity: _Gravity, error: ArmFault) -> None:
         """Find out what ended the loop: what the fault names, a joint that went the wrong way, or another cause."""
         if "gravity" not in self.checks:
-            self._passed(weight.diagnose_holding(session, self.model, gravity.limits, gravity.friction, error))
+            self._passed(weight.holding_fault_check(session, self.model, gravity.limits, gravity.friction, error))
             return
         if (remedy := remedy_of(error)) is not None:
             self._passed(failed("direction", str(error), remedy))

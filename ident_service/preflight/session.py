@@ -274,7 +274,7 @@ class Session:
             setpoint = reference.at(elapsed)
             self._rows.append((sample, setpoint))
             self._words = sample.status
-            wanted = self._led(sample, setpoint, np.zeros(len(self.home), dtype=bool))
+            wanted = self._safe_torque(sample, setpoint, np.zeros(len(self.home), dtype=bool))
             if shaking is not None:
                 # On its way only: a joint that sticks would look like one whose encoder does.
                 moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
@@ -282,7 +282,7 @@ class Session:
             if self.gives_positions:
                 self._target = self._passed(setpoint.position)
             else:
-                self._target = self._limited(wanted + self._against_friction(setpoint, learning))
+                self._target = self._limited(wanted + self._learned_friction(setpoint, learning))
             if learning and not self.gives_positions and setpoint.velocity.any():
                 learned.setdefault(bool(setpoint.velocity.sum() > 0.0), []).append(self._friction)
             if elapsed >= seconds:
@@ -299,7 +299,7 @@ class Session:
             return self._arm.exchange(None)
         return (self._arm.exchange_position if self.gives_positions else self._arm.exchange)(self._target)
 
-    def lead_in_silence(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
+    def cycle_without_signal(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
         """Check a cycle in which a signal is withheld from drives on purpose, and compute the next target.
 
         What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
@@ -330,11 +330,11 @@ class Session:
         there = np.where(given_up, sample.position, setpoint.position)
         going = np.where(given_up, 0.0, setpoint.velocity)
         asked = Setpoint(there, going, np.where(given_up, 0.0, setpoint.acceleration))
-        wanted = self._led(undisturbed, asked, given_up) + self._against_friction(asked, 0.0)
+        wanted = self._safe_torque(undisturbed, asked, given_up) + self._learned_friction(asked, 0.0)
         if sends:
             self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
-    def wait_in_silence(self) -> None:
+    def repeat_last_torque(self) -> None:
         """Repeat the target that was sent last, through the guard, while drives report no positions.
 
         Raises:
@@ -357,7 +357,7 @@ class Session:
             self._target = self._limited(held * (left / cycles), band=False)
         self._arm.stop(StopKind.TORQUE_OFF)
 
-    def _led(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
+    def _safe_torque(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
         """Check a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
         since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
         velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
@@ -379,7 +379,7 @@ class Session:
             self._explained = law - control.correction
         return law
 
-    def _against_friction(self, setpoint: Setpoint, learning: float) -> Vector:
+    def _learned_friction(self, setpoint: Setpoint, learning: float) -> Vector:
         """Torque that moving joints need besides the model's, learned from how they lag [N m or N], shape (joints,).
 
         Friction is the drives': one that moves several joints lags by what all of them do, and pushes all of them.

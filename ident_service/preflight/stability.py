@@ -160,7 +160,7 @@ def stability(
         # Where a joint's links are heaviest, its drives help least.
         own_lightest = ((lightest * own + whole - own) / whole).min(axis=0)
     joints = tuple(
-        _joint(name, _alone(loop, k), float(own_lightest[k]), float(INERTIA[1] + unknown[k]))
+        _joint(name, _single_joint_loop(loop, k), float(own_lightest[k]), float(INERTIA[1] + unknown[k]))
         for k, name in enumerate(model.chain.names)
     )
     coupled: float | None = None
@@ -217,7 +217,7 @@ def spectral_radius(loop: Loop, ratio: Vector) -> Vector:
     return np.asarray(np.abs(np.linalg.eigvals(transition(loop, ratio))).max(axis=-1))
 
 
-def _alone(loop: Loop, joint: int) -> Loop:
+def _single_joint_loop(loop: Loop, joint: int) -> Loop:
     kept = slice(joint, joint + 1)
     cutoff = np.broadcast_to(np.asarray(loop.cutoff), loop.kp.shape)
     return Loop(loop.kp[kept], loop.kd[kept], loop.period, cutoff[kept], loop.delay)

@@ -13,7 +13,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
-from ident_service.motion.clearance import stop_clearance, way_clearance
+from ident_service.motion.clearance import stop_clearance, trajectory_clearance
 from ident_service.motion.run import unhurried
 from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.stop_trajectory import require_stops_within_limits
@@ -166,7 +166,7 @@ def stability_check(model: ArmModel, limits: MotionLimits, excitation: Excitatio
     )
 
 
-def away_from_home(model: ArmModel, limits: MotionLimits, position: Vector) -> str:
+def distance_from_home_text(model: ArmModel, limits: MotionLimits, position: Vector) -> str:
     """Describe how far an arm stands from where motions begin, in words; empty where that is near.
 
     Args:
@@ -183,7 +183,7 @@ def away_from_home(model: ArmModel, limits: MotionLimits, position: Vector) -> s
     )
 
 
-def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
+def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> Check:
     """Check that the straight way home is clear, from where the arm stands [rad or m], shape (joints,)."""
     code = "ways_clear"
     try:
@@ -193,7 +193,7 @@ def way_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> C
     return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
 
 
-def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
+def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
     """Check that the ways from where the arm stands to the motion and back are within limits and clear.
 
     Args:
@@ -215,7 +215,7 @@ def ways_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, po
         ):
             found.append(measure(f"{what}, length", leg.duration, "s"))
             if collision.pairs:
-                clearance = way_clearance(collision, leg, limits, least)
+                clearance = trajectory_clearance(collision, leg, limits, least)
                 found.append(measure(f"{what}, clearance", clearance.lower_bound, "m", least=least))
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), "Move the arm by hand to where motions begin (home), then check again.", found)

@@ -111,7 +111,7 @@ def watchdog_check(
     dogs = watchdogs_of(arm, model)
     told = arm.describe().report_delay
     where = "at rest" if moving is None else "in motion"
-    gave_up: dict[int, tuple[float, AxisStatus]] = {}
+    watchdog_expired: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
     begun = 0
     at: Vector = np.zeros(0)
@@ -136,9 +136,9 @@ def watchdog_check(
                 for number, word in enumerate(status):
                     if word & AxisStatus.EMERGENCY_STOP:
                         strange.append(f"{dogs[number].drive} reports an emergency stop")
-                    if number in gave_up or word & AxisStatus.POWERED:
+                    if number in watchdog_expired or word & AxisStatus.POWERED:
                         continue
-                    gave_up[number] = silent, word
+                    watchdog_expired[number] = silent, word
                     if number not in watched:
                         strange.append(
                             f"{dogs[number].drive} stopped when {_WORDS[kind]} was missing, not because of its own"
@@ -146,11 +146,13 @@ def watchdog_check(
                 if strange:
                     break
                 if kind in _BLIND:
-                    session.wait_in_silence()
+                    session.repeat_last_torque()
                 else:
                     setpoint = setpoint_at((sample.stamp_ns - begun) * 1e-9)
-                    session.lead_in_silence(sample, setpoint, _joints_of(gave_up, model), sends=not of_torque)
-                if all(number in gave_up for number in watched) or silent > most:
+                    session.cycle_without_signal(
+                        sample, setpoint, _joints_of(watchdog_expired, model), sends=not of_torque
+                    )
+                if all(number in watchdog_expired for number in watched) or silent > most:
                     break
             if strange:
                 break
@@ -162,7 +164,7 @@ def watchdog_check(
         arm.stop(StopKind.TORQUE_OFF)
     found = []
     for number, dog in enumerate(dogs):
-        seconds, word = gave_up.get(number, (None, AxisStatus(0)))
+        seconds, word = watchdog_expired.get(number, (None, AxisStatus(0)))
         what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
         found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, told)))
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.

@@ -102,21 +102,21 @@ class RingConsumer:
         """Record until the end; whatever goes wrong is in the report, and in the ring before the file is finished."""
         error, complete = "", False
         try:
-            complete = self._take_until_end() and not self._reader.lost
+            complete = self._consume() and not self._reader.lost
             self._writer.finish(complete=complete)
         except Exception as caught:  # noqa: BLE001 - whatever it is, the motion loop has to learn of it
             error, complete = message_of(caught), False
-            self._tell_end(error)
+            self._report_end(error)
             with suppress(RecordingError):
                 self._writer.finish(complete=False)
         else:
-            self._tell_end(None)
+            self._report_end(None)
         finally:
             if self._pidfd is not None:
                 os.close(self._pidfd)
         return RecorderReport(self._samples, self._events, self._reader.lost, complete, error)
 
-    def _take_until_end(self) -> bool:
+    def _consume(self) -> bool:
         """Record until the writer's end; returns whether the writer said that the motion was finished."""
         while True:
             # Asked before the ring is emptied, so that nothing put before the end is left in it.
@@ -179,7 +179,7 @@ class RingConsumer:
             self._poll.register(self._pidfd, select.POLLIN)
         return not select.select([self._pidfd], [], [], 0)[0]
 
-    def _tell_end(self, error: str | None) -> None:
+    def _report_end(self, error: str | None) -> None:
         self._reader.end(error)
         if self._room is not None:
             os.eventfd_write(self._room, 1)

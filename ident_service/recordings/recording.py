@@ -183,7 +183,7 @@ class _Check:
         step = np.zeros(len(piece.stamp_ns), np.int64)
         step[1 - before :] = np.diff(run.stamp_ns)
         repeats = np.zeros(len(step), np.bool_)
-        repeats[1 - before :] = _same_as_before(run)
+        repeats[1 - before :] = _repeated_samples(run)
         stuck = (step == 0) & ~repeats
         stuck[: 1 - before] = False
         self._refuse(piece, step, stuck)
@@ -247,7 +247,7 @@ class _Check:
         return index, f"{what} of joint {self._joints[joint]} is {values[index, joint]}{hint}"
 
 
-def _same_as_before(run: Block) -> NDArray[np.bool_]:
+def _repeated_samples(run: Block) -> NDArray[np.bool_]:
     """Return which samples, from the second on, equal the one before in stamp and all values."""
     same: NDArray[np.bool_] = np.diff(run.stamp_ns) == 0
     if same.any():

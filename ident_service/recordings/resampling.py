@@ -437,7 +437,7 @@ def _at(run: Block, stamps: Grid, numbers: NDArray[np.int64], held: bool) -> Blo
     def curve(values: Matrix) -> Matrix:
         return np.asarray(sum(weights[:, m, None] * values[first + m] for m in range(4)))
 
-    torque = _mean_of_held(old, run.torque, np.append(new, new[-1] + period)) if held else curve(run.torque)
+    torque = _zero_order_hold_mean(old, run.torque, np.append(new, new[-1] + period)) if held else curve(run.torque)
     stamp: Stamps = stamps.first_ns + np.rint(new).astype(np.int64)
     block = Block(stamp, curve(run.position), torque, None if run.velocity is None else curve(run.velocity))
     for array in (block.stamp_ns, block.position, block.torque, block.velocity):
@@ -459,7 +459,7 @@ def _cubic(old: Vector, new: Vector) -> tuple[NDArray[np.intp], Matrix]:
     return first, weights
 
 
-def _mean_of_held(old: Vector, values: Matrix, edges: Vector) -> Matrix:
+def _zero_order_hold_mean(old: Vector, values: Matrix, edges: Vector) -> Matrix:
     """Return the mean of a value held from each stamp to the next, between edges; shape (edges - 1, joints)."""
     integral = np.zeros_like(values)
     np.cumsum(values[:-1] * np.diff(old)[:, None], axis=0, out=integral[1:])

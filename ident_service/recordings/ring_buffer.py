@@ -208,7 +208,7 @@ class RingMemory:
         self._bytes = memoryview(self.content)
         self.words = self._bytes.cast("Q")
 
-    def word_of(self, number: int) -> int:
+    def slot_word_index(self, number: int) -> int:
         """Return the index of the word that record `number`'s slot begins with."""
         return (HEADER_BYTES + number % self.slots * self.slot_bytes) >> 3
 
@@ -411,7 +411,7 @@ class RingWriter:
 
     def _publish(self, content: memoryview | bytes) -> None:
         number, words = self.written, self._words
-        sequence = self.memory.word_of(number)
+        sequence = self.memory.slot_word_index(number)
         begin = 8 * sequence + 8
         words[sequence] = 2 * number + 1
         self._content[begin : begin + len(content)] = content
@@ -487,7 +487,7 @@ class RingReader:
         words, torn = self._words, 0
         while True:
             number = self.cursor
-            word = self.memory.word_of(number)
+            word = self.memory.slot_word_index(number)
             expected = 2 * number + 2
             sequence = words[word]
             if sequence < expected:

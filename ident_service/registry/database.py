@@ -31,7 +31,7 @@ from typing import Any, Final, Self
 
 from ident_service.errors import DiskFull, IdentError, RegistryBusy, UsageError
 from ident_service.recordings.files import write_atomically
-from ident_service.registry.state_folder import leave_to_owner, require_whole
+from ident_service.registry.state_folder import give_to_owner, require_no_interrupted_restore
 
 _FIRST = """
 CREATE TABLE arms (
@@ -315,7 +315,7 @@ class Database:
             RegistryBusy: another process keeps it.
             DiskFull: there is no room for it.
         """
-        require_whole(state)
+        require_no_interrupted_restore(state)
         self._path, self._lock, self._read_lock = state / FILE, threading.RLock(), threading.Lock()
         self._writer: int | None = None  # the thread whose transaction is open
         self._busy, self._wrote = busy, math.inf  # when the last write was that is only in the log [s]
@@ -505,10 +505,10 @@ def note_later(state: Path, who: str, what: str, about: str, **detail: Any) -> N
     path = state / _WAITING / f"{time.time_ns()}-{secrets.token_hex(4)}.json"
     path.parent.mkdir(mode=0o700, exist_ok=True)
     write_atomically(path, json.dumps(_line(who, what, about, detail)))
-    leave_to_owner(state, path)
+    give_to_owner(state, path)
 
 
-def enter_waiting(db: Database, state: Path) -> None:
+def write_deferred_entries(db: Database, state: Path) -> None:
     """Enter the lines that `note_later` has left; each once, whoever is killed meanwhile."""
     place = state / _WAITING
     for path in sorted(place.glob("*.json")) if place.is_dir() else ():
@@ -594,7 +594,7 @@ def audit_log(db: Database, *, before: int | None = None, most: int = 100) -> li
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]
 
 
-def trail_after(db: Database, line: int, most: int = 500) -> list[Row]:
+def audit_entries_after(db: Database, line: int, most: int = 500) -> list[Row]:
     """Return lines of the audit trail after the one of this id, the earliest first."""
     rows = db.rows("SELECT * FROM audit WHERE id > ? ORDER BY id LIMIT ?", line, most)
     return [{**row, "detail": json.loads(row["detail"])} for row in rows]

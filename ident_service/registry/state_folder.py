@@ -25,7 +25,7 @@ RESTORING: Final = ".restoring"
 _OTHERS_ENTER = 0o011
 
 
-def keep_private(state: Path) -> None:
+def require_private(state: Path) -> None:
     """Check that nobody else can enter a state folder, and let only its owner read files written from now on.
 
     Args:
@@ -35,7 +35,7 @@ def keep_private(state: Path) -> None:
         UsageError: others can enter it, or it is somebody else's; the remedy is named.
     """
     os.umask(0o077)
-    if (refusal := shut_out(state, writing=True)) is not None:
+    if (refusal := access_refusal(state, writing=True)) is not None:
         raise UsageError(refusal)
     path = state.resolve()
     if not path.is_dir():
@@ -45,7 +45,7 @@ def keep_private(state: Path) -> None:
         raise UsageError(f"{state}: others can enter it, and read or block what is in it; close it: chmod 700 {path}")
 
 
-def shut_out(state: Path, *, writing: bool = False) -> str | None:
+def access_refusal(state: Path, *, writing: bool = False) -> str | None:
     """Say why a state folder is not for this process's user, with the remedy; None where it is, or is not there yet.
 
     Args:
@@ -68,7 +68,7 @@ def shut_out(state: Path, *, writing: bool = False) -> str | None:
     )
 
 
-def leave_to_owner(state: Path, path: Path) -> None:
+def give_to_owner(state: Path, path: Path) -> None:
     """Give what root has made in somebody else's state folder to its owner; for acts that are refused to nobody.
 
     Args:
@@ -98,7 +98,7 @@ def _sudo_user(number: int) -> str:
     return f"'#{number}'" if name == str(number) else name
 
 
-def require_whole(state: Path) -> None:
+def require_no_interrupted_restore(state: Path) -> None:
     """Refuse a state folder in which a restore was interrupted.
 
     Raises:

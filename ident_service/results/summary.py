@@ -169,7 +169,7 @@ def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "com
         ]
         lines.append(_row(f"  {name}", cells))
     lines += ["", *wrapped(how_fitted(estimate))]
-    lines += _found_before(estimate)
+    lines += _preliminary_findings(estimate)
     counts = {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")}
     lines += [
         "",
@@ -199,7 +199,7 @@ def _errors(candidate: Candidate) -> list[tuple[TorqueError, TorqueError]]:
     return [(candidate.identification, candidate.moving), *scores]
 
 
-def _found_before(estimate: Estimate) -> list[str]:
+def _preliminary_findings(estimate: Estimate) -> list[str]:
     """Describe what was found before the parameters: delay, shape of the friction, torque constants, prior."""
     model, prepared = estimate.model, estimate.prepared
     lines = []

@@ -63,12 +63,12 @@ def listen(channel: str) -> socket.socket:
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         try:
-            _bind(sock, address)
+            _bind_private(sock, address)
         except OSError as error:
-            if error.errno != errno.EADDRINUSE or not _forsaken(address):
+            if error.errno != errno.EADDRINUSE or not _is_stale_socket(address):
                 raise
             Path(address).unlink()
-            _bind(sock, address)
+            _bind_private(sock, address)
         sock.listen(64)
         sock.setblocking(False)
     except OSError as error:
@@ -125,12 +125,12 @@ def forget(channel: str, sock: socket.socket) -> None:
             Path(channel).unlink()
 
 
-def _bind(sock: socket.socket, address: str) -> None:
+def _bind_private(sock: socket.socket, address: str) -> None:
     os.fchmod(sock.fileno(), 0o600)  # before the bind, so that the file never has other permissions
     sock.bind(address)
 
 
-def _forsaken(address: str) -> bool:
+def _is_stale_socket(address: str) -> bool:
     """Return whether a socket file is left of a process that is gone."""
     if address.startswith("\0") or not Path(address).is_socket():
         return False

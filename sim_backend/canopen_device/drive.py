@@ -178,7 +178,7 @@ class TorqueLoop:
         demand = min(max(asked, -reach), reach)
         self.follows = cyclic or follows
         self.limited = demand != asked
-        if demand and self._leads_faster(demand, now_ns):
+        if demand and self._exceeds_max_speed(demand, now_ns):
             demand, self.limited, self.follows = 0, True, False
         values[0x607400] = demand
         fraction = self._motor.defects.torque_fraction
@@ -204,7 +204,7 @@ class TorqueLoop:
             values[0x607700] = values[0x607800] = round(self._sum / (now_ns - self._told_ns))
         self._sum, self._told_ns = 0.0, now_ns
 
-    def _leads_faster(self, demand: int, now_ns: int) -> bool:
+    def _exceeds_max_speed(self, demand: int, now_ns: int) -> bool:
         speed = self._motor.speed(now_ns)
         limited = 0x608000 in self._objects.entries
         return limited and speed * demand > 0.0 and abs(speed) * _RPM > self._objects.number(0x6080)

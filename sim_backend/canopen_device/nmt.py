@@ -114,7 +114,7 @@ class Nmt:
         """Apply a change of object 1017h; a new heartbeat begins at once."""
         self._node.stop(_PRODUCER)
         if self.state is not State.INITIALISING:
-            self._beat()
+            self._send_heartbeat()
 
     def configure_consumers(self) -> None:
         """Apply a change of object 1016h; awaiting begins with the next heartbeat received (CiA 301, 7.2.8.2.2.3).
@@ -159,9 +159,9 @@ class Nmt:
         if name == _BOOT:
             self._node.send(0x700 + self._node.number, b"\0")
             self._to(State.PRE_OPERATIONAL)
-            self._beat()
+            self._send_heartbeat()
         elif name == _PRODUCER:
-            self._beat()
+            self._send_heartbeat()
         elif name == _LIFE:
             self.silent_nodes.add(_HOST)
             self._lost(_HOST)
@@ -170,7 +170,7 @@ class Nmt:
             self.silent_nodes.add(number)
             self._lost(number)
 
-    def _beat(self) -> None:
+    def _send_heartbeat(self) -> None:
         if period := self._node.objects.number(0x1017):
             self._node.send(0x700 + self._node.number, bytes([self.state]))
             self._node.after(_PRODUCER, period * _MS)

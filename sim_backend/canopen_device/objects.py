@@ -297,7 +297,7 @@ class SdoServer:
     def _download_segment(self, request: bytes) -> bytes:
         if self._download is None:
             raise SdoAbort(COMMAND)
-        toggle = self._toggled(request)
+        toggle = self._checked_toggle_bit(request)
         self._download += request[1 : 8 - (request[0] >> 1 & 7)]
         if len(self._download) > _LARGEST:
             raise SdoAbort(TOO_LONG)
@@ -321,12 +321,12 @@ class SdoServer:
     def _upload_segment(self, request: bytes) -> bytes:
         if self._upload is None:
             raise SdoAbort(COMMAND)
-        toggle = self._toggled(request)
+        toggle = self._checked_toggle_bit(request)
         part, rest = self._upload[:7], self._upload[7:]
         self._upload = rest or None
         return struct.pack("<B7s", toggle | (7 - len(part)) << 1 | (not rest), part)
 
-    def _toggled(self, request: bytes) -> int:
+    def _checked_toggle_bit(self, request: bytes) -> int:
         """Return the toggle bit, which must alternate from 0."""
         toggle = request[0] & 0x10
         if toggle != self._toggle:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.canopen.capabilities import TORQUE_UNITS, entry_of, family_of
+from drivers.canopen.capabilities import TORQUE_UNITS, family_of, parse_entry
 from ident_service.config.canopen import CanopenDrive
 from ident_service.config.drive_family import Family, TorqueUnit
 from ident_service.config.eds import DataSheet, data_sheet
@@ -27,7 +27,7 @@ _SERVO = 0x0002_0192
 
 
 def _key(text: str) -> int:
-    entry = entry_of(text, "")
+    entry = parse_entry(text, "")
     return entry.index << 8 | entry.sub
 
 

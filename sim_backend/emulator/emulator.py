@@ -151,7 +151,7 @@ class Emulator:
             if face.listens(frame.identifier) and drive != sender and not self._injection.dead(drive):
                 self._deadline = None
                 is_sync = is_sync or frame.identifier == face.sync_identifier
-                sent += self._injection.on_the_way(drive, face.receive(frame, now_ns), now_ns)
+                sent += self._injection.apply_to_frames(drive, face.receive(frame, now_ns), now_ns)
         for companion in self.companions if bus == 0 and sender is None else ():
             if companion.listens(frame.identifier):
                 self._deadline = None
@@ -179,7 +179,7 @@ class Emulator:
             for drive, face in enumerate(self.faces):
                 deadline = face.next_deadline_ns
                 if deadline is not None and deadline <= at and not self._injection.dead(drive):
-                    sent += self._injection.on_the_way(drive, face.tick(at), at)
+                    sent += self._injection.apply_to_frames(drive, face.tick(at), at)
             for companion in self.companions:
                 due = companion.next_deadline_ns
                 if due is not None and due <= at:

@@ -251,7 +251,7 @@ class Injection:
         self.active.remove(fault)
         return self._changed(fault, now_ns, begins=False)
 
-    def on_the_way(self, drive: int, frames: Sequence[Frame], now_ns: int) -> list[Sent]:
+    def apply_to_frames(self, drive: int, frames: Sequence[Frame], now_ns: int) -> list[Sent]:
         """Apply faults to the frames that a drive has sent; returns those that get through."""
         bus = self._buses[drive]
         if not self.active:
@@ -306,7 +306,7 @@ class Injection:
             self._faces[drive].motor.defects = self._defects(drive)
             if drive not in self._dead:
                 self._faces[drive].evaluate(now_ns)
-            sent += self.on_the_way(drive, frames, now_ns)
+            sent += self.apply_to_frames(drive, frames, now_ns)
         return sent
 
     def _drive_changed(self, fault: DriveFault, drive: int, now_ns: int, *, begins: bool) -> list[Frame]:

@@ -155,7 +155,7 @@ class LockStepArm:
         self._require_bus(bus)
         frame = self._wires[bus].as_sent(frame)
         self._wires[bus].occupy(self._now_ns, frame)
-        self._carry(self.emulator.receive(bus, frame, self._now_ns))
+        self._put_on_buses(self.emulator.receive(bus, frame, self._now_ns))
 
     def receive(self, bus: int, deadline_ns: int) -> Frame | None:
         """Return the next frame; see `LockStepLink.receive`."""
@@ -211,7 +211,7 @@ class LockStepArm:
                 break
             self._now_ns = max(due, self._now_ns)
             if arrived is None:
-                self._carry(self.emulator.tick(due))
+                self._put_on_buses(self.emulator.tick(due))
             else:
                 self._deliver(arrived, self._wires[arrived].take(), self._now_ns)
         self._now_ns = max(now_ns, self._now_ns)
@@ -220,9 +220,9 @@ class LockStepArm:
         if bus in self._open:
             self._heard[bus].append(self._wires[bus].as_sent(sent.frame)._replace(stamp_ns=now_ns))
         if sent.drive is not None:
-            self._carry(self.emulator.receive(bus, sent.frame, now_ns, sent.drive))
+            self._put_on_buses(self.emulator.receive(bus, sent.frame, now_ns, sent.drive))
 
-    def _carry(self, sent: Sequence[Sent]) -> None:
+    def _put_on_buses(self, sent: Sequence[Sent]) -> None:
         for item in sent:
             self._wires[item.bus].put(item)
 
@@ -275,7 +275,7 @@ _standing: dict[int, LockStepArm] = {}
 
 
 @contextmanager
-def keep_arm(
+def hold_emulated_arm(
     config: ArmConfig, faults: Sequence[DriveFault] = (), clock: VirtualClock | None = None
 ) -> Iterator[LockStepArm]:
     """Keep an emulated arm alive before links to it are opened and after they are closed.

@@ -359,7 +359,7 @@ class _Run:
                     self._look(now)
                     if stop_requested() or (end is not None and now >= end):
                         break
-                heard = self._station.receive(self._patience(now, looked))
+                heard = self._station.receive(self._poll_timeout(now, looked))
                 # Time goes on to when nothing waited any more, however late this process is.
                 now = clock.now_ns()
                 heard, at_once = heard or self._station.receive(0.0), 0
@@ -368,14 +368,14 @@ class _Run:
                     bus, frame = heard
                     # Drives act when a frame is on the wire, not when this process comes to it.
                     at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
-                    self._pass_on(emulator.receive(bus, frame, at_ns), at_ns)
+                    self._send_ready_frames(emulator.receive(bus, frame, at_ns), at_ns)
                     now = clock.now_ns()
                     heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
                 if at_once:
                     self._heard += at_once
                     heard_ns = clock.now_ns()
                 # What was due while frames waited comes after them: a drive's firmware would have had them in time.
-                self._pass_on(emulator.tick(now))
+                self._send_ready_frames(emulator.tick(now))
                 self._streaming = now - heard_ns < _POLL_NS
                 if self._streaming:
                     emulator.go_on(now)
@@ -386,10 +386,10 @@ class _Run:
         now = clock.now_ns()
         self._look(now)
         return Emulated(
-            (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._resting(now)
+            (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._is_at_rest(now)
         )
 
-    def _patience(self, now_ns: int, looked_ns: int) -> float:
+    def _poll_timeout(self, now_ns: int, looked_ns: int) -> float:
         due = [looked_ns + _POLL_NS, *(item[0] for item in self._later[:1])]
         if (deadline := self._emulator.next_deadline_ns) is not None:
             due.append(deadline)
@@ -397,7 +397,7 @@ class _Run:
             due.append(overdue)
         return max(0, min(due) - now_ns) * 1e-9
 
-    def _pass_on(self, sent: Sequence[Sent], asked_ns: int | None = None) -> None:
+    def _send_ready_frames(self, sent: Sequence[Sent], asked_ns: int | None = None) -> None:
         """Send what is ready, the lowest identifiers first, as a bus would, but no position too late."""
         now = self._clock.now_ns()
         too_late = asked_ns is not None and now - asked_ns > self._given_up_ns
@@ -428,14 +428,14 @@ class _Run:
         if emulator.active != self._faults:
             self._faults = emulator.active
             self._tell("faults: " + (", ".join(self._named(fault) for fault in emulator.active) or "none"))
-        if (resting := self._resting(now_ns)) != self._rested:
+        if (resting := self._is_at_rest(now_ns)) != self._rested:
             self._rested = resting
             self._tell("the arm is at rest" if resting else "the arm moves")
 
     def _named(self, fault: DriveFault) -> str:
         return fault.kind if fault.drive is None else f"{fault.kind} of {self._emulator.names[fault.drive]}"
 
-    def _resting(self, now_ns: int) -> bool:
+    def _is_at_rest(self, now_ns: int) -> bool:
         fastest = float(np.abs(self._emulator.body.plant.velocity).max())
         if fastest > _RESTS:
             self._stirred_ns = now_ns
@@ -461,4 +461,4 @@ class _Run:
                 except DriverError as error:
                     self._tell(f"not understood: {error}")
         # A line must have had its effect before the next one is read.
-        self._pass_on(self._emulator.tick(now_ns))
+        self._send_ready_frames(self._emulator.tick(now_ns))

@@ -15,7 +15,7 @@ from drivers.barrett.protocol import (
     Request,
     Role,
     address_of,
-    answer_of,
+    decoded,
     get,
     pendant_of,
     pendant_value,
@@ -50,10 +50,10 @@ def test_torques_are_packed_as_the_vectors_say(torques: tuple[int, ...], data: s
 def test_positions_are_packed_as_the_vectors_say(counts: int, data: str) -> None:
     frame = position_frame(5, counts)
     assert frame == Frame(0x4A3, bytes.fromhex(data))
-    assert answer_of(frame) == Position(5, counts)
+    assert decoded(frame) == Position(5, counts)
     # The upper two bits of the first byte are no part of it.
     raised = bytes([frame.data[0] | 0xC0, *frame.data[1:]])
-    assert answer_of(Frame(0x4A3, raised)) == Position(5, counts)
+    assert decoded(Frame(0x4A3, raised)) == Position(5, counts)
 
 
 def test_positions_are_asked_for_by_one_frame_and_answered_by_every_puck() -> None:
@@ -66,8 +66,8 @@ def test_requests_and_replies_have_the_documented_bytes() -> None:
     assert put(10, 8, 1) == Frame(10, bytes([0x88, 0, 1, 0, 0, 0]))
     assert put(3, 48, -36833).data == bytes([0xB0, 0, *(-36833).to_bytes(4, "little", signed=True)])
     assert reply(3, 86, 2700, wide=False) == Frame(0x406 | 3 << 5, bytes([0xD6, 0, 0x8C, 0x0A]))
-    assert answer_of(reply(3, 86, -2, wide=False)) == Reply(3, 86, -2)
-    assert answer_of(reply(3, 68, 1 << 20, wide=True)) == Reply(3, 68, 1 << 20)
+    assert decoded(reply(3, 86, -2, wide=False)) == Reply(3, 86, -2)
+    assert decoded(reply(3, 68, 1 << 20, wide=True)) == Reply(3, 68, 1 << 20)
     assert request_of(bytes([0x88, 0, 2, 0])) == Request(8, 2)  # the short form, which is accepted as well
     with pytest.raises(DriverError, match="32 bits"):
         put(1, 48, 1 << 31)
@@ -156,7 +156,7 @@ def test_any_value_of_the_pendant_is_read(value: int) -> None:
 
 @given(st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans(), st.booleans(), st.booleans())
 def test_no_frame_upsets_the_decoder(identifier: int, data: bytes, remote: bool, error: bool, extended: bool) -> None:
-    found = answer_of(Frame(identifier, data, remote, error, extended))
+    found = decoded(Frame(identifier, data, remote, error, extended))
     request_of(data)
     torques_of(data)
     if found is not None:
@@ -171,7 +171,7 @@ def test_no_frame_upsets_the_decoder(identifier: int, data: bytes, remote: bool,
 
 @given(st.integers(1, 31), VALUES_22, st.none() | VALUES_22)
 def test_positions_come_back(node: int, counts: int, encoder: int | None) -> None:
-    assert answer_of(position_frame(node, counts, encoder)) == Position(node, counts, encoder)
+    assert decoded(position_frame(node, counts, encoder)) == Position(node, counts, encoder)
 
 
 @given(st.integers(0, 127), st.lists(VALUES_14, max_size=4))
@@ -182,6 +182,6 @@ def test_torques_come_back(number: int, counts: list[int]) -> None:
 
 @given(st.integers(1, 31), st.integers(0, 127), st.integers(-(1 << 31), (1 << 31) - 1))
 def test_properties_come_back(node: int, number: int, value: int) -> None:
-    assert answer_of(reply(node, number, value, wide=True)) == Reply(node, number, value)
+    assert decoded(reply(node, number, value, wide=True)) == Reply(node, number, value)
     assert request_of(put(node, number, value).data) == Request(number, value)
     assert request_of(get(node, number).data) == Request(number)

@@ -12,7 +12,7 @@ import pytest
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
-from ident_service.config.payload import Payload, knowledge_with_payload
+from ident_service.config.payload import Payload, constraints_with_payload
 from ident_service.errors import ConfigError, ModelError
 from ident_service.estimation.feasible.feasible_set import configured_blocks
 from ident_service.model.arm_model import arm_model
@@ -119,7 +119,7 @@ def test_bounds_of_masses_are_those_of_the_arm_with_it(shipped: Path) -> None:
     joints = dict(config.joints)
     body = joints["elbow"].body.model_copy(update={"mass": (0.5, 1.5)})
     joints["elbow"] = joints["elbow"].model_copy(update={"body": body})
-    said = knowledge_with_payload(config.model_copy(update={"joints": joints})).joints["elbow"].body.mass
+    said = constraints_with_payload(config.model_copy(update={"joints": joints})).joints["elbow"].body.mass
     assert said == (1.3, 2.3)
     assert model.prior is not None
     assert model.prior[index["m2"]] == pytest.approx(1.8)

@@ -71,9 +71,9 @@ def test_a_newcomer_takes_the_place_of_who_has_waited_longest() -> None:
     for port in range(4):
         book.at += 1.0
         assert book.come(FAR, port)
-    book.headers_came((FAR, 0), body=True)
-    book.request_came((FAR, 0))  # is being answered
-    book.headers_came((FAR, 1), body=True)
+    book.headers_received((FAR, 0), body=True)
+    book.request_received((FAR, 0))  # is being answered
+    book.headers_received((FAR, 1), body=True)
     assert book.come(FAR, 4)  # half of all places are full with this address
     assert book.gone() == [(FAR, 2)]
     book.answered((FAR, 0))  # and waits for another request, as the last of all
@@ -90,12 +90,12 @@ def test_what_is_answered_stays_and_leaves_places_for_a_stop() -> None:
     book = Book(8)
     for port in range(4):
         assert book.come(FAR, port)
-        book.headers_came((FAR, port), body=False)
+        book.headers_received((FAR, port), body=False)
         assert not book.busy((NEAR, 0))
     assert not book.come(FAR, 9)  # nobody of this address can go
     for port in range(2):
         assert book.come(NEAR, port)
-        book.headers_came((NEAR, port), body=False)
+        book.headers_received((NEAR, port), body=False)
     assert book.busy((NEAR, 9))  # three quarters: the doors refuse all but stops and leases
     assert book.gone() == [(FAR, 9)]
     book.end()
@@ -106,9 +106,9 @@ def test_headers_bodies_and_idle_lines_have_a_time() -> None:
     for port in range(4):
         assert book.come(NEAR, port)
     book.at += HEADER_SECONDS - 1.0
-    book.headers_came((NEAR, 1), body=True)
-    book.headers_came((NEAR, 2), body=False)
-    book.headers_came((NEAR, 3), body=False)
+    book.headers_received((NEAR, 1), body=True)
+    book.headers_received((NEAR, 2), body=False)
+    book.headers_received((NEAR, 3), body=False)
     book.answered((NEAR, 3))
     book.at += 2.0
     book.sweep()
@@ -126,8 +126,8 @@ def test_headers_bodies_and_idle_lines_have_a_time() -> None:
 def test_a_request_that_comes_before_the_last_one_is_told_of_keeps_its_time() -> None:
     book = Book(8)
     assert book.come(NEAR, 0)
-    book.headers_came((NEAR, 0), body=False)
-    book.headers_came((NEAR, 0), body=False)  # a stream, say
+    book.headers_received((NEAR, 0), body=False)
+    book.headers_received((NEAR, 0), body=False)  # a stream, say
     book.answered((NEAR, 0))
     book.at += 2 * HEADER_SECONDS
     book.sweep()
@@ -267,11 +267,11 @@ def test_descriptors_are_raised_and_leave_a_reserve(monkeypatch: pytest.MonkeyPa
     limits, given = (1024, 1 << 20), list[tuple[int, int]]()
     monkeypatch.setattr(connections.resource, "getrlimit", lambda _: limits)
     monkeypatch.setattr(connections.resource, "setrlimit", lambda _, wanted: given.append(wanted))
-    assert connections.most_connections() == 512
+    assert connections.raise_connection_limit() == 512
     assert given == [(4096, 1 << 20)]
     for hard, most in ((1024, 512), (512, 256), (64, 16)):
         limits = (hard, hard)
-        assert connections.most_connections() == most
+        assert connections.raise_connection_limit() == most
     assert len(given) == 1
 
 

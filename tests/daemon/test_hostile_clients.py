@@ -29,7 +29,7 @@ from ident_service.client import IdentClient
 from ident_service.daemon import uploads
 from ident_service.daemon.app import ROUTERS
 from ident_service.daemon.connections import ANSWER_SECONDS, HEADER_SECONDS, Connections
-from ident_service.daemon.dependencies import while_known
+from ident_service.daemon.dependencies import while_authorised
 from ident_service.daemon.news import LOOK
 from ident_service.operations import deletion
 from ident_service.registry import arms
@@ -42,7 +42,7 @@ def test_one_address_leaves_places_for_its_own_stops() -> None:
     for port in range(12):
         assert book.come(FAR, port)
         assert not book.busy((FAR, port))
-        book.headers_came((FAR, port), body=False)
+        book.headers_received((FAR, port), body=False)
     assert book.busy((FAR, 12))  # three quarters of the places of one address
     assert not book.busy((NEAR, 1))
     for port in range(12, 40):
@@ -55,7 +55,7 @@ def test_who_does_not_read_an_answer_is_let_go() -> None:
     book = Book(8)
     for port in range(3):
         assert book.come(NEAR, port)
-        book.headers_came((NEAR, port), body=False)
+        book.headers_received((NEAR, port), body=False)
         book.sending((NEAR, port))
     book.sent((NEAR, 1))
     book.at += ANSWER_SECONDS - 1.0
@@ -135,7 +135,7 @@ def test_hundreds_of_streams_keep_no_stop_of_their_address_out(state: Path) -> N
 
 def test_every_stream_ends_with_its_token() -> None:
     def needs(dependant: Dependant) -> bool:
-        return dependant.call is while_known or any(needs(one) for one in dependant.dependencies)
+        return dependant.call is while_authorised or any(needs(one) for one in dependant.dependencies)
 
     routes = [route for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)]
     found = {route.path: needs(route.dependant) for route in routes if route.response_class is StreamingResponse}

@@ -21,7 +21,7 @@ from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, UnitChild, alive, name_of
 from ident_service.daemon.jobs.socket_activation import taken
-from ident_service.daemon.serve import tell_manager, watchdog_seconds
+from ident_service.daemon.serve import notify_systemd, watchdog_seconds
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.state_folder import control_path
@@ -82,10 +82,10 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         assert ident(capsys, "verify", "x.json", *server)[0] == 2
         assert ident(capsys, "jobs", "list", "--state", state)[1]["jobs"][0]["kind"] == "simulate"
         with ControlFile.take(control_path(state, "quick"), None) as mover:
-            mover.ask_pause(True)
+            mover.request_pause(True)
             assert ident(capsys, "finish", "quick", *server)[1]["reached"] is True
             assert (mover.finish, mover.pause, mover.stop) == (True, False, False)
-            mover.ask_pause(True)
+            mover.request_pause(True)
             # At a terminal of the same machine it is the same.
             assert ident(capsys, "finish", state / "quick.yaml", "--state", state)[0] == 0
             assert not mover.pause
@@ -138,9 +138,9 @@ def test_a_manager_hears_ready_alive_and_stopping(state: Path, tmp_path: Path) -
 
 def test_without_a_manager_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    tell_manager("READY=1")
+    notify_systemd("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/at/all")
-    tell_manager("READY=1")
+    notify_systemd("READY=1")
     monkeypatch.setenv("WATCHDOG_USEC", "3000000")
     monkeypatch.setenv("WATCHDOG_PID", "1")
     assert watchdog_seconds() is None

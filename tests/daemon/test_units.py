@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ident_service.daemon.connections import most_connections
+from ident_service.daemon.connections import raise_connection_limit
 
 UNITS = Path(__file__).parents[2] / "configs" / "systemd"
 NAMES = ("ident.service", "ident-motion.socket", "ident-motion@.service")
@@ -98,4 +98,4 @@ def test_the_daemon_can_reach_the_door_of_motions() -> None:
 
 def test_the_daemons_unit_has_descriptors_for_all_its_connections_and_as_many_to_spare() -> None:
     (limit,) = re.findall(r"^LimitNOFILE=(\d+)$", (UNITS / "ident.service").read_text(encoding="utf-8"), re.MULTILINE)
-    assert int(limit) >= 2 * most_connections()
+    assert int(limit) >= 2 * raise_connection_limit()

@@ -259,7 +259,7 @@ def test_half_uploads_go_after_a_day(daemon: Asked) -> None:
     old, new = (daemon.post("/api/v1/uploads", announced(word)).json()["id"] for word in (b"old", b"new"))
     for path in (state / ".uploads" / old, *(state / ".uploads" / old).iterdir()):
         os.utime(path, (1.0, time.time() - uploads.HALF_SECONDS - 60.0))
-    assert uploads.delete_half_uploads(state) == [old]
+    assert uploads.delete_stale_uploads(state) == [old]
     assert [one["id"] for one in daemon.get("/api/v1/uploads").json()] == [new]
     assert daemon.ask("DELETE", f"/api/v1/uploads/{new}").status_code == 204
     assert daemon.get(f"/api/v1/uploads/{new}").status_code == 404

@@ -12,7 +12,7 @@ from ident_service.config.arm import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import equations as module
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import Equations, equations, kept_motion
+from ident_service.estimation.equations import Equations, equations, smoothed_samples
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.regressor import joint_regressor
@@ -52,7 +52,7 @@ def assert_same_knowledge(one: Equations, other: Equations) -> None:
 def test_equations_are_those_of_the_smoothed_samples(
     arm: ArmModel, base: BaseParameters, recording: SampledRecording
 ) -> None:
-    motion = kept_motion(recording, OPTIONS)
+    motion = smoothed_samples(recording, OPTIONS)
     H = joint_regressor(arm.chain, arm.layout, motion.position, motion.velocity, motion.acceleration)
     rows = [
         np.column_stack([H[joint].T[:, base.base], motion.torque[:, joint]])[motion.keep[:, joint]]
@@ -135,5 +135,5 @@ def test_reversals_without_window_or_speed_keep_all_rows(
 ) -> None:
     everything = with_options(arm, OPTIONS.model_copy(update={"reversal": Reversal(speed=0.0, window=0.0)}))
     got = equations(recording, everything, base)
-    turns = np.sum(np.diff(np.signbit(kept_motion(recording, OPTIONS).velocity), axis=0), axis=0)
+    turns = np.sum(np.diff(np.signbit(smoothed_samples(recording, OPTIONS).velocity), axis=0), axis=0)
     np.testing.assert_array_equal(got.samples - got.total.rows, turns)

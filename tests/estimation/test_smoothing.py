@@ -12,7 +12,7 @@ from ident_service.config.arm import FrictionShape, Identification, Reversal
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import kept_motion
+from ident_service.estimation.equations import smoothed_samples
 from ident_service.estimation.signal_processing import Motion, smoothed
 from ident_service.recordings.adapters import RangeRecording
 from ident_service.recordings.cached_recording import CachedRecording
@@ -68,7 +68,7 @@ def test_windows_equal_the_whole_recording(
     recording = noisy(4013, held=held)
     whole = in_one_piece(recording, options)
     edge = int(np.ceil(options.edge * RATE))
-    got = kept_motion(recording, options)
+    got = smoothed_samples(recording, options)
     np.testing.assert_allclose(got.time, whole.time[edge:-edge], rtol=0, atol=1e-9)
     for name in ("position", "velocity", "acceleration", "torque"):
         wanted = getattr(whole, name)[edge:-edge]
@@ -78,17 +78,17 @@ def test_windows_equal_the_whole_recording(
 @pytest.mark.parametrize("window", [400, 611])
 def test_keep_mask_in_windows_equals_the_whole_recording(monkeypatch: pytest.MonkeyPatch, window: int) -> None:
     recording = noisy(4013)
-    whole = kept_motion(recording, plain_options())
+    whole = smoothed_samples(recording, plain_options())
     assert 0.1 < whole.keep.mean() < 0.9
     monkeypatch.setattr(smoothing, "_WINDOW", window)
-    np.testing.assert_array_equal(kept_motion(recording, plain_options()).keep, whole.keep)
+    np.testing.assert_array_equal(smoothed_samples(recording, plain_options()).keep, whole.keep)
 
 
 @pytest.mark.parametrize("edge", [0.1, 0.5, 3.0])
 @pytest.mark.parametrize("samples", [3700, 3850, 4000, 4150, 4300])
 def test_edges_do_not_depend_on_where_windows_end(monkeypatch: pytest.MonkeyPatch, edge: float, samples: int) -> None:
     monkeypatch.setattr(smoothing, "_WINDOW", 700)
-    got = kept_motion(noisy(samples), plain_options(edge=edge))
+    got = smoothed_samples(noisy(samples), plain_options(edge=edge))
     left_out = int(np.ceil(edge * RATE))
     np.testing.assert_allclose(got.time, np.arange(left_out, samples - left_out) / RATE, rtol=0, atol=1e-9)
 
@@ -105,7 +105,7 @@ def test_a_cubic_motion_keeps_its_derivatives() -> None:
     powers = [np.polynomial.Polynomial(row) for row in coefficients]
     position = np.column_stack([p(time) for p in powers])
     recording = SampledRecording(stamps(2400, RATE), position, np.zeros_like(position))
-    got = kept_motion(recording, plain_options(edge=3.0))
+    got = smoothed_samples(recording, plain_options(edge=3.0))
     for joint, p in enumerate(powers):
         np.testing.assert_allclose(got.position[:, joint], p(got.time), rtol=0, atol=1e-9)
         np.testing.assert_allclose(got.velocity[:, joint], p.deriv()(got.time), rtol=0, atol=1e-8)
@@ -117,7 +117,7 @@ def test_sines_keep_their_derivatives() -> None:
     time = np.arange(4000) / RATE
     position = motion.derivative(time, 0)
     recording = SampledRecording(stamps(4000, RATE), position, np.zeros_like(position))
-    got = kept_motion(recording, plain_options(smoothing=plain_smoothing(cutoff=40.0)))
+    got = smoothed_samples(recording, plain_options(smoothing=plain_smoothing(cutoff=40.0)))
     for order, values in enumerate((got.position, got.velocity, got.acceleration)):
         wanted = motion.derivative(got.time, order)
         np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
@@ -127,7 +127,7 @@ def test_the_filter_has_no_phase_and_the_configured_cut_off() -> None:
     time = np.arange(4000) / RATE
     position = np.sin(2.0 * np.pi * 8.0 * time)[:, None]
     recording = SampledRecording(stamps(4000, RATE), position, np.zeros_like(position))
-    got = kept_motion(recording, plain_options(smoothing=plain_smoothing(cutoff=8.0), edge=3.0))
+    got = smoothed_samples(recording, plain_options(smoothing=plain_smoothing(cutoff=8.0), edge=3.0))
     # Twice through a Butterworth filter, its cut-off frequency loses half of its amplitude.
     np.testing.assert_allclose(got.position[:, 0], 0.5 * np.sin(2.0 * np.pi * 8.0 * got.time), rtol=0, atol=1e-6)
 
@@ -137,14 +137,14 @@ def test_held_torque_is_the_mean_of_two_periods_and_sampled_torque_is_left_alone
     options = plain_options()
     edge = int(np.ceil(options.edge * RATE))
     part = slice(edge, 1200 - edge)
-    np.testing.assert_array_equal(kept_motion(sampled, options).torque, sampled.torque[part])
+    np.testing.assert_array_equal(smoothed_samples(sampled, options).torque, sampled.torque[part])
     mean = 0.5 * (held.torque[:-1] + held.torque[1:])
-    np.testing.assert_allclose(kept_motion(held, options).torque, mean[edge - 1 : 1199 - edge], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(smoothed_samples(held, options).torque, mean[edge - 1 : 1199 - edge], rtol=0, atol=1e-15)
 
 
 def test_samples_near_a_reversal_are_left_out() -> None:
     options = plain_options(reversal=Reversal(speed=0.3, window=0.1))
-    got = kept_motion(noisy(3000), options)
+    got = smoothed_samples(noisy(3000), options)
     reach = round(0.1 * RATE)
     slow = np.abs(got.velocity) <= 0.3
     wanted = ~np.array([slow[max(k - reach, 0) : k + reach + 1].any(axis=0) for k in range(len(slow))])
@@ -155,7 +155,7 @@ def test_samples_near_a_reversal_are_left_out() -> None:
 
 def test_a_reversal_too_quick_to_be_slow_is_still_left_out() -> None:
     options = plain_options(reversal=Reversal(speed=0.0, window=0.05))
-    got = kept_motion(noisy(3000), options)
+    got = smoothed_samples(noisy(3000), options)
     turns = np.argwhere(np.diff(np.sign(got.velocity), axis=0) != 0.0)
     assert len(turns) > 10
     for sample, joint in turns:
@@ -169,7 +169,7 @@ def test_too_short_recordings_are_refused(rate: float, seconds: float) -> None:
     position = np.sin(np.arange(samples) / rate)[:, None]
     recording = SampledRecording(stamps(samples, rate), position, position)
     with pytest.raises(RecordingError, match=r"synthetic.csv: the longest stretch without a gap.*at least 2"):
-        kept_motion(recording, plain_options())
+        smoothed_samples(recording, plain_options())
 
 
 def test_the_length_that_the_message_asks_for_is_enough() -> None:
@@ -181,16 +181,16 @@ def test_the_length_that_the_message_asks_for_is_enough() -> None:
             return SampledRecording(recording.stamp_ns[part], recording.position[part], recording.torque[part])
 
         with pytest.raises(RecordingError) as caught:
-            kept_motion(cut(200), options)
+            smoothed_samples(cut(200), options)
         needed = float(str(caught.value).split("at least ")[1].split(" s")[0])
-        assert len(kept_motion(cut(int(needed * RATE) + 3), options).time) > 0
+        assert len(smoothed_samples(cut(int(needed * RATE) + 3), options).time) > 0
 
 
 @pytest.mark.parametrize("samples", [0, 1])
 def test_empty_recordings_are_refused(samples: int) -> None:
     recording = SampledRecording(stamps(samples, RATE), np.zeros((samples, 2)), np.zeros((samples, 2)))
     with pytest.raises(RecordingError, match="holds no samples"):
-        kept_motion(recording, plain_options())
+        smoothed_samples(recording, plain_options())
 
 
 def test_irregular_stamps_make_no_difference_to_a_smooth_motion() -> None:
@@ -201,7 +201,7 @@ def test_irregular_stamps_make_no_difference_to_a_smooth_motion() -> None:
     late[0], late[-1] = regular[0], regular[-1]
     late = np.round(late * 1e9) * 1e-9
     position = motion.derivative(late, 0)
-    got = kept_motion(SampledRecording(np.round(late * 1e9).astype(np.int64), position, position), plain_options())
+    got = smoothed_samples(SampledRecording(np.round(late * 1e9).astype(np.int64), position, position), plain_options())
     wanted = motion.derivative(got.time, 2)
     np.testing.assert_allclose(got.acceleration, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max())
 
@@ -210,7 +210,7 @@ def test_a_gap_is_cut_at_and_its_edges_are_left_out() -> None:
     good = noisy(6000)
     stamp = good.stamp_ns.copy()
     stamp[3000:] += 1_000_000_000
-    got = kept_motion(SampledRecording(stamp, good.position, good.torque), plain_options())
+    got = smoothed_samples(SampledRecording(stamp, good.position, good.torque), plain_options())
     hole = (got.time > 3000 / RATE - 0.5) & (got.time < 3000 / RATE + 1.0 + 0.5 - 1e-9)
     assert not hole.any()
     assert got.time[-1] > 6000 / RATE
@@ -220,13 +220,13 @@ def test_jitter_of_a_tenth_of_a_period_passes() -> None:
     good = noisy(3000)
     jitter = np.random.default_rng(1).integers(-250_000, 250_000, size=3000)
     recording = SampledRecording(good.stamp_ns + jitter, good.position, good.torque)
-    assert len(kept_motion(recording, plain_options()).time) == 2800
+    assert len(smoothed_samples(recording, plain_options()).time) == 2800
 
 
 def test_recordings_slower_than_the_cut_off_are_refused() -> None:
     recording = SampledRecording(stamps(300, 10.0), np.zeros((300, 2)), np.zeros((300, 2)))
     with pytest.raises(RecordingError, match=r"sampled at 10 Hz, too slow for a cut-off of 8 Hz"):
-        kept_motion(recording, plain_options())
+        smoothed_samples(recording, plain_options())
 
 
 def test_what_depends_on_friction_alone_filters_nothing_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,7 +240,7 @@ def test_what_depends_on_friction_alone_filters_nothing_again(monkeypatch: pytes
     monkeypatch.setattr(smoothing, "low_pass", counted)
     options = plain_options(smoothing=plain_smoothing(filter_torque=True))
     recording = CachedRecording(noisy(4013))
-    kept_motion(recording, options)
+    smoothed_samples(recording, options)
     once = len(filtered)
     others = {
         "friction": FrictionShape(presliding=0.01),
@@ -249,7 +249,7 @@ def test_what_depends_on_friction_alone_filters_nothing_again(monkeypatch: pytes
     }
     for key, value in others.items():
         changed = options.model_copy(update={key: value})
-        again, fresh = kept_motion(recording, changed), kept_motion(noisy(4013), changed)
+        again, fresh = smoothed_samples(recording, changed), smoothed_samples(noisy(4013), changed)
         for name in Motion.__dataclass_fields__:
             assert np.array_equal(getattr(again, name), getattr(fresh, name)), (key, name)
     assert len(filtered) == once * (1 + len(others))  # those of `fresh`, and none else
@@ -271,26 +271,26 @@ def test_another_filter_is_never_taken_for_the_last(change: dict[str, object]) -
     kept, options = CachedRecording(noisy(4013)), plain_options()
     changed = options.model_copy(update=change)
     for asked in (options, changed, options):
-        found, fresh = kept_motion(kept, asked), kept_motion(noisy(4013), asked)
+        found, fresh = smoothed_samples(kept, asked), smoothed_samples(noisy(4013), asked)
         for name in Motion.__dataclass_fields__:
             assert np.array_equal(getattr(found, name), getattr(fresh, name)), name
 
 
 def test_another_part_of_a_recording_has_its_own_smoothed_samples() -> None:
     kept, options = CachedRecording(noisy(4013)), plain_options()
-    whole = kept_motion(kept, options)
+    whole = smoothed_samples(kept, options)
     for start, end in ((2.0, 12.0), (5.0, 15.0)):
-        part = kept_motion(RangeRecording(kept, start, end), options)
-        fresh = kept_motion(RangeRecording(noisy(4013), start, end), options)
+        part = smoothed_samples(RangeRecording(kept, start, end), options)
+        fresh = smoothed_samples(RangeRecording(noisy(4013), start, end), options)
         assert np.array_equal(part.position, fresh.position)
         assert len(part.time) < len(whole.time)
-    assert np.array_equal(kept_motion(kept, options).position, whole.position)
+    assert np.array_equal(smoothed_samples(kept, options).position, whole.position)
 
 
 def test_smoothed_samples_of_a_large_recording_are_not_kept() -> None:
     recording, options = CachedRecording(noisy(4013), max_bytes=100_000), plain_options()
     first, second = (next(smoothed(recording, options)) for _ in range(2))
-    kept_motion(recording, options)
+    smoothed_samples(recording, options)
     assert recording.memory.recall("grid", RecordingFormat()) is not None
     assert not np.shares_memory(first.position, second.position)
     again = [next(smoothed(recording, options)).position for _ in range(2)]

@@ -14,7 +14,7 @@ from helpers.random_arms import model_around, random_delta
 from ident_service.config.arm import Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import equation_rows, equations, kept_motion
+from ident_service.estimation.equations import equation_rows, equations, smoothed_samples
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
@@ -35,7 +35,7 @@ def noisy(samples: int, *, noise: float = 1e-4, seed: int = 3) -> SampledRecordi
 def test_polynomials_recover_the_derivatives() -> None:
     recording = noisy(4000, noise=0.0)
     options = plain_options(smoothing=plain_smoothing(method="savitzky_golay", order=4, cutoff=25.0))
-    got = kept_motion(recording, options)
+    got = smoothed_samples(recording, options)
     for order, values in enumerate((got.position, got.velocity, got.acceleration)):
         wanted = waves(3, 3).derivative(got.time, order)
         np.testing.assert_allclose(values, wanted, rtol=0, atol=2e-4 * np.abs(wanted).max())
@@ -45,7 +45,7 @@ def test_polynomials_are_exact_for_polynomials() -> None:
     time = np.arange(2400) / RATE
     p = np.polynomial.Polynomial([0.3, -0.2, 0.05, 0.004])
     recording = SampledRecording(stamps(2400, RATE), p(time)[:, None], np.zeros((2400, 1)))
-    got = kept_motion(recording, plain_options(smoothing=plain_smoothing(method="savitzky_golay", order=3)))
+    got = smoothed_samples(recording, plain_options(smoothing=plain_smoothing(method="savitzky_golay", order=3)))
     for order, values in enumerate((got.position, got.velocity, got.acceleration)):
         wanted = p.deriv(order)(got.time) if order else p(got.time)
         np.testing.assert_allclose(values[:, 0], wanted, rtol=0, atol=1e-8 * 100.0**order)
@@ -56,7 +56,7 @@ def test_polynomials_have_about_the_cut_off_asked_for() -> None:
     white = rng.normal(size=(40_000, 1))
     recording = SampledRecording(stamps(len(white), RATE), white, white)
     for method in ("butterworth", "savitzky_golay"):
-        got = kept_motion(recording, plain_options(smoothing=plain_smoothing(method=method, order=3, cutoff=10.0)))
+        got = smoothed_samples(recording, plain_options(smoothing=plain_smoothing(method=method, order=3, cutoff=10.0)))
         # White noise of which a share of the band is left.
         assert float(np.var(got.position)) == pytest.approx(10.0 / (RATE / 2.0), rel=0.25)
 
@@ -69,13 +69,13 @@ def test_windows_and_decimation_change_nothing(
 ) -> None:
     recording = noisy(4013)
     shape = plain_friction(presliding=(0.0, 0.01, 0.05))
-    whole = kept_motion(
+    whole = smoothed_samples(
         recording,
         plain_options(smoothing=plain_smoothing(method=method, filter_torque=True), friction=shape),  # type: ignore[arg-type]
     )
     monkeypatch.setattr(smoothing, "_WINDOW", window)
     few = plain_smoothing(method=method, filter_torque=True, decimate=decimate)  # type: ignore[arg-type]
-    got = kept_motion(recording, plain_options(smoothing=few, friction=shape))
+    got = smoothed_samples(recording, plain_options(smoothing=few, friction=shape))
     for name in FIELDS:
         wanted = getattr(whole, name)[::decimate]
         largest = max(1.0, float(np.abs(wanted).max()))
@@ -85,7 +85,7 @@ def test_windows_and_decimation_change_nothing(
 def test_direction_follows_the_smoothed_velocity() -> None:
     options = plain_options(friction=plain_friction(presliding=0.02), edge=0.0)
     C = np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.0, 0.0, -2.0]])
-    got = kept_motion(noisy(3000), options, C)
+    got = smoothed_samples(noisy(3000), options, C)
     assert got.direction is not None
     wanted = friction_direction(got.velocity @ C.T, 1.0 / RATE, np.full(3, 0.02))
     np.testing.assert_allclose(got.direction, wanted, rtol=0, atol=1e-9)
@@ -94,8 +94,8 @@ def test_direction_follows_the_smoothed_velocity() -> None:
 def test_a_joint_is_left_out_where_any_of_its_drives_stands_still() -> None:
     C = np.array([[1.0, 0.0, 0.0], [0.7, 1.0, 0.0], [0.0, 0.0, 1.0]])
     options = plain_options(reversal=Reversal(speed=0.1, window=0.0))
-    got = kept_motion(noisy(4000, noise=0.0), options, C)
-    plain = kept_motion(noisy(4000, noise=0.0), options)
+    got = smoothed_samples(noisy(4000, noise=0.0), options, C)
+    plain = smoothed_samples(noisy(4000, noise=0.0), options)
     rate = got.velocity @ C.T
     slow = np.abs(rate) <= 0.1
     # Rows where a speed changes its sign between two samples are fast here and hence none of those that differ.
@@ -110,7 +110,7 @@ def test_a_delay_shifts_the_torque(seconds: float) -> None:
     time = np.arange(3000) / RATE
     torque = np.sin(2.0 * np.pi * 0.7 * (time - seconds))[:, None]
     recording = SampledRecording(stamps(3000, RATE), noisy(3000).position[:, :1], torque)
-    got = kept_motion(recording, plain_options(delay=seconds))
+    got = smoothed_samples(recording, plain_options(delay=seconds))
     np.testing.assert_allclose(got.torque[:, 0], np.sin(2.0 * np.pi * 0.7 * got.time), rtol=0, atol=1e-6)
 
 
@@ -135,7 +135,7 @@ def test_filtered_rows_equal_those_of_one_piece(monkeypatch: pytest.MonkeyPatch)
     recording = recorded(model, delta, waves(2, 3), rate=RATE, seconds=40.0)
     plain = options.smoothing.model_copy(update={"regressor_cutoff": None, "decimate": 1})
     wide = options.model_copy(update={"smoothing": plain, "edge": 0.0})
-    motion = kept_motion(recording, wide)
+    motion = smoothed_samples(recording, wide)
     H = joint_regressor(
         model.chain,
         model.layout,
@@ -186,4 +186,4 @@ def test_both_sides_filtered_recover_the_parameters() -> None:
 
 def test_a_cut_off_above_the_samples_is_refused() -> None:
     with pytest.raises(RecordingError, match="too slow for a cut-off of 150 Hz"):
-        kept_motion(noisy(3000), plain_options(smoothing=plain_smoothing(method="savitzky_golay", cutoff=150.0)))
+        smoothed_samples(noisy(3000), plain_options(smoothing=plain_smoothing(method="savitzky_golay", cutoff=150.0)))

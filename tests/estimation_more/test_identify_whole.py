@@ -13,7 +13,7 @@ import pytest
 from estimation.synthetic import SampledRecording, exact_torque, stamps, waves, with_options
 
 from ident_service.cli import main
-from ident_service.config.arm import PriorPull
+from ident_service.config.arm import PriorRegularisation
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.errors import UsageError
 from ident_service.estimation.identify import Estimate, identify
@@ -70,7 +70,7 @@ def plain(setting: Setting) -> Estimate:
 
 def drawn(setting: Setting, kind: str, weight: float | str) -> Estimate:
     options = setting.model.config.identification.model_copy(
-        update={"prior": PriorPull.model_validate({"kind": kind, "weight": weight})}
+        update={"prior": PriorRegularisation.model_validate({"kind": kind, "weight": weight})}
     )
     return identify(with_options(setting.model, options), [setting.recording])
 
@@ -113,7 +113,9 @@ def test_a_weight_chosen_on_what_was_held_out(setting: Setting, plain: Estimate,
 
 
 def test_a_prior_that_the_arm_has_not_is_refused(setting: Setting) -> None:
-    options = setting.model.config.identification.model_copy(update={"prior": PriorPull(kind="entropic", weight=1.0)})
+    options = setting.model.config.identification.model_copy(
+        update={"prior": PriorRegularisation(kind="entropic", weight=1.0)}
+    )
     bare = with_options(replace(setting.model, prior=None), options)
     with pytest.raises(UsageError, match="the arm has none"):
         identify(bare, [setting.recording])

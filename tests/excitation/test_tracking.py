@@ -14,7 +14,13 @@ from design_bench import FOURIER, ONE_START, quick, small
 from ident_service.config.motion_design import Criterion, Design
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
-from ident_service.excitation.active_limits import binding, binding_words, gain_words, needed_stiffness, stiffer_gains
+from ident_service.excitation.active_limits import (
+    active_limit_lines,
+    binding,
+    gain_words,
+    needed_stiffness,
+    stiffer_gains,
+)
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import complete_task, criterion_of, design_motion, family, per_period
 from ident_service.excitation.limit_proof import certified_clearance, proof_of, scale_to_verified, violations
@@ -23,7 +29,7 @@ from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import Problem, Task
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import Candidate, local_search, random_variables
-from ident_service.excitation.tracking import cases, track, way_width
+from ident_service.excitation.tracking import cases, segment_tube_width, track
 from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
@@ -143,7 +149,7 @@ def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
     velocity = task.limits.velocity * np.array([1.0, 1.1])
     more = from_there(replace(task, limits=replace(task.limits, velocity=velocity)))
     assert best.value - more.value == pytest.approx(expected * np.log(1.1), rel=0.3)
-    words = binding_words(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
+    words = active_limit_lines(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
     assert any("elbow is held by its velocity; 1.2 would give about" in line for line in words)
 
 
@@ -179,7 +185,7 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
             return bool(kp[1] <= allowed)
 
         gains = stiffer_gains(found, np.zeros(2, dtype=bool), needed, limits, stable)
-        lines = binding_words(found, task, limits, 0.3 * limits.velocity, ("rad", "rad"), gains)
+        lines = active_limit_lines(found, task, limits, 0.3 * limits.velocity, ("rad", "rad"), gains)
         (about,) = [line for line in lines if "elbow is held to" in line]
         return about
 
@@ -270,6 +276,6 @@ def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
     model = small(joints={"elbow": {"velocity": 0.1}}, **SLOW)
     path = PosturePath(np.array([[0.0, 0.0], [0.6, 0.5], [0.0, 0.0]]), np.array([9.0, 11.0]), 0.0)
     whole = track(path, model, 0.2).error
-    (parts,) = way_width(path, model, 0.2)(np.array([10.0]), np.array([0.1]))
+    (parts,) = segment_tube_width(path, model, 0.2)(np.array([10.0]), np.array([0.1]))
     assert (parts >= 1.1 * whole).all()
     assert (parts <= 2.0 * whole).all()

@@ -9,7 +9,7 @@ import numpy as np
 from exports.export_bench import identified, true_arm
 
 from ident_service.results.export.bodies import about_origin
-from ident_service.results.export.bodies_said import body_notes, longest_reach
+from ident_service.results.export.bodies_said import arm_reach, body_notes
 from ident_service.results.export.formats import export_texts
 
 LINKS = ["urdf", "mjcf", "sdf", "json"]
@@ -42,7 +42,7 @@ def test_a_prior_that_was_used_is_not_recommended() -> None:
 
 def test_links_that_no_arm_has_are_named() -> None:
     model = true_arm("planar2").model
-    assert longest_reach(model) == 1.0
+    assert arm_reach(model) == 1.0
     delta = np.zeros(model.layout.size)
     delta[model.layout.inertial(0)] = about_origin(9e-4, np.zeros(3), 1e-6 * np.eye(3))
     # Seen from the second joint, 1.05 m away; the link's frame lies at its far end.

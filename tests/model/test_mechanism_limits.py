@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
-from ident_service.model.limited_process import ask_process
+from ident_service.model.limited_process import run_limited_process
 from ident_service.model.mechanism import DEEPEST_LINKS, MOST_LINKS, Kind, read_mechanism
 
 LIMIT = '<limit lower="-1" upper="1" velocity="1" effort="1"/>'
@@ -134,10 +134,10 @@ def test_a_process_ends_at_its_limits(
     )
     monkeypatch.syspath_prepend(tmp_path)
     if message is None:
-        assert ask_process("limited_work", tmp_path, deadline) == {"done": True}
+        assert run_limited_process("limited_work", tmp_path, deadline) == {"done": True}
         return
     with pytest.raises(ModelError, match=message):
-        ask_process("limited_work", tmp_path, deadline)
+        run_limited_process("limited_work", tmp_path, deadline)
 
 
 BITS = [

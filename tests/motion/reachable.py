@@ -11,7 +11,7 @@ from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.trajectory import FourierPath, FourierSeries, PosturePath
 from ident_service.motion.sequencer import Paused
-from ident_service.motion.speed_scaling import Slowed, SpeedChange
+from ident_service.motion.speed_scaling import ScaledMotion, SpeedChange
 from ident_service.motion.stop_trajectory import after, stop
 from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest
 
@@ -71,7 +71,7 @@ def random_reference(rng: np.random.Generator, limits: MotionLimits, path: Motio
     time = float(rng.uniform(0.0, motion.duration))
     match str(rng.choice(["path", "slowed", "speed change", "way", "paused", "resumed", "approach"])):
         case "slowed":
-            return Slowed(motion, float(rng.uniform(0.1, 1.0))), "slowed"
+            return ScaledMotion(motion, float(rng.uniform(0.1, 1.0))), "slowed"
         case "speed change":
             factors = (float(rng.uniform(0.1, 1.0)), float(rng.choice([0.2, 0.9, 1.0])))
             return SpeedChange(motion, time, factors, path_peaks(path), limits), "speed change"

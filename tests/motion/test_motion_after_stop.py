@@ -16,7 +16,7 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.after_stop import AfterStop, after_stop, falling_joints
+from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.motion.command_channel import ControlFile, Homing, LocalCommands, SupervisedCommands
 from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
 from ident_service.motion.faults import ActiveFaults
@@ -108,15 +108,15 @@ def test_an_arm_that_would_fall_must_say_what_holds_it() -> None:
         resolved(loose(None))
     with pytest.raises(MotionRefused, match="elbow would fall"):  # a wish is no brake
         resolved(bench_config(joints={**JOINTS, "elbow": LOOSE["elbow"]}, control={"after_stop": "brake"}))
-    assert resolved(bench_config()) is AfterStop.BRAKE
-    assert resolved(loose("hold")) is AfterStop.HOLD
-    assert resolved(loose("lower")) is AfterStop.LOWER
+    assert resolved(bench_config()) is StopSecuring.BRAKE
+    assert resolved(loose("hold")) is StopSecuring.HOLD
+    assert resolved(loose("lower")) is StopSecuring.LOWER
 
 
 def test_a_simulated_drive_has_a_brake_where_nothing_is_said_and_a_real_one_has_none() -> None:
     silent = {name: {key: value for key, value in joint.items() if key != "brake"} for name, joint in JOINTS.items()}
     config = bench_config(joints=silent)
-    assert resolved(config) is AfterStop.BRAKE
+    assert resolved(config) is StopSecuring.BRAKE
     assert [config.has_brake(name) for name in silent] == [True, True]
     real = config.model_copy(update={"driver": load_arm("wam7_canopen").driver})
     with pytest.raises(MotionRefused, match=r"shoulder, elbow would fall after a stop"):
@@ -124,8 +124,8 @@ def test_a_simulated_drive_has_a_brake_where_nothing_is_said_and_a_real_one_has_
 
 
 def test_an_arm_that_does_not_fall_need_not_say_anything() -> None:
-    assert resolved(loose(None, gravity=(0.0, 0.0, 0.0))) is AfterStop.BRAKE
-    assert resolved(loose(None, gravity=(0.0, 0.0, -9.81))) is AfterStop.BRAKE  # turns about a vertical axis
+    assert resolved(loose(None, gravity=(0.0, 0.0, 0.0))) is StopSecuring.BRAKE
+    assert resolved(loose(None, gravity=(0.0, 0.0, -9.81))) is StopSecuring.BRAKE  # turns about a vertical axis
     slide = {"position": (-0.3, 0.3), "velocity": 0.5, "acceleration": 4.0, "jerk": 40.0, "torque": 30.0}
     joints = {name: {**LOOSE[name], **slide, "following_error": 0.05} for name in ("shoulder", "elbow")}
     rows = {"shoulder": {"type": "prismatic", "alpha": np.pi / 2}, "elbow": {"type": "prismatic"}}
@@ -136,7 +136,7 @@ def test_an_arm_that_does_not_fall_need_not_say_anything() -> None:
     assert falling_joints(arm_model(steep), motion_limits(steep)) == ("shoulder",)
 
 
-def resolved(config: Any) -> AfterStop:
+def resolved(config: Any) -> StopSecuring:
     return after_stop(arm_model(config), motion_limits(config))
 
 
@@ -368,13 +368,13 @@ def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(
         lifeline = SupervisedCommands(controls, ours, lock_step=False)
         person = ControlFile.reach(tmp_path / "controls", lambda: now)
         with pytest.raises(UsageError, match="not held"):
-            person.ask_home()
+            person.request_home()
         os.close(theirs)
         lifeline.wait_for_support()
         controls.ask_stop()
         now += 10**10
         assert not lifeline.lease_ok(now)
-        person.ask_home()
+        person.request_home()
         assert (lifeline.homing, lifeline.stop) == (Homing.ASKED, False)
         lifeline.tell_homing(Homing.GOING)
         assert lifeline.lease_ok(now)

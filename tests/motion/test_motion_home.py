@@ -77,8 +77,8 @@ def test_from_a_little_outside_the_way_leads_inwards_only(
     bench = make(**standing(side * OUT, 0.5))
     assert go(bench, destination).state is State.DONE
     held = next(stamp for stamp, _, message in bench.story.events if message == "stopping")
-    on_the_way = bench.story.column("stamp_ns") < held
-    wanted = side * bench.story.column("reference_position")[on_the_way, 0]
+    apply_to_frames = bench.story.column("stamp_ns") < held
+    wanted = side * bench.story.column("reference_position")[apply_to_frames, 0]
     assert (np.diff(wanted) <= 1e-12).all(), "it never turns round"
     assert wanted[0] == pytest.approx(OUT, abs=1e-4)
     end = positions(bench)[-1]

@@ -9,7 +9,7 @@ from motion_bench import PRIOR, bench_model
 
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.encoder_observer import (
-    OWED,
+    HIDDEN_SHARE,
     SLID,
     SLIDING,
     STANDING,
@@ -25,7 +25,7 @@ assert MODEL.prior is not None
 DYNAMICS = InverseDynamics(MODEL.chain, MODEL.layout, MODEL.prior)
 INERTIA = np.diag(DYNAMICS.mass_matrix(HOME))
 FRICTION, STEP = np.array([0.8, 0.3]), np.full(2, 1e-5)
-HIDDEN = OWED * LIMITS.following_error + STEPS * STEP
+HIDDEN = HIDDEN_SHARE * LIMITS.following_error + STEPS * STEP
 NONE, STILL = np.zeros(2), np.zeros(2)
 
 

@@ -13,7 +13,7 @@ from reachable import close, keeps_to, random_limits, random_path, sampled
 
 from ident_service.errors import MotionRefused
 from ident_service.motion.sequencer import Paused, Resumed
-from ident_service.motion.speed_scaling import Slowed, slowed_limits
+from ident_service.motion.speed_scaling import ScaledMotion, slowed_limits
 from ident_service.motion.trajectory import PathReference, Setpoint, rest
 
 Array = np.ndarray
@@ -138,7 +138,7 @@ def test_a_resumed_motion_can_be_paused_again() -> None:
 
 
 def test_a_rehearsal_is_resumed_as_slowly_as_it_goes() -> None:
-    slow = Slowed(MOTION, 0.2)
+    slow = ScaledMotion(MOTION, 0.2)
     limits = slowed_limits(LIMITS, 0.2)
     resumed = Paused(slow, 0.4 * slow.duration, LIMITS).resume(limits)
     keeps_to(limits, resumed, 1e-5, 1000)

@@ -12,7 +12,7 @@ from motion_bench import bench_excitation, bench_limits
 from reachable import PathPeaks, close, keeps_to, path_peaks, random_limits, random_path, sampled
 
 from ident_service.errors import MotionRefused, UsageError
-from ident_service.motion.speed_scaling import Slowed, SpeedChange, slowed_limits
+from ident_service.motion.speed_scaling import ScaledMotion, SpeedChange, slowed_limits
 from ident_service.motion.trajectory import PathReference, Setpoint, plan_trajectory, rest
 
 LIMITS = bench_limits()
@@ -28,7 +28,7 @@ def test_a_slowed_motion_goes_the_same_way_within_smaller_limits(seed: int, fact
     rng = np.random.default_rng(seed)
     limits = random_limits(rng, 2)
     motion = PathReference(random_path(rng, limits))
-    slow = Slowed(motion, factor)
+    slow = ScaledMotion(motion, factor)
     assert slow.duration == pytest.approx(motion.duration / factor)
     times, position, _, _ = sampled(slow, 50)
     for time, seen in zip(times, position, strict=True):
@@ -37,7 +37,7 @@ def test_a_slowed_motion_goes_the_same_way_within_smaller_limits(seed: int, fact
 
 
 def test_a_motion_at_full_speed_is_itself() -> None:
-    same = Slowed(MOTION, 1.0)
+    same = ScaledMotion(MOTION, 1.0)
     assert same.duration == MOTION.duration
     for time in np.linspace(0.0, MOTION.duration, 9):
         seen, expected = same.at(float(time)), MOTION.at(float(time))
@@ -49,7 +49,7 @@ def test_a_motion_at_full_speed_is_itself() -> None:
 def test_a_slowed_way_is_the_way_within_slowed_limits() -> None:
     start, end = rest(np.zeros(2)), rest(np.array([1.0, -0.4]))
     slow, other = (
-        Slowed(plan_trajectory(start, end, LIMITS), 0.2),
+        ScaledMotion(plan_trajectory(start, end, LIMITS), 0.2),
         plan_trajectory(start, end, slowed_limits(LIMITS, 0.2)),
     )
     assert slow.duration == pytest.approx(other.duration)
@@ -68,11 +68,11 @@ def test_a_change_of_speed_keeps_to_all_limits(seed: int, share: float, one: flo
     motion, time = PathReference(path), share * path.duration
     factors = (one, other) if faster else (other, one)
     change = SpeedChange(motion, time, factors, path_peaks(path), limits)
-    close(change.at(0.0), Slowed(motion, factors[0]).at(time / factors[0]))
+    close(change.at(0.0), ScaledMotion(motion, factors[0]).at(time / factors[0]))
     close(change.at(change.duration + 1.0), change.at(change.duration))
     assert change.motion_time(change.duration) == pytest.approx(path.duration, abs=1e-9)
     if change.duration > change.change:
-        close(change.at(change.duration), Slowed(motion, factors[1]).at(path.duration / factors[1]))
+        close(change.at(change.duration), ScaledMotion(motion, factors[1]).at(path.duration / factors[1]))
     if change.duration > 1e-6:
         keeps_to(limits, change, points=800)
 
@@ -112,7 +112,7 @@ def test_the_limits_are_the_peaks_of_a_way() -> None:
 @pytest.mark.parametrize("factor", [0.0, -0.2, 1.001, np.nan, np.inf])
 def test_no_motion_is_played_backwards_or_faster_than_it_is(factor: float) -> None:
     with pytest.raises(UsageError, match="above 0 and at most 1"):
-        Slowed(MOTION, factor)
+        ScaledMotion(MOTION, factor)
     with pytest.raises(UsageError, match="above 0 and at most 1"):
         slowed_limits(LIMITS, factor)
     for factors in ((factor, 0.5), (0.5, factor)):

@@ -93,11 +93,11 @@ def test_the_position_is_kept_after_the_arm_was_closed_and_compared_when_it_is_o
     assert last is not None
     assert np.abs(last.position - behind.emulator.body.plant.position).max() < 1e-3
     with opened_by(behind, config) as arm:
-        kept.require_not_turned(arm)
+        kept.require_no_lost_turns(arm)
         behind.inject(parse_fault(f"encoder_offset joint=elbow size={2.0 * np.pi / 20.0}", tuple(config.joints)))
         arm.exchange(None)
         with pytest.raises(MotionRefused, match=r"motor 2 stands 1 whole turn .*elbow [+]0[.]314.*Look at the arm"):
-            kept.require_not_turned(arm)
+            kept.require_no_lost_turns(arm)
     kept.forget()
     assert kept.read() is None
 

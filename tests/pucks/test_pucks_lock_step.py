@@ -13,7 +13,7 @@ from drivers.can.can_frame import Frame
 from drivers.can.can_link import open_links
 from drivers.clock import VirtualClock
 from ident_service.errors import DriverError
-from sim_backend.emulator.lock_step import keep_arm
+from sim_backend.emulator.lock_step import hold_emulated_arm
 
 TWO = [{"interface": "lock_step"}, {"interface": "lock_step"}]
 SPREAD = [{"node": 1, "bus": bus, "rated_torque": 1.0, "max_torque": 30.0, "max_speed": 6000.0} for bus in range(2)]
@@ -141,7 +141,7 @@ def test_each_opening_builds_the_arm_anew_unless_it_stands(tmp_path: Path) -> No
     first, second = open_links(config)[0], open_links(config)[0]
     assert Host(first).arm is not Host(second).arm
     clock = VirtualClock(5 * MS)
-    with keep_arm(config, clock=clock) as arm:
+    with hold_emulated_arm(config, clock=clock) as arm:
         link = open_links(config)[0]
         assert Host(link).arm is arm
         assert link.clock is clock
@@ -152,7 +152,7 @@ def test_each_opening_builds_the_arm_anew_unless_it_stands(tmp_path: Path) -> No
         with pytest.raises(DriverError, match="bus 0 is closed"):
             link.send(Frame(0x080))
         assert Host(open_links(config)[0]).arm is arm
-        with pytest.raises(DriverError, match="there already"), keep_arm(config):
+        with pytest.raises(DriverError, match="there already"), hold_emulated_arm(config):
             pass
     assert Host(open_links(config)[0]).arm is not arm
 

@@ -44,7 +44,7 @@ def campaign(rounds: int, seed: int) -> None:
                 processes[0].kill()
                 processes[0].wait()
                 count = watch.memory.words[ring_memory.WRITTEN]
-                count += watch.memory.words[watch.memory.word_of(count)] == 2 * count + 2
+                count += watch.memory.words[watch.memory.slot_word_index(count)] == 2 * count + 2
             for process in processes[1:]:
                 said, _ = process.communicate(timeout=60)
                 if process is not victim:

@@ -25,14 +25,14 @@ class Time:
 def test_what_one_side_asks_the_other_reads(tmp_path: Path) -> None:
     with ControlFile.take(tmp_path / "arm" / "control", None) as loop, ControlFile.reach(loop_path(tmp_path)) as person:
         assert (loop.stop, loop.pause, loop.finish) == (False, False, False)
-        person.ask_pause(True)
+        person.request_pause(True)
         assert loop.pause
-        person.ask_pause(False)
+        person.request_pause(False)
         assert not loop.pause
-        person.ask_finish()
+        person.request_finish()
         assert (loop.stop, loop.pause, loop.finish) == (False, False, True)
-        person.ask_pause(True)
-        person.ask_pause(False)
+        person.request_pause(True)
+        person.request_pause(False)
         assert (loop.pause, loop.finish) == (False, True)
         person.ask_stop()
         assert loop.stop

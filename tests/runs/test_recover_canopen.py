@@ -18,7 +18,7 @@ from ident_service.motion.arm_factory import make_arm
 from ident_service.operations.recovery import recover, release_held_drives
 from ident_service.registry.state_folder import fault_file
 from sim_backend.emulator.faults import DriveFault
-from sim_backend.emulator.lock_step import LockStepArm, keep_arm
+from sim_backend.emulator.lock_step import LockStepArm, hold_emulated_arm
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def config(tmp_path: Path) -> ArmConfig:
 
 @pytest.fixture
 def behind(config: ArmConfig) -> Iterator[LockStepArm]:
-    with keep_arm(config) as arm:
+    with hold_emulated_arm(config) as arm:
         yield arm
 
 
@@ -123,7 +123,7 @@ def test_drives_whose_host_died_are_usable_again(config: ArmConfig, behind: Lock
 
 def test_drives_that_hold_the_arm_let_it_go_when_a_person_says_so(config: ArmConfig, state: Path) -> None:
     config = config.model_copy(update={"control": config.control.model_copy(update={"after_stop": "hold"})})
-    with keep_arm(config) as behind:
+    with hold_emulated_arm(config) as behind:
         with pytest.raises(UsageError, match="its drives do not hold it"):
             release_held_drives(config, state)
         session(config, behind)

@@ -24,7 +24,7 @@ from ident_service.operations.recovery import home_posture, recover, set_home
 from ident_service.preflight.preflight import preflight
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 from sim_backend.emulator.faults import DriveFault
-from sim_backend.emulator.lock_step import LockStepArm, keep_arm
+from sim_backend.emulator.lock_step import LockStepArm, hold_emulated_arm
 
 HOME = np.array([0.3, -0.2])
 GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}
@@ -63,7 +63,7 @@ def config(tmp_path: Path) -> ArmConfig:
 
 @pytest.fixture
 def behind(config: ArmConfig) -> Iterator[LockStepArm]:
-    with keep_arm(config) as arm:
+    with hold_emulated_arm(config) as arm:
         arm.settle(arm.clock.now_ns() + 50_000_000)
         yield arm
 

@@ -51,7 +51,7 @@ class JobProcess(Protocol):
         """End the process's standard input."""
 
 
-class OwnChild:
+class SubprocessJob:
     """Implement `JobProcess` with a subprocess of the daemon."""
 
     def __init__(self, words: tuple[str, ...], folder: Path) -> None:

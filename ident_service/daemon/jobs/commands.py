@@ -58,7 +58,18 @@ from ident_service.registry.runs import (
 )
 
 JOBS = "jobs"
-_LOOKS = (Check, Watch, Recover, Base, Preview, Zero, BusLoad, BusScan, BusProbe, ConfigCheck)  # that make no folder
+_WITHOUT_FOLDER = (
+    Check,
+    Watch,
+    Recover,
+    Base,
+    Preview,
+    Zero,
+    BusLoad,
+    BusScan,
+    BusProbe,
+    ConfigCheck,
+)  # that make no folder
 _OF_A_RUN = (Report, Export, Verify, Compare, Feasible, Correct, Figures, Payload)
 _VERBS: Final = {
     "leave_limit": ("recover",),
@@ -106,7 +117,7 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
     if isinstance(asked, Judge):
         return _judgement(db, state, asked)
     arm = known_arm(db, state, asked.arm)
-    made = None if isinstance(asked, _LOOKS) else new_id(arm.name)
+    made = None if isinstance(asked, _WITHOUT_FOLDER) else new_id(arm.name)
     words = [*_VERBS.get(asked.kind, (asked.kind,)), *_words(db, state, asked, arm)]
     if made is not None:
         words += ["--out", str(state / FOLDERS.get(asked.kind, RUNS) / made)]
@@ -114,7 +125,7 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
     if moves:
         words.append("--lease-from-stdin")
     return Command(
-        (*words, *_always(state)),
+        (*words, *_common_options(state)),
         arm.name,
         moves,
         made,
@@ -152,14 +163,14 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
         chosen = {"method": asked.method, "feasible-set": asked.feasible_set, "prior": asked.prior}
         if asked.as_accepted is not None:
             path = str(accepted_description(state, arm.name, asked.as_accepted))
-        return [*recordings, "--arm", path, *judged, *_given(chosen)]
+        return [*recordings, "--arm", path, *judged, *_given_options(chosen)]
     if isinstance(asked, Simulate):
         motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
-        return [path, *motion, *_given({"seed": asked.seed, "feasible-set": asked.feasible_set})]
+        return [path, *motion, *_given_options({"seed": asked.seed, "feasible-set": asked.feasible_set})]
     if isinstance(asked, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
         return [path]
     if isinstance(asked, BusLoad):
-        return [path, *_given({"rate": asked.rate})]
+        return [path, *_given_options({"rate": asked.rate})]
     if isinstance(asked, Zero):
         return [path, "--zero", "--confirm", arm.name]
     if isinstance(asked, LeaveLimit):
@@ -187,7 +198,7 @@ def _design(db: Database, state: Path, asked: Design) -> list[str]:
     after = [f"--after={path}" for path in _as_described(db, state, asked.after)]
     chosen = {"search-time": asked.seconds, "starts": asked.starts, "seed": asked.seed, "criterion": asked.criterion}
     parameters = [f"--parameter={expression}" for expression in asked.parameters]
-    return [*after, *parameters, *_given({**chosen, "motion": asked.motion})]
+    return [*after, *parameters, *_given_options({**chosen, "motion": asked.motion})]
 
 
 def _about_a_run(
@@ -200,13 +211,13 @@ def _about_a_run(
     place = state / (REPORTS if isinstance(asked, Report) else EXPORTS)
     if isinstance(asked, Verify):
         described = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
-        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS)), *_given({"arm": described})]
+        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS)), *_given_options({"arm": described})]
     elif isinstance(asked, Compare):
         words = ["compare", str(folder), str(run_folder(db, state, asked.other))]
     elif isinstance(asked, Feasible | Correct):
         conditions = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
         words = [asked.kind, str(run_file(db, state, asked.run, PARAMETERS))]
-        words += _given({"feasible-set": asked.feasible_set, "arm": conditions})
+        words += _given_options({"feasible-set": asked.feasible_set, "arm": conditions})
         if isinstance(asked, Correct):
             words += [f"--metric={asked.metric}", "--out", str(place / str(made) / PARAMETERS)]
     elif isinstance(asked, Report):
@@ -220,7 +231,7 @@ def _about_a_run(
     if made is not None or isinstance(asked, Report):
         # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
         (place / str(made) if isinstance(asked, Correct) else place).mkdir(parents=True, exist_ok=True)
-    return Command((*words, *_always(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
+    return Command((*words, *_common_options(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
 
 
 def _judgement(db: Database, state: Path, asked: Judge) -> Command:
@@ -229,7 +240,7 @@ def _judgement(db: Database, state: Path, asked: Judge) -> Command:
         raise UsageError(f"the run {asked.run} is about the arm {run['arm']}, not {asked.arm}")
     accepted = accepted_set(state, asked.arm, asked.against)[1] / PARAMETERS
     words = ["compare", str(accepted), str(run_folder(db, state, asked.run)), "--keep"]
-    return Command((*words, *_always(state)), asked.arm, False, asked.run, (), LEASE_SECONDS)
+    return Command((*words, *_common_options(state)), asked.arm, False, asked.run, (), LEASE_SECONDS)
 
 
 def _recordings(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
@@ -267,10 +278,10 @@ def range_words(one: RecordingReference) -> str:
     return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))
 
 
-def _given(options: Mapping[str, object]) -> list[str]:
+def _given_options(options: Mapping[str, object]) -> list[str]:
     """Return options that have a value, each in one word, so that no value can pass for an option."""
     return [f"--{name}={value}" for name, value in options.items() if value is not None]
 
 
-def _always(state: Path) -> tuple[str, ...]:
+def _common_options(state: Path) -> tuple[str, ...]:
     return ("--json", "--state", str(state))

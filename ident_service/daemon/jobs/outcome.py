@@ -246,7 +246,7 @@ def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool]
             rows.explain(db, row["id"], f"the service died while it ran; its process lives on ({process.split()[0]})")
             continue
         if row["motion"]:
-            _wait_for_rest(control_path(state, row["arm"]))
+            _wait_for_motion_process(control_path(state, row["arm"]))
         folder = folder_of(state, row)
         detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
         try:
@@ -263,7 +263,7 @@ def orphans(db: Database, state: Path) -> list[str]:
     return [row["id"] for row in found if alive(_process(state, row))]
 
 
-def _wait_for_rest(controls: Path) -> None:
+def _wait_for_motion_process(controls: Path) -> None:
     """Wait for the motion process, which may outlive its parent for as long as its stop takes."""
     until = time.monotonic() + _WAIT
     while in_use(controls) and time.monotonic() < until:

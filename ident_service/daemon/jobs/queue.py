@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, OwnChild, UnitChild
+from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, SubprocessJob, UnitChild
 from ident_service.daemon.jobs.commands import JOBS, Command, command
 from ident_service.daemon.jobs.outcome import (
     explain_interrupted,
@@ -40,7 +40,7 @@ from ident_service.daemon.jobs.outcome import (
 from ident_service.daemon.jobs.requests import Asked
 from ident_service.daemon.metrics import Metrics
 from ident_service.errors import IdentError, MotionRefused, UsageError
-from ident_service.motion.command_channel import stop_asked_ns
+from ident_service.motion.command_channel import stop_requested_ns
 from ident_service.operations.moving_arms import confirm_support, finish_arm, moving_arms, pause_arm, stop_arms
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import AuditQueue, Database, Row, note
@@ -238,7 +238,7 @@ class LiveJobs:
         with self._lock:
             live.child = child
             if live.asked_to_end:
-                _say_stop(live)
+                _send_stop(live)
 
     def conclude(self, live: LiveJob, child: JobProcess) -> None:
         """Close the input of a process that has ended."""
@@ -305,7 +305,7 @@ class LiveJobs:
         """Ask a job to end; the first reason counts."""
         if not live.asked_to_end:
             live.asked_to_end, live.since = why, self._now()
-        _say_stop(live)
+        _send_stop(live)
         self.changed.set()
 
     def _keep_leases(self) -> None:
@@ -327,7 +327,7 @@ class LiveJobs:
             self._end(live, f"its lease was not renewed {waited if live.child is None else moved}")
 
 
-def _say_stop(live: LiveJob) -> None:
+def _send_stop(live: LiveJob) -> None:
     """Send the stop to a motion's process, if it runs; a computation is ended by the queue."""
     if live.child is not None and live.order.moves:
         live.child.say(STOP)
@@ -546,7 +546,7 @@ class Engine:
 
     def _stopped_at_terminal(self, live: LiveJob) -> bool:
         """Return whether a stop was asked for after this motion was, possibly not through this service."""
-        stamp = stop_asked_ns(control_path(self.state, str(live.order.arm)))
+        stamp = stop_requested_ns(control_path(self.state, str(live.order.arm)))
         # A stamp in the future is from before the machine was started.
         return live.asked_ns < stamp <= time.monotonic_ns()
 
@@ -571,7 +571,7 @@ class Engine:
             if live.order.resources and self._door is not None:
                 child = UnitChild(live.order.words, folder, self._door)
             else:
-                child = OwnChild(live.order.words, folder)
+                child = SubprocessJob(live.order.words, folder)
         except (IdentError, OSError) as error:
             self._finish(live, "failed", f"its process could not be started: {error}", None)
             return

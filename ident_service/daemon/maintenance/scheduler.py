@@ -91,7 +91,7 @@ class MaintenanceScheduler:
         """Decide once whether a due re-identification begins unattended; it is marked before anything moves."""
         self._db.write("UPDATE dues SET tried = 1 WHERE id = ?", row["id"])
         try:
-            why = self._against(row, now)
+            why = self._reason_against_unattended(row, now)
             if not why:
                 found = next(one for one in schedules(self._db, row["arm"]) if one["id"] == row["schedule"])
                 self.reidentifications.begin(
@@ -102,7 +102,7 @@ class MaintenanceScheduler:
         if why:
             note(self._db, SERVICE, "due asks for a person", row["arm"], due=row["id"], why=why)
 
-    def _against(self, row: Row, now: float) -> str:
+    def _reason_against_unattended(self, row: Row, now: float) -> str:
         """Return why a due re-identification must not begin without a person; empty if nothing prevents it."""
         arm = row["arm"]
         found = [one for one in schedules(self._db, arm) if one["id"] == row["schedule"]]

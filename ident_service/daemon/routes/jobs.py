@@ -120,13 +120,13 @@ def create_job(
             rows.enter_key(service.db, who.name, idempotency_key, asked, job["id"])
 
         try:
-            return answer_of(service, service.engine.create(body.job, who.name, entering=enter))
+            return job_answer_document(service, service.engine.create(body.job, who.name, entering=enter))
         except sqlite3.IntegrityError:  # the same request came twice at once, and the other one was entered first
             row = rows.job_of_key(service.db, who.name, idempotency_key, asked)
             if row is None:
                 raise
     response.headers["Idempotent-Replayed"] = "true"
-    return answer_of(service, row)
+    return job_answer_document(service, row)
 
 
 def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
@@ -138,7 +138,7 @@ def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
     """
     if body.job.kind in MOVES:
         require_confirmed(service, getattr(body.job, "arm", ""), body.confirm, who.name)
-    return answer_of(service, service.engine.create(body.job, who.name))
+    return job_answer_document(service, service.engine.create(body.job, who.name))
 
 
 @router.get("/jobs", responses=PAGES)
@@ -154,13 +154,13 @@ def list_jobs(
     """List jobs, the newest first."""
     states = tuple(state or rows.STATES)
     found = page(most, lambda n: rows.jobs(service.db, states=states, arm=arm, before=before, most=n), "number")
-    return [answer_of(service, row) for row in found]
+    return [job_answer_document(service, row) for row in found]
 
 
 @router.get("/jobs/{job}")
 def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
     """Show a job: its state, its progress, and why it ended."""
-    return answer_of(service, rows.known_job(service.db, job))
+    return job_answer_document(service, rows.known_job(service.db, job))
 
 
 @router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
@@ -189,7 +189,7 @@ async def watch_job(service: Serving, _: Viewer, told: WhileAuthorized, job: Id)
 def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
     """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
     service.engine.cancel(job, who.name)
-    return answer_of(service, rows.known_job(service.db, job))
+    return job_answer_document(service, rows.known_job(service.db, job))
 
 
 @router.post("/jobs/{job}/lease")
@@ -221,7 +221,7 @@ async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
     return StopAnswer(**done)
 
 
-def answer_of(service: Service, row: Row) -> JobAnswer:
+def job_answer_document(service: Service, row: Row) -> JobAnswer:
     """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
     found = service.engine.progress(row)
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
@@ -260,7 +260,7 @@ async def _events(service: Service, job: str) -> AsyncIterator[str]:
     last, silent = "", 0.0
     while True:
         row = await run_in_threadpool(rows.known_job, service.db, job)
-        shown = (await run_in_threadpool(answer_of, service, row)).model_dump_json()
+        shown = (await run_in_threadpool(job_answer_document, service, row)).model_dump_json()
         if shown != last:
             last, silent = shown, 0.0
             yield f"event: job\ndata: {json.dumps(json.loads(shown))}\n\n"

@@ -136,7 +136,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
     checked, ticket = _ticket(ticket_path(state, arm), config)
     rehearsed = _newest(jobs, "rehearse")
     comparable, words = _comparable(state, config) if accepted else (False, "accept parameters first")
-    asks = _asks(db, arm)
+    asks = _due_reasons(db, arm)
     if comparable:
         words = "; ".join(asks) or _last(again)
     done: dict[str, tuple[bool, str]] = {
@@ -184,7 +184,7 @@ def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
     return True, ""
 
 
-def _asks(db: Database, arm: str) -> list[str]:
+def _due_reasons(db: Database, arm: str) -> list[str]:
     """Return the reasons for a re-identification, in words."""
     due = [f"due: {row['cause']}" for row in pending(db, arm)]
     return [*due, *(["open drift alarm"] if alarms(db, arm, most=1) else [])]
@@ -277,7 +277,14 @@ def list_arms(service: Serving, who: Viewer) -> Response:
     for line in lines:
         line["alarms"] = sum(one["arm"] == line["name"] for one in standing)
         line["dues"] = sum(one["arm"] == line["name"] for one in due)
-    return page("arms", who, arms=lines, alarms=standing, dues=due, jobs=[jobs.answer_of(service, row) for row in busy])
+    return page(
+        "arms",
+        who,
+        arms=lines,
+        alarms=standing,
+        dues=due,
+        jobs=[jobs.job_answer_document(service, row) for row in busy],
+    )
 
 
 @router.get("/new")
@@ -320,7 +327,7 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
         runs=known_runs.runs(service.db, answer.name, most=20),
         identified=[row["run"] for row in sets],
         acts=list(reversed(arms.list_acceptances(service, who, arm))),
-        jobs=[jobs.answer_of(service, row) for row in rows.jobs(service.db, arm=answer.name, most=10)],
+        jobs=[jobs.job_answer_document(service, row) for row in rows.jobs(service.db, arm=answer.name, most=10)],
     )
 
 

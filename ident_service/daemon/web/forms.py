@@ -56,7 +56,7 @@ class PageRoute(APIRoute):
                 return await handler(request)
             except HTTPException as error:
                 if error.status_code == HTTPStatus.UNAUTHORIZED:
-                    return RedirectResponse(_way_in(request), 303)
+                    return RedirectResponse(_login_url(request), 303)
                 return failure(request, error.status_code, str(error.detail))
             except (RequestValidationError, ValidationError) as error:
                 return failure(request, 422, words_of(error))
@@ -94,7 +94,7 @@ def inside(address: str) -> str:
     return address if good else "/"
 
 
-def _way_in(request: Request) -> str:
+def _login_url(request: Request) -> str:
     where = request.url.path if request.method == "GET" else "/"
     query = f"?{request.url.query}" if request.method == "GET" and request.url.query else ""
     return f"/login?next={quote(where + query, safe='')}"

@@ -26,7 +26,7 @@ router = APIRouter(include_in_schema=False, route_class=PageRoute)
 def list_jobs(service: Serving, who: Viewer, before: Annotated[int, Query(ge=0, lt=2**62)] | None = None) -> Response:
     """List jobs, the newest first."""
     found = rows.jobs(service.db, before=before, most=50)
-    return page("jobs", who, jobs=[jobs.answer_of(service, row) for row in found], more=len(found) == 50)
+    return page("jobs", who, jobs=[jobs.job_answer_document(service, row) for row in found], more=len(found) == 50)
 
 
 @router.get("/jobs/{job}")
@@ -39,7 +39,7 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
     return page(
         "job",
         who,
-        job=jobs.answer_of(service, row),
+        job=jobs.job_answer_document(service, row),
         live=live,
         lease="keep" if attends else "",
         recorded=row["kind"] in RECORDED,

@@ -100,7 +100,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(when=_when, lasting=_lasting, short=_short)
+    environment.filters.update(when=_when, lasting=_duration_text, short=_short)
     return environment
 
 
@@ -111,7 +111,7 @@ def _when(seconds: float | None) -> str:
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
-def _lasting(seconds: float | None) -> str:
+def _duration_text(seconds: float | None) -> str:
     """Format a duration [s]."""
     if seconds is None:
         return "\u2014"

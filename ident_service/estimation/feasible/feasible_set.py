@@ -41,7 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import ArmConfig, Body, Box, Ellipsoid, FeasibleSetName, JointTerm
-from ident_service.config.payload import knowledge_with_payload
+from ident_service.config.payload import constraints_with_payload
 from ident_service.config.quantities import Vector3
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.conic import triangle_entries
@@ -180,7 +180,7 @@ def configured_blocks(config: ArmConfig, links: Sequence[int], index: Index) -> 
     Raises:
         ParameterError: a hull whose points lie in one plane.
     """
-    config = knowledge_with_payload(config)
+    config = constraints_with_payload(config)
     blocks = _masses(config, links, index)
     for link, body in _bodies(config, links):
         if body.center_of_mass is not None:
@@ -195,7 +195,7 @@ def configured_blocks(config: ArmConfig, links: Sequence[int], index: Index) -> 
 def symmetries(config: ArmConfig, links: Sequence[int], index: Index) -> list[Block]:
     """Return the odd moments that symmetry planes make zero, one block per plane; none stands twice."""
     blocks = []
-    for link, body in _bodies(knowledge_with_payload(config), links):
+    for link, body in _bodies(constraints_with_payload(config), links):
         gone: set[str] = set()
         for plane in dict.fromkeys(body.symmetry):
             names = [f"{symbol}{link}" for symbol in _ODD[plane] if symbol not in gone]

@@ -62,7 +62,7 @@ def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figu
     ours, theirs = (_friction(side) for side in (reference, pair.side))
     figures = []
     for joint in sorted(set(ours) & set(theirs)):
-        fastest = _fastest(pair, joint)
+        fastest = _largest_velocity(pair, joint)
         half = fastest * np.linspace(0.0, 1.0, _SAMPLES // 2 + 1)[1:] ** 2
         at = np.concatenate([-half[::-1], half])
         curves = [_curve(side, own[joint], at, joint) for side, own in ((reference, ours), (pair.side, theirs))]
@@ -169,7 +169,7 @@ def _curve(side: ComparedSet, terms: Mapping[JointTerm, float], at: Array, joint
     return curve
 
 
-def _fastest(pair: Pair, joint: int) -> float:
+def _largest_velocity(pair: Pair, joint: int) -> float:
     """Return the largest velocity of the friction curves, from the compared motion; 1 where none is known."""
     if pair.compared is not None:
         first, second = pair.compared
@@ -191,13 +191,13 @@ LEFT_OUT = (
 
 def comparison_text(comparison: Comparison) -> str:
     """Describe a comparison in several lines of plain text, ending with a line break."""
-    lines = [f"reference: {_called(comparison.reference)}"]
+    lines = [f"reference: {_side_title(comparison.reference)}"]
     for pair in comparison.pairs:
-        lines += [f"compared:  {_called(pair.side)}", "", *_pair(comparison, pair)]
+        lines += [f"compared:  {_side_title(pair.side)}", "", *_pair(comparison, pair)]
     return "\n".join(lines) + "\n"
 
 
-def _called(side: ComparedSet) -> str:
+def _side_title(side: ComparedSet) -> str:
     arm = side.content.get("arm", {}).get("name", "no arm named")
     return f"{side.path} ({arm}, {side.content.get('method', 'method not said')})"
 

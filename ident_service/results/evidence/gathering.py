@@ -80,7 +80,7 @@ def posed(model: ArmModel, delta: Array | None, positions: Array) -> PosedArm | 
     """
     if delta is None:
         return None
-    posture = positions[[_most_telling(frame_origins(model.chain, positions))]]
+    posture = positions[[_most_spread_posture(frame_origins(model.chain, positions))]]
     turns, places = link_poses(model.chain, posture)
     bodies = []
     for link in range(model.layout.joints):
@@ -90,7 +90,7 @@ def posed(model: ArmModel, delta: Array | None, positions: Array) -> PosedArm | 
     return PosedArm(frame_origins(model.chain, posture)[0], branches(model.chain), tuple(bodies))
 
 
-def _most_telling(points: Array) -> int:
+def _most_spread_posture(points: Array) -> int:
     """Return the posture whose frames lie farthest from each other, as seen from the side and from above."""
     seen = np.zeros(len(points))
     for view in ((0, 2), (0, 1)):

@@ -30,7 +30,7 @@ def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
 
 
 def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
-    farthest, found = longest_reach(model), []
+    farthest, found = arm_reach(model), []
     for name, parameters in zip(model.chain.names, joint_bodies(model, delta), strict=True):
         mass, center, _ = about_center(parameters)
         distance = float(np.linalg.norm(center))
@@ -44,7 +44,7 @@ def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
     return tuple(found)
 
 
-def longest_reach(model: ArmModel) -> float:
+def arm_reach(model: ArmModel) -> float:
     """Return the longest way from the first joint, wherever mounted, along the frames and the last link [m]."""
     chain = model.chain
     ways = np.zeros(chain.joints)

@@ -20,7 +20,7 @@ from ident_service import __version__
 from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import Array
-from ident_service.model.friction_state import advance_dahl_state, presliding_ways
+from ident_service.model.friction_state import advance_dahl_state, presliding_distances
 from ident_service.model.newton_euler import drive_torque, friction_torque, mass_matrix, rigid_torque
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.symbolic import ExpressionGraph, Symbol, Value, needed_steps
@@ -202,7 +202,7 @@ def _preface(arm: IdentifiedArm, name: str) -> str:
 """
 
 
-def turning_said(arm: IdentifiedArm) -> tuple[str, ...]:
+def presliding_notes(arm: IdentifiedArm) -> tuple[str, ...]:
     """Return notes on friction with pre-sliding, for the header's reader; none where there is none."""
     name = c_prefix(arm)
     return tuple(
@@ -213,7 +213,7 @@ def turning_said(arm: IdentifiedArm) -> tuple[str, ...]:
 
 
 def _turning_comment(arm: IdentifiedArm, name: str) -> str:
-    said = turning_said(arm)
+    said = presliding_notes(arm)
     if not said:
         return ""
     lines = textwrap.wrap(plain(said[0]) + ".", 115)
@@ -261,7 +261,7 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
         M = mass_matrix(tape, chain, layout, p, s["q"])
         return [M[i][j] for i in range(n) for j in range(n)]
 
-    ways = presliding_ways(arm.model)
+    ways = presliding_distances(arm.model)
 
     def turn(tape: ExpressionGraph, p: dict[int, Value], s: dict[str, list[Symbol]]) -> list[Value]:
         return [
@@ -278,7 +278,7 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
         ("gravity", ("q",), "tau", gravity),
         ("mass_matrix", ("q",), "M", mass),
     ]
-    if turning_said(arm):
+    if presliding_notes(arm):
         found += [("turned", ("step", "before"), "direction", turn)]
         found += [("turning_friction", ("dq", "direction"), "tau", turning)]
     return found
@@ -379,7 +379,7 @@ def _check(arm: IdentifiedArm, text: str) -> None:
         # Where offsets are grouped with masses, only the sum is the same.
         ("gravity", run("gravity") + run("friction", {"dq": still.T}), torque(model, delta, (q, still, still))),
         ("mass matrix", run("mass_matrix"), M.reshape(len(q), n * n)),
-        *_turning_pairs(arm, delta, run),
+        *_friction_check_pairs(arm, delta, run),
     )
     for what, found, meant in pairs:
         if np.abs(meant).max() == 0.0 == np.abs(found).max():
@@ -390,13 +390,13 @@ def _check(arm: IdentifiedArm, text: str) -> None:
             )
 
 
-def _turning_pairs(
+def _friction_check_pairs(
     arm: IdentifiedArm, delta: Array, run: Callable[[str, dict[str, Array]], Array]
 ) -> list[tuple[str, Array, Array]]:
     """Return friction with a state, as read back and as meant, after small steps and after none."""
-    if not turning_said(arm):
+    if not presliding_notes(arm):
         return []
-    model, ways = arm.model, presliding_ways(arm.model)
+    model, ways = arm.model, presliding_distances(arm.model)
     still, dq, before = random_states(model.chain.joints)
     step = np.where(np.arange(len(dq))[:, None] % 3 == 0, 0.0, 1e-3 * dq)
     before = np.tanh(before)

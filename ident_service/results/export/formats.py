@@ -21,12 +21,12 @@ from ident_service import __version__
 from ident_service.config.arm import Joint
 from ident_service.errors import ModelError, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.friction_state import presliding_ways
+from ident_service.model.friction_state import presliding_distances
 from ident_service.model.parameter_layout import INERTIAL, Layout, about_center
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.export.bodies import about_origin, joint_bodies
 from ident_service.results.export.bodies_said import body_notes
-from ident_service.results.export.c_header import c_header, c_prefix, turning_said
+from ident_service.results.export.c_header import c_header, c_prefix, presliding_notes
 from ident_service.results.export.identified_arm import IdentifiedArm, read_identified
 from ident_service.results.export.mjcf import mjcf_export
 from ident_service.results.export.round_trip import AGREEMENT, disagreement, random_states, torque
@@ -75,7 +75,7 @@ def _friction_shape(arm: IdentifiedArm) -> list[tuple[str, str, float]]:
     """Return the nonlinear friction numbers, joint by joint: name, unit, value; none that the arm has not."""
     model, layout = arm.model, arm.model.layout
     units = ["rad" if turns else "m" for turns in model.chain.revolute]
-    ways = presliding_ways(model).tolist()
+    ways = presliding_distances(model).tolist()
     found = [(f"presliding{k}", unit, way) for k, (unit, way) in enumerate(zip(units, ways, strict=True), 1)]
     found = found if any(ways) else []
     if "stribeck" in layout.terms:
@@ -139,7 +139,7 @@ def _document(arm: IdentifiedArm) -> dict[str, Any]:
         "gravity": chain.gravity.tolist(),
         "joints": joints,
         "friction": {
-            "presliding": presliding_ways(model).tolist(),
+            "presliding": presliding_distances(model).tolist(),
             "stribeck_velocity": list(layout.stribeck_velocity),
         },
         "drives": None if arm.delta is None else {"coupling": chain.coupling.tolist(), **drives},
@@ -164,7 +164,7 @@ def _check(arm: IdentifiedArm, text: str, name: str) -> None:
     content = json.loads(text)
     if content["base_parameters"]["values"] != arm.beta.tolist():
         raise ModelError(f"{name}: the base parameters read back differ; it was not written")
-    if content["friction"]["presliding"] != presliding_ways(arm.model).tolist():
+    if content["friction"]["presliding"] != presliding_distances(arm.model).tolist():
         raise ModelError(f"{name}: the pre-sliding distances read back differ; it was not written")
     if arm.delta is None:
         return
@@ -253,7 +253,7 @@ def _csv(arm: IdentifiedArm) -> Export:
 
 
 def _c(arm: IdentifiedArm) -> Export:
-    notes = (*turning_said(arm), *filter(None, (arm.sigma_said,)))
+    notes = (*presliding_notes(arm), *filter(None, (arm.sigma_said,)))
     return Export("c", f"{c_prefix(arm)}_dynamics.h", c_header(arm), notes=notes)
 
 

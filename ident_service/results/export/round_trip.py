@@ -11,7 +11,7 @@ from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.friction_state import presliding_ways
+from ident_service.model.friction_state import presliding_distances
 from ident_service.model.parameter_layout import JOINT_TERMS, TERM_SYMBOLS, Layout, WrittenArm, joint_drives
 from ident_service.model.regressor import joint_regressor
 
@@ -128,7 +128,7 @@ def unsupported_terms(model: ArmModel, delta: Array, has: Carried) -> tuple[str,
 
 def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
     """Return the drives' pre-sliding, in words, which a format without friction state does not carry."""
-    layout, ways = model.layout, presliding_ways(model)
+    layout, ways = model.layout, presliding_distances(model)
     dry = [layout.term_values(term, delta) for term in ("coulomb", "stribeck") if term in layout.terms]
     said = [
         f"{name} {way:.3g} {'rad' if turns else 'm'}"
