@@ -48,6 +48,8 @@ LISTEN = 0.12  # s before we send anything; another host's heartbeat comes withi
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
+# A bus that is 90 % full has room for one frame in a cycle at 1 kHz: questions in each would leave none for the answers.
+_ASK_EVERY_NS = 5_000_000
 _SILENT = 2  # cycles without a position, after which a drive may have left `operational`
 _MISSED = 0.25  # of a period late, and the slot is left to the next
 _DOUBT = 0.25  # of a period: sending a SYNC takes less, unless this computer stalls
@@ -107,7 +109,7 @@ class Buses:
         self._heartbeat_ns = 0
         self.withheld: set[str] = set()
         self.enabled = False
-        self._asked = 0
+        self._asked = self._ask_again_ns = 0
         # When each guarded drive is asked next, one after the other: remote frames in a row would delay a cycle.
         self._guards: dict[int, GuardedNode] = {}
         for number, (codec, _) in self._at.items():
@@ -164,8 +166,9 @@ class Buses:
             if (shown := self.mode_shown(number)) != mode.wanted:
                 told = "tells no mode" if shown is None else f"is in mode {shown}"
                 found[number] = f"{told} ({mode.display.index:04X}h) although {mode.wanted} was set"
-        if found:
-            self._asked += 1
+        now_ns = self.clock.now_ns()
+        if found and now_ns >= self._ask_again_ns:
+            self._asked, self._ask_again_ns = self._asked + 1, now_ns + _ASK_EVERY_NS
             number = list(found)[self._asked % len(found)]
             self.ask(number, self.modes[number].display)
         return found
