@@ -48,7 +48,7 @@ LISTEN = 0.12  # s before we send anything; another host's heartbeat comes withi
 AWAKE = 2.0  # s within which every drive must answer
 LEAST = 0.5  # of a period, from SYNC on, that positions are waited for in any case
 SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
-# A bus that is 90 % full has room for one frame in a cycle at 1 kHz: questions in each would leave none for the answers.
+# A bus that is 90 % full has room for one frame in a cycle at 1 kHz: a question in each would leave none for answers.
 _ASK_EVERY_NS = 5_000_000
 _SILENT = 2  # cycles without a position, after which a drive may have left `operational`
 _MISSED = 0.25  # of a period late, and the slot is left to the next
