@@ -12,6 +12,7 @@
     ├── ConfigError (ValueError)       an arm description with mistakes, all of them, each with file:line:column
     ├── ModelError (ValueError)        a mechanism or array shape that the model cannot represent
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
+    │   └── RecordingNotWritten        a recording cannot be written, as on a full disk
     ├── ParameterError (ValueError)    a parameter file or expression that does not parse or does not fit
     ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
@@ -124,6 +125,10 @@ class RecordingError(IdentError, ValueError):
     def __init__(self, path: Path | str, message: str) -> None:
         self.path = Path(path)
         super().__init__(f"{path}: {message}")
+
+
+class RecordingNotWritten(RecordingError):
+    """A recording cannot be written, as on a full disk."""
 
 
 class ParameterError(IdentError, ValueError):

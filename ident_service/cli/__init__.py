@@ -50,6 +50,7 @@ from ident_service.errors import (
     ParameterError,
     PersonNeeded,
     RecordingError,
+    RecordingNotWritten,
     UsageError,
 )
 
@@ -63,6 +64,7 @@ GROUPS = (
 # when it was understood and came to nothing.
 _BAD_INPUT: tuple[type[IdentError], ...] = (UsageError, ConfigError, ModelError, RecordingError, ParameterError)
 _EXIT_CODES: tuple[tuple[type[IdentError] | tuple[type[IdentError], ...], int], ...] = (
+    (RecordingNotWritten, FAILED),
     (_BAD_INPUT, USAGE),
     (PersonNeeded, PERSON_NEEDED),
     (MotionRefused, VERDICT_NO),

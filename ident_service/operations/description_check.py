@@ -146,7 +146,7 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
 def _after_stop_text(checked: CheckedDescription) -> str:
     """Format what follows a stop; empty for an arm without a model."""
     follows, assumed = checked.after_stop, checked.assumed_brakes
-    held = f"its brakes hold {', '.join(checked.falling)}" if checked.falling else "gravity moves no joint"
+    held = f"they hold {', '.join(checked.falling)}" if checked.falling else "gravity moves no joint"
     if assumed:
         held += (
             f"\n  ASSUMED: brakes of {', '.join(assumed)}, because the drives are simulated; for real ones, each joint"

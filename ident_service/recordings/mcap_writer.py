@@ -27,7 +27,7 @@ from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike, NDArray
 
 from ident_service import __version__
-from ident_service.errors import RecordingError, UsageError
+from ident_service.errors import RecordingError, RecordingNotWritten, UsageError
 from ident_service.recordings.cycle import Cycle
 
 _SEPARATOR: Final = "=" * 80
@@ -405,7 +405,7 @@ class RecordingWriter:
         """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle` and, where drives measure, `/joint_torques`.
 
         Raises:
-            RecordingError: the file cannot be written.
+            RecordingNotWritten: the file cannot be written.
             ValueError: an array of another shape.
         """
         utc_ns = cycle.stamp_ns + self._utc_offset_ns
@@ -479,4 +479,4 @@ class RecordingWriter:
                 with suppress(OSError):
                     self._file.close()
                 self._file = None
-            raise RecordingError(self.partial, f"cannot be written: {error.strerror or error}") from error
+            raise RecordingNotWritten(self.partial, f"cannot be written: {error.strerror or error}") from error

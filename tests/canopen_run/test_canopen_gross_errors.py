@@ -54,7 +54,7 @@ def test_counts_of_a_motor_times_two_are_a_scale_and_no_sign(motor: int) -> None
 def test_twice_the_torque_of_motor_1_is_refused() -> None:
     check = checked(wam(), wam(m1={"torque_scale": 2.0}))["direction"]
     assert check.verdict is Verdict.FAILED
-    assert check.reason.startswith("j1: answer to torque")
+    assert check.reason.startswith("j1: response to torque")
 
 
 def test_a_gear_ratio_twice_too_large_is_told_and_leads_to_the_scale() -> None:
@@ -74,8 +74,8 @@ def test_a_hidden_delay_of_a_cycle_is_refused() -> None:
 # Real torque over believed, by motor, with the CAD model of the links (`cad`) or what an identification knows,
 # and what preflight makes of it. Decision 0058 says why physics hide the rest.
 TORQUES: dict[tuple[str, int, float], str] = {
-    ("cad", 1, 2.0): "j1: answer to torque",
-    ("cad", 1, 3.0): "j1: answer to torque",
+    ("cad", 1, 2.0): "j1: response to torque",
+    ("cad", 1, 3.0): "j1: response to torque",
     ("cad", 4, 3.0): "j4: answer to torque",
     ("identified", 4, 2.0): "j4: answer to torque",
     ("identified", 5, 3.0): "j6 went astray",

@@ -99,7 +99,7 @@ def test_an_answer_that_cannot_be_written_is_no_success_and_no_traceback() -> No
             check=False,
         )
     assert ended.returncode == 1
-    assert ended.stderr == "ident: done, but the answer cannot be written: No space left on device\n"
+    assert ended.stderr == "ident: done, but the output cannot be written: No space left on device\n"
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

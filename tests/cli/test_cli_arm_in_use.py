@@ -38,7 +38,7 @@ def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ide
     # Nobody moves it any more: what was wanted is so, as for `ident stop` of all.
     again = ident("stop", "uploaded", "--json")
     assert (again.code, again.json["pid"]) == (0, None)
-    assert "nobody moves uploaded" in ident("stop", "uploaded").out
+    assert "uploaded is not moving" in ident("stop", "uploaded").out
     fault_file(state, "uploaded").latch("lease_lost", "nobody was there")
     assert ident("ack", "uploaded", "lease_lost").code == 0
     assert ident("stop", "../uploaded").code == 2

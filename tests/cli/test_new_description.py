@@ -198,7 +198,7 @@ def test_all_that_no_urdf_says_is_told_and_written(tmp_path: Path, capsys: pytes
     assert "Of a real arm say in\n# the braces of each joint `brake: true` or `brake: false`" in text
     assert main(["config", "check", str(tmp_path / "bars.yaml")]) == 0
     told = capsys.readouterr().out
-    assert "after a stop: held for two seconds, then switched off; its brakes hold shoulder, elbow\n" in told
+    assert "after a stop: held for two seconds, then released to its brakes; they hold shoulder, elbow\n" in told
     assert "  ASSUMED: brakes of shoulder, elbow, because the drives are simulated; for real ones" in told
 
 

@@ -235,7 +235,9 @@ def test_friction_of_another_shape_is_not_compared(commissioned: Path, ident: Id
     other = changed_file(again, "other_shape.json", **shape)
     code, out, _ = ident("compare", accepted, other)
     assert code == 3
-    assert "NO VERDICT: friction of joint elbow was fitted with another shape and is not compared; all else" in out
+    assert (
+        "NO VERDICT: friction of joint elbow was fitted with another shape and is not compared; everything else" in out
+    )
     assert "note: friction of joint elbow has another shape" in out
     # What the message tells to do can be done: the folder's arm is a description with that shape.
     assert f"--arm {accepted}/arm.json" in out

@@ -109,7 +109,7 @@ def test_tested_and_used_values_are_both_shown(commissioned: Path, tmp_path: Pat
     assert document["reference"] == document["compared"]
     assert document["used"]["compared"][place] == 3.0 * document["used"]["reference"][place]
     out = ident("compare", accepted, path)[1]
-    assert "tested: unconstrained values, to which the covariances belong; the values in use, held in" in out
+    assert "tested: unconstrained values, to which the covariances belong; the values in use, constrained" in out
     (row,) = [line.split() for line in out.splitlines() if line.startswith("fc2 ")]
     assert row[-2:] == [f"{document['used'][side][place]:.4g}" for side in ("reference", "compared")]
     page = comparison_html(compare([read_side(accepted), read_side(path)]))
@@ -138,7 +138,7 @@ def test_a_small_table_against_a_run_is_short(commissioned: Path, tmp_path: Path
     at = out.splitlines().index("left out, only in the reference:")
     rows = out.splitlines()[at + 1 : at + 10]
     assert rows[-1] == "  and 3 more (all of them in the JSON)"
-    assert "said of one alone: arm, arm sha256, method" in out
+    assert "given for one alone: arm, arm sha256, method" in out
     assert "note: constrained values" not in out
 
 

@@ -156,7 +156,7 @@ def test_an_exception_stops_the_arm(client: IdentClient, state: Path) -> None:
 
 @pytest.mark.timeout(300)
 def test_a_stop_elsewhere_ends_the_block(client: IdentClient) -> None:
-    with pytest.raises(Stopped, match=r"a stop was requested \(job \S+-run-"):  # noqa: PT012, SIM117 - at the block's end
+    with pytest.raises(Stopped, match=r"owner asked for a stop \(job \S+-run-"):  # noqa: PT012, SIM117 - at the block's end
         with client.arm("patient").run(confirm="patient") as job:
             live = job.live()
             next(live)

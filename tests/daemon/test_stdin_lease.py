@@ -86,7 +86,7 @@ def test_the_end_of_the_input_is_a_stop(pipe: tuple[int, int]) -> None:
     assert not lease.over()
     os.close(pipe[1])
     assert lease.over()
-    assert "gone" in lease.reason
+    assert "has ended" in lease.reason
 
 
 def test_a_flood_does_not_keep_us(pipe: tuple[int, int]) -> None:

@@ -378,7 +378,7 @@ def test_parameters_are_identified_from_ones_own_data(
         assert client.get(f"/api/v1/jobs/{ended.id}")["run"] is None
         assert main(["run", "quick", "--confirm", "quick", *there[:4]]) == 3
         told = capsys.readouterr()
-        assert "not checked yet" in told.out
+        assert "no preflight ticket" in told.out
         assert "\nrun " not in told.out
         assert client.get(f"/api/v1/jobs/{answer['job']['id']}")["run"] == answer["job"]["run"]
         # What takes no columns file says so.

@@ -216,7 +216,7 @@ def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: 
     monkeypatch.setattr("ident_service.estimation.robust_regression._MOST_ROUNDS", 2)
     estimate = identify(model, [with_noise(0.02)], method="huber")
     assert np.isfinite(estimate.beta).all()
-    assert "Huber's weights did not settle: of all rounds the one is used" in estimate.remarks[0]
+    assert "Huber's weights did not converge: the round is used" in estimate.remarks[0]
     monkeypatch.undo()
     assert identify(model, [with_noise(0.02)], method="huber").remarks == ()
 
@@ -229,7 +229,7 @@ def test_instruments_that_do_not_settle_give_the_best_round_and_say_so(monkeypat
     monkeypatch.setattr("ident_service.estimation.instrumental_variables.SETTLED", 0.0)
     estimate = identify(model, [with_noise(0.0)], method="iv")
     (remark,) = estimate.remarks
-    assert remark.startswith("the instrumental estimate did not settle: of all rounds the one is used that changed a")
+    assert remark.startswith("the instrumental estimate did not converge: the round is used that changed")
     assert estimate.method == "iv"
     assert np.all(np.abs(estimate.beta - settled.beta) < 0.1 * settled.standard_deviations)
     assert np.isfinite(estimate.standard_deviations).all()

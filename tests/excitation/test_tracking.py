@@ -150,7 +150,7 @@ def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
     more = from_there(replace(task, limits=replace(task.limits, velocity=velocity)))
     assert best.value - more.value == pytest.approx(expected * np.log(1.1), rel=0.3)
     words = active_limit_lines(found, task, motion_limits(model.config), task.limits.velocity, ("rad", "rad"))
-    assert any("elbow is held by its velocity; 1.2 would give about" in line for line in words)
+    assert any("elbow is limited by its velocity; 1.2 would give about" in line for line in words)
 
 
 @pytest.fixture(scope="module")
@@ -186,10 +186,12 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
 
         gains = stiffer_gains(found, np.zeros(2, dtype=bool), needed, limits, stable)
         lines = active_limit_lines(found, task, limits, 0.3 * limits.velocity, ("rad", "rad"), gains)
-        (about,) = [line for line in lines if "elbow is held to" in line]
+        (about,) = [line for line in lines if "elbow is limited to" in line]
         return about
 
-    assert words(1.01 * most).startswith("elbow is held to 30% of its velocity by following_error; 0.1 rad would give")
+    assert words(1.01 * most).startswith(
+        "elbow is limited to 30% of its velocity by following_error; 0.1 rad would give"
+    )
     assert words(1.01 * most).endswith(
         f"; with kp {most:.0f} and kd {12.0 * np.sqrt(most / 40.0):.3g} it would follow at its velocity limit"
     )

@@ -195,7 +195,7 @@ def test_bad_recordings_are_named_and_the_others_go_on(fleet: Run, folder: Path,
     (place / "arm1").mkdir()
     (place / "arm1" / "only.mcap").write_bytes(good[: len(good) // 2])
     code, answer = fleet(str(place), out="none")
-    assert code == 1
+    assert code == 2
     assert answer["error"]["kind"] == "RecordingError"
     assert not (tmp_path / "none").exists()
 

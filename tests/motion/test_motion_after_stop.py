@@ -357,7 +357,7 @@ def test_an_arm_with_a_fault_of_its_own_is_not_led_home() -> None:
     with pytest.raises(ArmFault, match="repeated_warnings"):
         led(rig)
     assert LEADS not in [words for _, _, words in rig.story.events]
-    assert any(words.startswith("not led home: it was stopped by") for _, _, words in rig.story.events)
+    assert any(words.startswith("not moved home: it was stopped by") for _, _, words in rig.story.events)
 
 
 def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(tmp_path: Path) -> None:

@@ -233,7 +233,7 @@ def test_where_the_straight_way_back_is_not_free_the_run_goes_on(
     assert bench.story.states[-1] == "done"
     assert sum(distance < 1e-9 for distance in judged) == 1  # asked for once, not in later pauses again
     warnings = [message for _, level, message in bench.story.events if level == 30]
-    assert warnings == ["not finished early, goes on to its end: the table is in the way"]
+    assert warnings == ["not finished early, continues to its end: the table is in the way"]
     kept_all_limits(bench)
     ended_where_it_began(bench)
 

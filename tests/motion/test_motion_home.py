@@ -134,7 +134,7 @@ def test_a_way_through_an_obstacle_is_refused(make: Callable[..., Bench]) -> Non
         geometry={"elbow": [{"from": [-0.45, 0, 0], "to": [0, 0, 0], "radius": 0.03}]},
         workspace={"obstacles": {"post": {"box": {"center": [0.75, -0.5, 0.0], "size": [0.1, 0.2, 0.2]}}}},
     )
-    refused(bench, "the way home comes within .*post.*by hand")
+    refused(bench, "the path home comes within .*post.*by hand")
 
 
 def test_limits_are_widened_only_where_the_arm_stands_outside() -> None:

@@ -274,7 +274,7 @@ def test_a_latched_fault_refuses_the_next_run_until_it_is_acknowledged(make: Cal
     assert fault.cause.startswith("shoulder: position is not a number: ")
     assert fault.since_ns == MIDWAY * 1_000_000
     again = make()
-    with pytest.raises(MotionRefused, match=r"nobody has acknowledged: feedback_not_finite \(shoulder: "):
+    with pytest.raises(MotionRefused, match=r"unacknowledged faults: feedback_not_finite \(shoulder: "):
         played(again, LocalCommands(), latch=latch)
     again.nothing_was_enabled()
     latch.acknowledge("feedback_not_finite")

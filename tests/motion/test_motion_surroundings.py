@@ -92,7 +92,7 @@ def test_far_from_everything_the_way_back_is_what_it_was() -> None:
 def test_an_arm_that_stands_touching_finds_no_way_back() -> None:
     paused = Paused(MOTION, 1.0, LIMITS)
     model = with_ball(tip(paused.at(paused.duration).position), 0.05)
-    with pytest.raises(MotionRefused, match=r"the way comes within -0\.\d+ m at elbow - obstacle ball, 0\.00 s"):
+    with pytest.raises(MotionRefused, match=r"the path comes within -0\.\d+ m at elbow - obstacle ball, 0\.00 s"):
         searched(paused, model)
 
 

@@ -102,6 +102,6 @@ def test_a_stop_ends_the_waiting_and_nothing_is_latched() -> None:
 
     commands.lease_ok = lease_ok  # type: ignore[method-assign]
     refused, story, latch = moved(0, 0.0, commands, ArmConfig.model_validate(document))
-    assert "a stop was asked for before the arm was energised" in str(refused)
+    assert "a stop was requested before the arm was energised" in str(refused)
     assert waited(story) == 1
     assert not latch.faults

@@ -292,7 +292,7 @@ def geared(ratio: float, joint: int) -> Callable[[FlightArm], None]:
     ("ratio", "shows"),
     # An answer of 0.45^2 is within its doubt of the least that links twice as heavy give; but the arm goes twice
     # as far as it is told.
-    [(0.4, "answer"), (0.45, "displacement"), (1.6, "answer")],
+    [(0.4, "response"), (0.45, "displacement"), (1.6, "response")],
 )
 def test_a_wrong_gear_ratio_shows_in_what_the_joint_does(ratio: float, shows: str) -> None:
     level = {"gravity": (0.0, 0.0, -9.81)}  # the axes upright: gravity cannot tell
@@ -355,7 +355,7 @@ def test_a_drive_that_limits_its_torque_is_named_and_not_the_joint_that_it_drags
     check = only_failure(preflight(arm, model, None, confirm=lambda question: "planar2", look_seconds=0.3), "direction")
     assert check.reason.startswith("repeated_warnings: torque_not_applied in more than 20 of the last 100 cycles")
     assert "(shoulder: the drive gives 0.8 of the " in check.reason
-    assert " N m it was told)" in check.reason
+    assert " N m commanded)" in check.reason
     assert "limits that the drive keeps by itself" in check.remedy
 
 

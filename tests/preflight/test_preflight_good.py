@@ -57,7 +57,7 @@ def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     flight = Flight(changes={"prior": prior, "driver": driver})
     check = check_of(flight.ticket(), "direction")
     assert check.verdict is Verdict.PASSED
-    judged = {one.joint: one for one in check.measures if one.what.startswith("answer") and one.most is not None}
+    judged = {one.joint: one for one in check.measures if one.what.startswith("response") and one.most is not None}
     assert "scale that is too low cannot be detected until the prior has the drive inertia" in judged["elbow"].what
     # The elbow alone accelerates, by a; the model expects a (M_22 + Ia)/M_22 of the torque that it takes.
     model = flight.model

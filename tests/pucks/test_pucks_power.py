@@ -123,7 +123,7 @@ def test_a_mode_that_the_drive_does_not_have_is_not_taken(host: Host) -> None:
     host.configure()
     host.enable()
     host.cycle(200, 200)
-    assert host.write(1, 0x6060, 0, "b", 8) == 0
+    assert host.write(1, 0x6060, 0, "b", 2) == 0
     assert host.read(1, 0x6061, 0, "b") == 10
     assert host.write(1, 0x6060, 0, "b", 10) == 0
     assert host.read(1, 0x6041, 0, "H") & 0x1000

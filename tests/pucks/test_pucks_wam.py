@@ -18,9 +18,9 @@ RATED = 0.1  # N m at the motor, so that a count is 0.1 mN m
 @pytest.mark.slow
 def test_the_wam_stands_under_its_own_gravity_torque(tmp_path: Path) -> None:
     gears = {"ratios": list(WAM.ratios), "coupling": [list(row) for row in WAM.coupling or ()], "drive_terms": "joints"}
-    config = pucks_config(
-        tmp_path, name="wam7.yaml", gears=gears, emulation={"truth": str(CONFIGS / "wam7_truth.json")}
-    )
+    drives = [{"node": k, "rated_torque": 1.0, "max_torque": 8.0, "max_speed": 6000.0} for k in range(1, 8)]
+    truth = {"truth": str(CONFIGS / "wam7_truth.json")}
+    config = pucks_config(tmp_path, name="wam7.yaml", gears=gears, drives=drives, emulation=truth)
     (link,) = open_links(config)
     host = Host(link, tuple(range(1, 8)))
     for node in host.nodes:

@@ -175,7 +175,11 @@ WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
     "sign": (negated, {}, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
     "one sign": (one_negated, {}, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
     "thousand": (thousandfold, {}, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
-    "spike": (spike, {}, "lwr_3_joint moves 0.3.* rad between two samples, .* mend the samples 10.* s after the first"),
+    "spike": (
+        spike,
+        {},
+        "lwr_3_joint moves 0.3.* rad between two samples, .* correct the samples 10.* s after",
+    ),
     "gravity": (
         nothing,
         {"gravity": [0.0, 0.0, 9.81]},

@@ -77,7 +77,7 @@ def test_a_computer_that_is_set_up_has_nothing_to_mend(tmp_path: Path) -> None:
             "cores",
             {"sys/devices/system/cpu/isolated": "", "sys/devices/system/cpu/online": "0-1"},
             {},
-            "2: none",
+            "2: no core can be isolated",
             "core",
         ),
         ("computer", {"proc/cpuinfo": "flags : fpu hypervisor tsc\n"}, {}, "virtual machine", "real computer"),

@@ -72,7 +72,7 @@ def test_a_full_disk_is_the_fault_that_it_is(
         for name in ("ended.json", "manifest.json"):
             (run / name).mkdir()  # so that neither can be written
 
-    when(monkeypatch, {"exciting": fill})
+    when(monkeypatch, {"approaching": fill})
     capsys.readouterr()
     assert main([*words, *(["--json"] if form == "json" else [])]) == 4
     out, err = capsys.readouterr()
@@ -260,7 +260,7 @@ def test_the_first_fault_is_the_error_and_the_others_are_its_notes(tmp_path: Pat
     with pytest.raises(ArmFault, match=r"^drive_fault: a cable") as raised:
         ending.raise_for(faults)
     assert raised.value.code == "drive_fault"
-    assert raised.value.__notes__ == ["latched, too: following_error: elbow", "latched, too: bus_silent: nothing"]
+    assert raised.value.__notes__ == ["also active: following_error: elbow", "also active: bus_silent: nothing"]
 
 
 def test_a_fault_that_could_not_be_latched_is_still_the_error(tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_an_arm_without_brakes_is_held_until_a_person_confirms(
     assert main(["supported", loose[1], *state]) == 2  # nobody moves it, and its drives do not hold it
     assert main(loose) == 1
     assert said[-3:] == ["stopped", WAITS, LOWERS]
-    assert "supported asked of process" in capsys.readouterr().out
+    assert "supported requested of process" in capsys.readouterr().out
     assert fault_file(tmp_path / "state", "planar2").latched() == {}
 
 
