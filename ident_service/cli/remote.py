@@ -101,7 +101,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
             try:
                 return verb(client, arguments)
             except AccessRefused as error:
-                if "token that counts" not in str(error):
+                if "valid token" not in str(error):
                     raise
                 # The daemon's words are for programs that speak HTTP.
                 given = "$IDENT_TOKEN" if os.environ.get("IDENT_TOKEN") else str(state_folder(arguments) / "token")

@@ -330,8 +330,8 @@ def test_a_failed_upload_names_the_file_and_no_id(state: Path, tmp_path: Path) -
 
         with pytest.raises(UnknownId, match=r"^\S+/mine\.csv: was not uploaded: what had arrived was deleted at the"):
             client.upload("planar2", tmp_path / "mine.csv", tell=deleted)
-        other = IdentClient(client.url, (state / "token").read_text().strip())
-        begun = other.post("/api/v1/uploads", announced(content, name="mine.csv"))
+        with IdentClient(client.url, (state / "token").read_text().strip()) as other:
+            begun = other.post("/api/v1/uploads", announced(content, name="mine.csv"))
         with (
             uploads.Piece(state, begun["id"], 0),
             pytest.raises(
