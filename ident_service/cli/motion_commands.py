@@ -244,7 +244,7 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     """
     if arguments.json or not sys.stdin.isatty():
         raise UsageError(
-            "there is no terminal at which to hold the space bar; `ident run --speed 0.2` (or `rehearse --no-key`) "
+            "there is no terminal at which to hold the space bar; `ident run --speed 0.2` "
             "moves the arm without; have `ident stop` ready in another terminal"
         )
     return sys.stdin.fileno()

@@ -236,7 +236,10 @@ class ControlFile:
         if not _locked(fd):
             pid = _pid_in(fd)
             os.close(fd)
-            raise DriverError(f"the arm is in use by process {pid}; `ident stop` stops it")
+            raise DriverError(
+                f"the arm is in use by process {pid}; `ident stop` stops it, "
+                "`ident supported` lets go of one that is held"
+            )
         os.ftruncate(fd, _SIZE)
         memory = mmap.mmap(fd, _SIZE)
         length = 0 if lease_seconds is None else round(lease_seconds * 1e9)

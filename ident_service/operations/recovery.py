@@ -89,7 +89,8 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     pid = controlling_pid(control_path(state, config.name))
     if pid is not None:
         stop_first = (
-            f"`ident stop {called}` stops it; process {pid} is moving it.",
+            f"`ident stop {called}` stops it; process {pid} moves it, or holds it after a stop.",
+            f"`ident supported {called}`, if it is held: once it is supported, or at home.",
             f"`ident recover {called}` again, when it is at rest.",
         )
         return Recovery(config.name, faults, pid, None, "", "", (), {}, (), stop_first, False)

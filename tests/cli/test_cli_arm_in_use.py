@@ -27,6 +27,13 @@ def test_an_arm_that_moves_is_neither_checked_nor_watched(ident: Ident, state: P
     assert not (state / "arms" / "planar2" / "ticket.json").exists()
 
 
+def test_what_lets_go_of_an_arm_that_is_held_is_named(ident: Ident, state: Path) -> None:
+    """A process may outlive whoever began the motion, and hold the arm: another stop changes nothing then."""
+    with ControlFile.take(control_path(state, "planar2"), None):
+        assert "`ident supported` lets go of one that is held" in ident("preflight", "planar2").err
+        assert "`ident supported planar2`, if it is held" in ident("recover", "planar2").out
+
+
 @pytest.mark.slow
 def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ident, state: Path) -> None:
     assert ident("stop", "uploaded").code == 2

@@ -191,7 +191,7 @@ def test_without_a_terminal_nothing_can_be_held(
     assert main([verb, str(arm(tmp_path)), "--state", str(tmp_path), *options]) == 2
     error = capsys.readouterr().err
     assert "no terminal" in error
-    assert "`ident run --speed 0.2` (or `rehearse --no-key`)" in error
+    assert "`ident run --speed 0.2` moves the arm without" in error
 
 
 def test_a_target_of_accuracy_is_for_a_run_without_the_key(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
