@@ -251,7 +251,7 @@ def test_a_mode_that_shows_only_when_switched_on_is_waited_for_before_enabling()
 
 
 def test_a_drive_that_falls_into_another_mode_is_not_enabled() -> None:
-    """As an iPOS may under power; the mode was the wanted one while it was configured."""
+    """Refuse a drive that shows another mode once it has power, as an iPOS may."""
     bench = Bench(arm_of("maxon_epos4_50-8_0110h.eds"))
     with bench.arm as arm:
         face = bench.behind.emulator.faces[1]

@@ -208,7 +208,7 @@ class Moved:
 
     @property
     def off(self) -> bool:
-        """Whether no drive is enabled any more."""
+        """Tell if no drive is enabled any more."""
         return not any("operation enabled" in state for state in self.behind.emulator.states)
 
 

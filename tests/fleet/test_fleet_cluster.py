@@ -202,7 +202,7 @@ def test_bad_recordings_are_named_and_the_others_go_on(fleet: Run, folder: Path,
 
 @pytest.fixture(scope="module")
 def undisturbed(cluster: LocalCluster, folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """What two of the arms say when nothing is killed."""
+    """Return the results of two arms when no process is killed."""
     place = tmp_path_factory.mktemp("undisturbed")
     request = FleetRequest(
         "planar2", (f"{folder}/arm[01]/*.mcap",), str(place / "store"), NAMES, cluster.scheduler_address

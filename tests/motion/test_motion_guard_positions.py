@@ -122,7 +122,7 @@ def test_a_drive_that_pushes_hard_quick_stops_although_its_joint_moves() -> None
 
 
 def test_a_joint_that_stands_still_although_it_shall_move_is_a_frozen_encoder() -> None:
-    """What the control law would add for the following error is not sent, and tells it all the same."""
+    """Find a frozen encoder by the torque that the law would add for the following error, though it is not sent."""
     seen, fault = bench(), None
     for number in range(100):
         away = 0.002 * number * unit(0)

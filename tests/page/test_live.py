@@ -216,7 +216,7 @@ def test_deviations_from_blocks_are_those_that_blocks_of_the_whole_give() -> Non
 
 
 def test_a_run_with_a_target_does_not_end_on_repetitions_alone() -> None:
-    """What the model lacks errs alike in every period, so that a target is not reached by waiting."""
+    """Show that repeating a motion does not reach a target: an error of the model is the same in every period."""
     once, often = (
         growing_run(seconds, 0.002, in_blocks=True, period=10.0, error=0.2)[2][-1] for seconds in (11.0, 101.0)
     )
