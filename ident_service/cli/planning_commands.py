@@ -187,12 +187,16 @@ def _preview(arguments: argparse.Namespace) -> Answer:
 
 def _add_configs(verbs: VerbList) -> None:
     """Register `new` and `config check`."""
-    new = verbs.add("new", _new, "write a first description of an arm from its URDF, with a simulated driver")
-    new.add_argument("urdf", metavar="URDF", type=Path)
+    text = "write a first description of an arm from its URDF, MJCF or DH table, with a simulated driver"
+    new = verbs.add("new", _new, text)
+    help_source = "URDF (.urdf, .xml), MJCF (.xml), or DH table (.csv, .yaml)"
+    new.add_argument("source", metavar="FILE", type=Path, help=help_source)
     new.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: NAME.yaml here)")
-    new.add_argument("--name", help="of the arm (default: the URDF's file name)")
-    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: the root)")
+    new.add_argument("--name", help="of the arm (default: the file's)")
+    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: found)")
     new.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where the gripper begins)")
+    help_convention = "of a DH table that does not say it: standard (distal frames) or modified (Craig)"
+    new.add_argument("--convention", choices=["standard", "modified"], help=help_convention)
     config = verbs.group("config", "arm descriptions")
     check = config.add(
         "check",
@@ -224,8 +228,8 @@ def _new(arguments: argparse.Namespace) -> Answer:
     def tell(line: str) -> None:
         print_to_person(f"{line} ...\n")
 
-    words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
-    path, guessed = new_description(*words, tell)
+    words = (arguments.source, arguments.out, arguments.name, arguments.base, arguments.tip)
+    path, guessed = new_description(*words, tell, arguments.convention)
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
