@@ -381,12 +381,8 @@ def _told(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -
     if kind in ("literal_error", "enum"):
         return "wanted", str(context["expected"])
     if kind == "union_tag_invalid":
-        expected = str(context["expected_tags"])
-        tags = [one.strip("' ") for one in expected.split(",")]
-        return (
-            "said",
-            f"kind must be {', '.join(tags)}, not {context['tag']!r}{did_you_mean(str(context['tag']), tags)}",
-        )
+        tag, tags = str(context["tag"]), [one.strip("' ") for one in str(context["expected_tags"]).split(",")]
+        return "said", f"kind must be {' or '.join(tags)}, not {tag!r}{did_you_mean(tag, tags)}"
     if kind == "union_tag_not_found":
         return "said", "'kind' is missing; add it"
     if kind == "extra_forbidden":

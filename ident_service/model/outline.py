@@ -183,8 +183,9 @@ def _csv_table(path: Path, text: str, convention: str | None) -> tuple[DHTable, 
     if len(numbered) < 2:
         raise ConfigError([Problem(path, 1, 1, f"a row of names (joint, {', '.join(_DH)}) and one for each joint")])
     names, scales = [], []
-    for column, head in enumerate(next(csv.reader(io.StringIO(numbered[0][1])))):
-        found = _COLUMN.fullmatch(head.strip())
+    heads = [head.strip() for head in next(csv.reader(io.StringIO(numbered[0][1])))]
+    for column, head in enumerate(heads):
+        found = _COLUMN.fullmatch(head)
         name, unit = (found[1].lower(), (found[2] or "").replace(" ", "")) if found else (head, "")
         known = ("joint", *_DH, *_LIMITS)
         if name not in known:
@@ -218,7 +219,7 @@ def _cell(name: str, cell: str, scale: float) -> Any:
     if name in ("joint", "type"):
         return cell
     try:
-        return float(cell) * scale
+        return float(f"{float(cell) * scale:.12g}")
     except ValueError:
         return cell  # `pi/2`, `90 deg`, or a mistake that is told where it is checked
 
@@ -733,7 +734,7 @@ def _mjcf_capsules(model: pin.Model, path: Path) -> tuple[dict[str, list[Any]], 
             half = getattr(solid, "halfLength", 0.0) * place.rotation[:, 2]
             start, end = place.translation - half, place.translation + half
             exact.setdefault(body.name, []).append(_rounded(start, end, solid.radius))
-        elif (surface := _surface(solid, np.asarray(shape.meshScale).ravel())) is not None:
+        elif (surface := _surface(solid)) is not None:
             corners.setdefault(body.name, []).append(surface @ place.rotation.T + place.translation)
     found = {
         name: [
@@ -749,11 +750,10 @@ def _stacked(corners: Iterable[Array]) -> Array:
     return np.vstack([np.zeros((0, 3, 3)), *corners])
 
 
-def _surface(solid: Any, scale: Array) -> Array | None:
+def _surface(solid: Any) -> Array | None:
     """Return triangles around one of coal's shapes in its frame [m], shape (triangles, 3, 3); None for a plane."""
     if isinstance(solid, coal.BVHModelBase):
-        found = _triangles(solid)
-        return None if found is None else found * scale
+        return _triangles(solid)  # in metres: the file's scale is applied by its reader
     if isinstance(solid, coal.ConvexBase):
         return _hull(np.array(solid.points()))
     if isinstance(solid, coal.Halfspace | coal.Plane):

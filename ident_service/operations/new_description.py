@@ -609,7 +609,7 @@ def _gains(draft: Draft, loaded: Callable[[], ArmModel]) -> None:
     for k, (name, joint) in enumerate(draft.joints.items()):
         unit = "N m/rad" if model.chain.revolute[k] else "N/m"
         draft.origins[name] |= {
-            "kp": f"chosen: stable; {joint['kp'] * home[k]:.3g} {unit} with the inertia at home",
+            "kp": f"chosen: stable; {short(joint['kp'] * home[k], 3):g} {unit} with the inertia at home",
             "kd": "chosen: critically damped",
         }
     if finer := [name for name, one in zip(draft.joints, draft.encoder, strict=True) if one < ENCODER]:

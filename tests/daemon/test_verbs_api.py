@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -133,8 +134,14 @@ def test_a_description_is_judged_and_not_kept(daemon: Asked, state: Path) -> Non
     assert (answer.status_code, answer.json()["arm"], answer.json()["stable"]) == (200, "unseen", True), answer.text
     assert "gain margin" in answer.json()["text"]
     answer = daemon.post(door, {"description": unstable_text()})
-    assert (answer.status_code, answer.json()["stable"]) == (200, False), answer.text
-    assert answer.json()["objections"]
+    assert (answer.status_code, answer.json()["stable"], answer.json()["good"]) == (200, False, False), answer.text
+    # Who stores it is told the same: each at its place, and never that it is good.
+    assert re.match(r"\d+:\d+: gains: ", answer.json()["objections"][0])
+    assert answer.json()["text"].splitlines()[0].endswith(": CANNOT MOVE")
+    stored = daemon.post("/api/v1/arms", {"description": unstable_text()})
+    assert (stored.status_code, stored.json()["objections"]) == (201, answer.json()["objections"]), stored.text
+    again = daemon.post("/api/v1/arms", {"description": unstable_text()})
+    assert (again.status_code, again.json()["objections"]) == (201, None)
     refusal(daemon.post(door, {"description": quick_text().replace("terms:", "termz:")}), 422, r"arm.yaml:\d+:\d+:")
     refusal(daemon.post(door, {"description": "x" * (8 * 2**20 + 1)}), 422)
     refusal(daemon.post(door, {"description": "x", "files": {"y": "z" * (8 * 2**20)}}), 400, "bytes at most")
