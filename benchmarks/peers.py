@@ -62,7 +62,8 @@ def measure(folder: Path) -> list[Row]:
     errors: dict[str, dict[str, float]] = {}
     for turn in range(TURNS + 1):
         words = {"ours": [*ours, "--out", str(folder / f"result{turn}")]}
-        words |= {name: [*script, str(folder / "arm.urdf"), fit, unseen, str(exact)] for name, script in scripts.items()}
+        files = [str(folder / "arm.urdf"), fit, unseen, str(exact)]
+        words |= {name: [*script, *files] for name, script in scripts.items()}
         for name, command in words.items():
             spent, said = _cpu_seconds(command)
             if turn:  # once for warm files and compiled modules
