@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import time
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -89,6 +91,65 @@ def test_ros_replays_every_message_in_order_and_latches_the_description(
     np.testing.assert_allclose(state.velocity, expected, atol=0.1)  # type: ignore[attr-defined]
     assert read["/robot_description"][0].data == urdf  # type: ignore[attr-defined]
     assert [one.cycle for one in read["/cycle"]] == list(range(count))  # type: ignore[attr-defined]
+
+
+LAYOUTS = Path(__file__).resolve().parents[2] / "configs" / "layouts"
+
+
+@pytest.fixture(scope="module")
+def fields(tmp_path_factory: pytest.TempPathFactory, types: Typestore, wam: ArmModel) -> dict[str, object]:
+    """The last message of each topic of a recording of the WAM whose drives measure torques."""
+    path = tmp_path_factory.mktemp("fields") / "run.mcap"
+    with RecordingWriter(path, wam.chain.names, urdf_text(wam, None), OFFSET_NS) as writer:
+        q = np.zeros(7)
+        writer.sample(Cycle(START_NS, q, None, q, q, q, 0, 0, 0, q == 0, np.zeros(7, int), 0, q))
+        writer.event(START_NS, 20, "armed")
+    with Reader(path) as bag:
+        return {one.topic: types.deserialize_cdr(data, one.msgtype) for one, _, data in bag.messages()}
+
+
+def test_the_layout_for_foxglove_shows_what_recordings_have(fields: dict[str, object]) -> None:
+    layout = json.loads((LAYOUTS / "foxglove.json").read_text())
+    panels = layout["configById"]
+
+    def placed(node: object) -> list[str]:
+        return [node] if isinstance(node, str) else [*placed(node["first"]), *placed(node["second"])]  # type: ignore[index]
+
+    assert sorted(placed(layout["layout"])) == sorted(panels)
+    shown = set()
+    for name, panel in panels.items():
+        for series in panel.get("paths", ()):
+            topic, field, index = re.fullmatch(r"(/\w+)\.(\w+)(?:\[(\d)\])?", series["value"]).groups()  # type: ignore[union-attr]
+            value = getattr(fields[topic], field)
+            assert np.isfinite(value if index is None else value[int(index)]), (name, series)
+            shown.add(topic)
+    urdf = panels["3D!arm"]["layers"]["urdf"]
+    shown |= {urdf["topic"], panels["RosOut!events"]["topicToRender"]}
+    assert urdf["layerId"] == "foxglove.Urdf"
+    assert shown == set(fields)
+    assert panels["3D!arm"]["followTf"] == fields["/joint_states"].header.frame_id  # type: ignore[attr-defined]
+
+
+def test_the_layout_for_plotjuggler_shows_what_recordings_have(fields: dict[str, object]) -> None:
+    # Its parser of joint states names series by the joints, that of all other messages by the fields.
+    known = {
+        f"{topic}/{joint}/{field}"
+        for topic, message in fields.items()
+        if topic.startswith("/joint_")
+        for field in ("position", "velocity", "effort")
+        if len(getattr(message, field))
+        for joint in message.name  # type: ignore[attr-defined]
+    }
+    known |= {f"/cycle/{field}" for field in ("cycle", "lateness_ns", "compute_ns", "lost")}
+    root = ET.fromstring((LAYOUTS / "plotjuggler.xml").read_text())  # noqa: S314 - our own
+    curves = [curve.get("name") for curve in root.iter("curve")]
+    assert len(curves) == len(set(curves)) > 30
+    assert set(curves) <= known
+    assert {name.split("/")[1] for name in filter(None, curves)} == {
+        *("joint_states", "joint_commands", "joint_torques", "cycle")
+    }
+    for splitter in root.iter("DockSplitter"):
+        assert int(splitter.get("count", "0")) == len(splitter) == len(splitter.get("sizes", "").split(";"))
 
 
 def test_rosbag2_is_told_how_to_read_the_policies(tmp_path: Path) -> None:
