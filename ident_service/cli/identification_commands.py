@@ -535,7 +535,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
 
 def _add_results(verbs: VerbList) -> None:
-    """Register `report` and `figures`."""
+    """Register `report`, `figures` and `view`."""
     sub = verbs.add("report", _report, "write the report of a result folder as one HTML file")
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the folder")
@@ -544,6 +544,15 @@ def _add_results(verbs: VerbList) -> None:
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
+
+    sub = verbs.add("view", _view, "show a run in Rerun: the arm, its joints, what the parameters leave of the torques")
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
+    sub.add_argument(
+        *("--recording",), type=Path, action="append", default=[], metavar="FILE",
+        help="besides those in the folder; may be repeated",
+    )  # fmt: skip
+    sub.add_argument("--urdf", type=Path, metavar="FILE", help="draw its meshes, which stand beside it")
+    sub.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for Rerun instead of opening it")
 
 
 def _report(arguments: argparse.Namespace) -> Answer:
@@ -562,6 +571,18 @@ def _figures(arguments: argparse.Namespace) -> Answer:
     names = write_figures(arguments.run, arguments.out, arguments.format)
     text = f"files: {arguments.out}\n" + "".join(f"  {name}\n" for name in names)
     return DONE, text, {"folder": str(arguments.out), "files": names}
+
+
+def _view(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.run_view import view_run
+
+    seen = view_run(arguments.run, arguments.recording, arguments.save, arguments.urdf)
+    text = f"recordings: {', '.join(seen.recordings)}\n"
+    text += f"residuals: {', '.join(seen.residuals) or 'none; identify parameters from the recording first'}\n"
+    if seen.saved is not None:
+        text += f"{seen.saved}: {seen.saved.stat().st_size / 1e6:.2f} MB; show it with: rerun {seen.saved}\n"
+    file = None if seen.saved is None else str(seen.saved)
+    return DONE, text, {"recordings": list(seen.recordings), "residuals": list(seen.residuals), "file": file}
 
 
 def add(verbs: VerbList) -> None:
