@@ -617,7 +617,10 @@ def _add_results(verbs: VerbList) -> None:
     sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
 
-    sub = verbs.add("view", _view, "show a run in Rerun: the arm, its joints, what the parameters leave of the torques")
+    sub = verbs.add(
+        *("view", _view, "show a run in Rerun: the arm, its joints, its residuals"),
+        examples=("result", "result --save result.rrd"),
+    )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
     sub.add_argument(
         *("--recording",), type=Path, action="append", default=[], metavar="FILE",

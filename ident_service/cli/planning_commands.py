@@ -221,7 +221,10 @@ def _add_configs(verbs: VerbList) -> None:
         examples=("my_arm.yaml", "wam7"),
     )
     check.add_argument("file", metavar="FILE")
-    schema = verbs.add("schema", _schema, "print the JSON schema of a file format, for editors and other tools")
+    schema = verbs.add(
+        *("schema", _schema, "print the JSON schema of a file format"),
+        examples=("arm", "parameters"),
+    )
     schema.add_argument("of", metavar="FORMAT", choices=_SCHEMAS, help=f"{', '.join(_SCHEMAS)}; arm is a description")
 
 

@@ -63,8 +63,8 @@ def _quantity(value: float | None, unit: str) -> Cell:
 def joint_rule() -> str:
     """Return the meaning of the columns and words of the table on top."""
     return (
-        f"Use: below {POOR:g} %; use with care: above, near standstill or in motion; do not use: above {USELESS:g} % in "
-        "motion. Fitted: recordings fitted to; unseen: the worst recording that was not; moving: without rows near "
+        f"Use: below {POOR:g} %; use with care: above, near standstill or in motion; do not use: above {USELESS:g} % "
+        "in motion. Fitted: recordings fitted to; unseen: the worst recording that was not; moving: without rows near "
         "standstill. Root mean squares are of the recording that decides."
     )
 
@@ -252,7 +252,8 @@ def _number(value: float | None, digits: int = 5) -> Cell:
 
 _NO_WARNING = (
     "No warnings of the recordings: gaps, saturation and standstill are as they should be, and the standard deviation "
-    f"of the steps between stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands under Timing."
+    f"of the steps between stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands "
+    "under Timing."
 )
 _ARRIVAL = (
     "The arm's description takes stamps for times of arrival: between gaps samples count as evenly spaced, so uneven "
