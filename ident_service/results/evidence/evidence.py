@@ -29,8 +29,6 @@ class Estimated:
         validation: likewise on every recording that was never fitted to.
         moving: as `identification`, without rows of joints near standstill, whose friction is unknown.
         moving_validation: likewise on every recording that was never fitted to.
-        moving_joints: as `moving` and `moving_validation`, joint by joint, each in percent of the joint's own torque;
-            one row for what was fitted to, then one per recording that was not; empty where it was not told.
     """
 
     name: str
@@ -40,7 +38,6 @@ class Estimated:
     validation: tuple[float, ...]
     moving: float | None = None
     moving_validation: tuple[float, ...] = ()
-    moving_joints: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -162,7 +162,6 @@ def evidence_document(evidence: Evidence) -> dict[str, Any]:
                 "validation": list(one.validation),
                 "moving": one.moving,
                 "moving_validation": list(one.moving_validation),
-                "moving_joints": [list(row) for row in one.moving_joints],
             }
             for one in evidence.estimates
         ],
@@ -268,11 +267,6 @@ def _evidence(content: Mapping[str, Any]) -> Evidence:
     size = len(content["bounds"])
     for one in estimates:
         _require(len(one["values"]) == size, f"estimate {one['name']!r} has {len(one['values'])} values, not {size}")
-        rows = one.get("moving_joints", [])
-        _require(
-            len(rows) in (0, 1 + len(one["validation"])), f"joint errors of {one['name']!r} on {len(rows)} recordings"
-        )
-        _require(all(len(row) == joints for row in rows), f"joint errors of {one['name']!r}: not of {joints} joints")
     for key in ("unconstrained", "constrained", "chosen"):
         _require(content[key] < len(estimates), f"{key} is estimate {content[key]} of {len(estimates)}")
     recordings = tuple(_traced(one, joints) for one in content["recordings"])
@@ -291,7 +285,6 @@ def _evidence(content: Mapping[str, Any]) -> Evidence:
                 tuple(one["validation"]),
                 one["moving"],
                 tuple(one["moving_validation"]),
-                tuple(tuple(row) for row in one.get("moving_joints", [])),
             )
             for one in estimates
         ),

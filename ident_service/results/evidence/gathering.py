@@ -539,10 +539,6 @@ def _estimates(estimate: Estimate) -> tuple[Estimated, ...]:
             validation=tuple(score.error.relative_percent for score in scores),
             moving=candidate.moving.relative_percent,
             moving_validation=tuple(score.moving.relative_percent for score in scores),
-            moving_joints=tuple(
-                tuple(error.joint_relative_percent.tolist())
-                for error in (candidate.moving, *(score.moving for score in scores))
-            ),
         )
 
     found = [of(candidate) for candidate in estimate.candidates]
