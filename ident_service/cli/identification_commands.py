@@ -12,7 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
+from ident_service.cli.arguments import (
+    FEASIBLE_SETS,
+    VerbList,
+    columns_files,
+    delay,
+    did_you_mean,
+    replicates,
+    seed,
+    weight,
+    workers,
+)
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -382,6 +392,17 @@ def accepted_name(path: Path) -> str | None:
     return name if word == "accepted" and name and "/" not in name and not path.exists() else None
 
 
+def _require_arm(arm: str, known: Sequence[str]) -> None:
+    """Refuse `accepted:NAME` of an arm of which nothing is known.
+
+    Raises:
+        UsageError: with the arms that are.
+    """
+    if arm not in known:
+        there = f"; known are {', '.join(known)}" if known else ""
+        raise UsageError(f"accepted:{arm}: no arm of this name has an accepted set{did_you_mean(arm, known) or there}")
+
+
 def _compare(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.parameter_files import KEPT, compare_files, compare_into
     from ident_service.results.comparison.presentation import comparison_document, comparison_text
@@ -389,7 +410,9 @@ def _compare(arguments: argparse.Namespace) -> Answer:
     reference = arguments.reference
     if (arm := accepted_name(reference)) is not None:
         from ident_service.operations.acceptance import PARAMETERS, accepted_set
+        from ident_service.registry.state_folder import known_arms
 
+        _require_arm(arm, known_arms(state_folder(arguments)))
         reference = accepted_set(state_folder(arguments), arm)[1] / PARAMETERS
     if arguments.keep:
         if len(arguments.others) != 1 or not arguments.others[0].is_dir():

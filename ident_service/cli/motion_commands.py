@@ -620,6 +620,14 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
     return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
 
 
+_ASKED = {
+    "pause": "pause requested of",
+    "resume": "resumption requested of",
+    "finish": "early end requested of",
+    "supported": "support confirmed to",
+}
+
+
 def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.command_channel import ControlFile, in_use
 
@@ -642,7 +650,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
         pid = controls.pid
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
-    return DONE, f"{name}: {arguments.asks} requested of process {pid}\n", document
+    return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:

@@ -232,7 +232,6 @@ def _new(arguments: argparse.Namespace) -> Answer:
     path, guessed = new_description(*words, tell)
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
-    lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
     return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 

@@ -159,7 +159,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
         lines.append(
             "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )
-    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident preflight {arguments.arm}`")
+    lines.append("compare what `ident watch` shows with the arm, then make a new preflight")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -236,7 +236,7 @@ def _text(found: Recovery) -> str:
     lines += [f"  outside its position limits: {words}" for words in found.outside]
     if found.seen is not None:
         lines += ["", watch_text(found.seen).rstrip("\n")]
-    lines += ["", "next:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
+    lines += ["", "steps:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
     return "\n".join(lines)
 
 

@@ -225,7 +225,9 @@ def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     arm = arguments.arm
     answer = client.post("/api/v1/stop" if arm is None else f"/api/v1/arms/{word_of_address(arm)}/stop")
-    names = ", ".join([*answer["arms"], *answer["jobs"]])
+    parts = [f"stop requested of {', '.join(answer['arms'])}"] if answer["arms"] else []
+    parts += [f"cancelled: {', '.join(f'job {job}' for job in answer['jobs'])}"] if answer["jobs"] else []
+    names = "; ".join(parts)
     if arm is not None and not names and not _known(client, arm):
         return (
             USAGE,
@@ -233,7 +235,7 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
             answer,
         )
     nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
-    return DONE, f"stop requested of {names}\n" if names else f"{nobody}\n", answer
+    return DONE, f"{names or nobody}\n", answer
 
 
 def _known(client: IdentClient, arm: str) -> bool:

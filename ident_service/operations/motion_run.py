@@ -73,11 +73,13 @@ class ProcessResult:
         report: of a run that was done or stopped, else empty.
         error: kind, message, and code of a fault; else empty.
         code: exit code, None while it runs.
+        taken: whether the process has had the arm.
     """
 
     report: dict[str, Any]
     error: dict[str, str]
     code: int | None = None
+    taken: bool = False
 
     @property
     def heard(self) -> bool:
@@ -255,6 +257,7 @@ class _Watch:
 
     def _take(self, said: dict[str, Any]) -> None:
         if "pid" in said:
+            self.ending.taken = True
             with suppress(UsageError):  # it died at once, as the next read will show
                 self._controls = ControlFile.reach(self._path)
         self.ending.report = said.get("report", self.ending.report)
@@ -477,7 +480,7 @@ def run_motion(
         "speed": speed,
         "log_frames": log_frames,
     }
-    started = False
+    started, ending = False, None
     try:
         write_ticket(folder / "ticket.json", ticket)
         for file, content in attachments.items():
@@ -492,7 +495,8 @@ def run_motion(
             ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, stop_requested, finish)
             ending.raise_for(faults)
     except BaseException as error:
-        if started and not (isinstance(error, MotionRefused) and not faults.latched()):
+        refused = isinstance(error, MotionRefused) or (ending is not None and ending.heard and not ending.taken)
+        if started and not (refused and not faults.latched()):
             _keep(folder, error)
         else:
             shutil.rmtree(folder, ignore_errors=True)
