@@ -44,6 +44,7 @@ from ident_service.cli.output import (
     state_folder,
     styled,
 )
+from ident_service.cli.progress import progress_bar
 from ident_service.errors import (
     ArmFault,
     ConfigError,
@@ -106,7 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb: Callable[[argparse.Namespace], Answer] = (
             arguments.verb if arguments.server is None else remote.run_on_daemon
         )
-        code, text, document = _asked(verb, arguments)
+        with progress_bar(arguments):
+            code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
         # A second Ctrl-C: the person does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")

@@ -24,6 +24,7 @@ from ident_service.cli.arguments import (
     workers,
 )
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
+from ident_service.cli.progress import step_of
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
 
@@ -134,6 +135,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
             described=described,
             custom=custom_of(arguments.arm, described),
             tell=lambda line: tell(arguments, line),
+            step=step_of(arguments),
             stop_requested=stopping.requested,
         )
     scored, estimate = result.score, result.estimate
@@ -193,7 +195,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         second_opinion=arguments.second_opinion,
     )
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name)
-    result = identify_files(request, folder, lambda line: tell(arguments, line))
+    result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
     text = summary(estimate, result.unusable, result.torque)
@@ -328,7 +330,7 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     arm_model(config)  # what cannot be used is told before workers start
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name, "fleets")
-    result = identify_fleet(request, folder, lambda line: tell(arguments, line))
+    result = identify_fleet(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     good = not result.document["left_out"] and not result.changed
     return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
 
@@ -605,7 +607,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
     formats = known_formats(arguments.format)
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "exports")
-    made = export_run(arguments.run, formats, folder)
+    made = export_run(arguments.run, formats, folder, step_of(arguments))
     lines, files = [f"files: {folder}"], []
     for export in made:
         lines.append(f"  {export.name} ({export.format})")

@@ -67,6 +67,9 @@ def _print_json(document: dict[str, Any]) -> None:
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
     """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
+    bar = getattr(arguments, "progress", None)
+    if bar is not None and sys.stdout is not None and sys.stdout.isatty() and bar.tell(line):
+        return
     # With --json, stdout belongs to the one object.
     with suppress(OSError):
         write(sys.stderr if arguments.json else sys.stdout, line + "\n")

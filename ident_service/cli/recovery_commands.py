@@ -30,6 +30,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
@@ -316,6 +317,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
 
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
+    parsed.progress = getattr(arguments, "progress", None)
     parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
     tell(arguments, f"-- {words[0]}")
     try:

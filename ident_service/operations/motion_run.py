@@ -401,6 +401,7 @@ def run_motion(
     log_frames: bool = False,
     begin: Callable[[], None] = lambda: None,
     tell: Callable[[str], None] = lambda _: None,
+    moved: Callable[[float], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
     asked_ns: int | None = None,
     until: Target | None = None,
@@ -418,6 +419,7 @@ def run_motion(
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
         begin: called when all checks that do not need the arm have passed, and the folder exists.
         tell: called with each state that is entered.
+        moved: called several times a second with how long the arm has been driven, in its own time [s].
         stop_requested: asked several times a second.
         asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
             was asked for since then keeps it from beginning.
@@ -481,6 +483,11 @@ def run_motion(
         "log_frames": log_frames,
     }
     started, ending = False, None
+
+    def watched() -> bool:
+        moved(recorder.written / config.control.rate)
+        return stop_requested()
+
     try:
         write_ticket(folder / "ticket.json", ticket)
         for file, content in attachments.items():
@@ -492,7 +499,7 @@ def run_motion(
         with recorder, reaching or nullcontext():
             started = True
             finish = (lambda: False) if reaching is None else reaching.reached
-            ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, stop_requested, finish)
+            ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, watched, finish)
             ending.raise_for(faults)
     except BaseException as error:
         refused = isinstance(error, MotionRefused) or (ending is not None and ending.heard and not ending.taken)
