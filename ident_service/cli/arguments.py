@@ -46,6 +46,7 @@ LOCAL_ONLY: dict[str, str] = {
     **dict.fromkeys(
         ("bus import", "bus store", "bus restore"), "it changes what drives keep; it is an act at the arm's computer"
     ),
+    "view": "a viewer opens where you sit; copy the run's folder from the daemon's machine",
     "bus report": "it writes a file beside you; log in where the daemon runs",
     **dict.fromkeys(("backup", "restore"), "it is done at the daemon's machine, in its state folder"),
     "tokens add": "whoever got hold of an operator's token could make others that outlive it; "

@@ -141,7 +141,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     scored, estimate = result.score, result.estimate
     lines = [
         "",
-        summary(estimate, result.unusable),
+        summary(estimate, result.unusable, warnings=result.warnings),
         "comparison with the true parameters",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
         f"  validation residual over that of the true parameters: {scored.residual_ratio:.4f}",
@@ -152,8 +152,8 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         "",
     ]
     document = {"folder": str(result.folder), "score": score_document(scored)}
-    document |= _estimate_document(estimate, result.unusable)
-    return _exit_code(estimate, result.unusable), "\n".join(lines), document
+    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    return _exit_code(document), "\n".join(lines), document
 
 
 @contextmanager
@@ -198,26 +198,29 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
-    text = summary(estimate, result.unusable, result.torque)
+    text = summary(estimate, result.unusable, result.torque, result.warnings)
     text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
     document["torque"] = result.torque
-    document |= _estimate_document(estimate, result.unusable)
-    return _exit_code(estimate, result.unusable), text, document
+    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    return _exit_code(document), text, document
 
 
-def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
-    return DONE if estimate.feasible and not unusable else VERDICT_NO
+def _exit_code(document: dict[str, Any]) -> int:
+    return DONE if document["usable"] else VERDICT_NO
 
 
-def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.assessment import assess_estimate
     from ident_service.results.parameter_file import convex_document
     from ident_service.results.summary import how_fitted, implausible_links
 
     own = estimate.candidates[estimate.chosen]
+    found = assess_estimate(estimate, unusable, warnings)
     return {
         "arm": estimate.model.config.name,
-        "usable": estimate.feasible and not unusable,
+        "assessment": found.document(),
+        "usable": found.word != "do not use",
         "unusable": list(unusable),
         "feasible": estimate.feasible,
         "margin": estimate.margin,
@@ -619,7 +622,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
 
 def _add_results(verbs: VerbList) -> None:
-    """Register `report` and `figures`."""
+    """Register `report`, `figures` and `view`."""
     sub = verbs.add(
         "report",
         _report,
@@ -639,13 +642,24 @@ def _add_results(verbs: VerbList) -> None:
     sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
 
+    sub = verbs.add("view", _view, "show a run in Rerun: the arm, its joints, what the parameters leave of the torques")
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
+    sub.add_argument(
+        *("--recording",), type=Path, action="append", default=[], metavar="FILE",
+        help="besides those in the folder; may be repeated",
+    )  # fmt: skip
+    sub.add_argument("--urdf", type=Path, metavar="FILE", help="draw its meshes, which stand beside it")
+    sub.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for Rerun instead of opening it")
+
 
 def _report(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.report_files import make_report
+    from ident_service.results.summary import assessment_lines
 
-    page = make_report(arguments.run, arguments.out)
+    page, found = make_report(arguments.run, arguments.out)
     size = page.stat().st_size
-    return DONE, f"{page}: {size / 1e6:.2f} MB\n", {"file": str(page), "bytes": size}
+    text = "\n".join([*assessment_lines(found), "", f"{page}: {size / 1e6:.2f} MB", ""])
+    return DONE, text, {"file": str(page), "bytes": size, "assessment": found.document()}
 
 
 def _figures(arguments: argparse.Namespace) -> Answer:
@@ -654,6 +668,18 @@ def _figures(arguments: argparse.Namespace) -> Answer:
     names = write_figures(arguments.run, arguments.out, arguments.format)
     text = f"files: {arguments.out}\n" + "".join(f"  {name}\n" for name in names)
     return DONE, text, {"folder": str(arguments.out), "files": names}
+
+
+def _view(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.run_view import view_run
+
+    seen = view_run(arguments.run, arguments.recording, arguments.save, arguments.urdf)
+    text = f"recordings: {', '.join(seen.recordings)}\n"
+    text += f"residuals: {', '.join(seen.residuals) or 'none; identify parameters from the recording first'}\n"
+    if seen.saved is not None:
+        text += f"{seen.saved}: {seen.saved.stat().st_size / 1e6:.2f} MB; show it with: rerun {seen.saved}\n"
+    file = None if seen.saved is None else str(seen.saved)
+    return DONE, text, {"recordings": list(seen.recordings), "residuals": list(seen.residuals), "file": file}
 
 
 def add(verbs: VerbList) -> None:

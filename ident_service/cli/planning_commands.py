@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import select
 import sys
@@ -217,6 +218,22 @@ def _add_configs(verbs: VerbList) -> None:
         examples=("my_arm.yaml", "wam7"),
     )
     check.add_argument("file", metavar="FILE")
+    schema = verbs.add("schema", _schema, "print the JSON schema of a file format, for editors and other tools")
+    schema.add_argument("of", metavar="FORMAT", choices=_SCHEMAS, help=f"{', '.join(_SCHEMAS)}; arm is a description")
+
+
+_SCHEMAS = ("arm", "comparison", "evidence", "parameters", "payload")
+
+
+def _schema(arguments: argparse.Namespace) -> Answer:
+    from importlib.resources import files
+
+    from ident_service.config.yaml_source import arm_schema_file
+
+    of = arguments.of
+    file = arm_schema_file() if of == "arm" else files("ident_service.results").joinpath(f"{of}.schema.json")
+    text = file.read_text(encoding="utf-8")
+    return DONE, text, json.loads(text)
 
 
 def _new(arguments: argparse.Namespace) -> Answer:
