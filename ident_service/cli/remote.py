@@ -27,6 +27,7 @@ from ident_service.cli.output import (
     tell,
     with_answer_lines,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.cli.remote_recordings import file_of, recording, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.errors import AccessRefused, IdentError, UnknownId, UsageError
@@ -225,7 +226,9 @@ def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     arm = arguments.arm
     answer = client.post("/api/v1/stop" if arm is None else f"/api/v1/arms/{word_of_address(arm)}/stop")
-    names = ", ".join([*answer["arms"], *answer["jobs"]])
+    parts = [f"stop requested of {', '.join(answer['arms'])}"] if answer["arms"] else []
+    parts += [f"cancelled: {', '.join(f'job {job}' for job in answer['jobs'])}"] if answer["jobs"] else []
+    names = "; ".join(parts)
     if arm is not None and not names and not _known(client, arm):
         return (
             USAGE,
@@ -233,7 +236,7 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
             answer,
         )
     nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
-    return DONE, f"stop requested of {names}\n" if names else f"{nobody}\n", answer
+    return DONE, f"{names or nobody}\n", answer
 
 
 def _known(client: IdentClient, arm: str) -> bool:
@@ -307,7 +310,9 @@ REMOTE: dict[str, Verb] = {
 
 
 # Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
-_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind"})
+_OURS = frozenset(
+    {"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind", "progress"}
+)
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
@@ -343,7 +348,9 @@ def _wait_for_job(
             if job["held"] and not held:
                 for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
                     tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
-            said = (job["progress"] or {}).get("phase", job["state"])
+            known = job["progress"] or {}
+            said = known.get("phase", job["state"])
+            step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
             if said != phase:
                 phase = said
                 tell(arguments, phase)
@@ -380,7 +387,8 @@ def typed(arguments: argparse.Namespace) -> str:
     if name is None and sys.stdin.isatty() and not arguments.json:
         what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
         what = "is lowered" if getattr(arguments, "word", "") == "supported" else what
-        name = input(f"{arguments.arm} {what} where you may not see it. Type its name to confirm: ").strip()
+        question = f"{arguments.arm} {what} where you may not see it. Type its name to confirm: "
+        name = ask(arguments, question).strip()
     if name != arguments.arm:
         raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
     return str(name)

@@ -228,6 +228,8 @@ def job_answer_document(service: Service, row: Row) -> JobAnswer:
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
     held = bool(row["motion"]) and row["state"] == "running" and held_arm(service.state, str(row["arm"]))
+    if held and progress is not None:  # it ends when a person says so
+        progress |= {"fraction": None, "remaining": None}
     return JobAnswer(**{**shown, "progress": progress, "held": held})
 
 

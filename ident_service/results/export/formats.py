@@ -298,13 +298,16 @@ def export_texts(arm: IdentifiedArm, formats: Sequence[str]) -> tuple[Export, ..
     return tuple(FORMATS[name](arm) for name in known_formats(",".join(formats)))
 
 
-def export_run(run: Path, formats: Sequence[str], folder: Path) -> tuple[Export, ...]:
+def export_run(
+    run: Path, formats: Sequence[str], folder: Path, step: Callable[[str, float], None] = lambda words, share: None
+) -> tuple[Export, ...]:
     """Export a folder of results: all files, or none.
 
     Args:
         run: the folder, every file in it as its manifest says.
         formats: of `FORMATS`.
         folder: where the files appear; others in it stay.
+        step: called with each format before it is made, and the share of them that is done, from 0 to 1.
 
     Returns:
         What was written, without the texts.
@@ -314,7 +317,10 @@ def export_run(run: Path, formats: Sequence[str], folder: Path) -> tuple[Export,
         ParameterError: the files of the run are torn, changed or foreign.
         ConfigError, ModelError: the arm in it cannot be used, or a format cannot carry it.
     """
-    made = export_texts(read_identified(run), formats)
+    arm, made = read_identified(run), list[Export]()
+    for name in known_formats(",".join(formats)):
+        step(f"exporting {name}", len(made) / len(formats))
+        made += export_texts(arm, [name])
     with atomic_folder(folder) as staging:
         for export in made:
             write_atomically(staging / export.name, export.text)
