@@ -40,7 +40,15 @@ from ident_service.fleet.population import (
     unlike,
     variance_shares,
 )
-from ident_service.fleet.reduction import FleetRequest, Reduced, Tell, absolute_url, connected, reduce_fleet
+from ident_service.fleet.reduction import (
+    FleetRequest,
+    Reduced,
+    Tell,
+    absolute_url,
+    connected,
+    list_recordings,
+    reduce_fleet,
+)
 from ident_service.fleet.results import (
     FLEET,
     FORMAT,
@@ -87,10 +95,11 @@ def identify_fleet(request: FleetRequest, folder: Path, tell: Tell = lambda _: N
         SolverError: a solver stopped without an optimum.
     """
     _require_replaceable(folder)
+    listed = list_recordings(request)  # what cannot be is refused before workers start
+    for arm, _ in listed.whose.values():
+        _require_file_name(arm)
     with connected(request, tell) as client:
-        reduced = reduce_fleet(client, request, tell)
-        for arm in reduced.arms:
-            _require_file_name(arm)
+        reduced = reduce_fleet(client, request, listed, tell)
         result, written, splits = _analysed(client, request, reduced, folder, tell)
     with staging_beside(folder) as staging:
         _write(staging, result, written, splits, request)
