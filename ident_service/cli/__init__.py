@@ -128,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         print_to_person(f"ident: done, but the output cannot be written: {error.strerror}\n")
         discard(sys.stdout)
-        return FAILED
+        return FAILED if code == DONE else code
     return code
 
 

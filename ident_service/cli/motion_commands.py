@@ -238,12 +238,31 @@ def add_dry_run(sub: Parser) -> None:
     sub.add_argument("--dry-run", action="store_true", help=text)
 
 
+def described_arm(arguments: argparse.Namespace) -> ArmConfig:
+    """Load the description of a verb's arm: a file, a shipped one, or one that was uploaded to the daemon here.
+
+    Raises:
+        UsageError: there is none of this name.
+        ConfigError: every mistake in it.
+    """
+    from ident_service.config.load import load_arm
+
+    try:
+        return load_arm(arguments.arm)
+    except UsageError:
+        from ident_service.registry.arms import uploaded_description
+
+        path = uploaded_description(state_folder(arguments), str(arguments.arm))
+        if path is None:
+            raise
+        return load_arm(path)
+
+
 def dry_run(arguments: argparse.Namespace) -> Answer:
     """Return what opening the arm of a verb would write into its drives; nothing is written and nothing moves."""
-    from ident_service.config.load import load_arm
     from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     planned = planned_configuration(config)
     code = VERDICT_NO if any(one.refused for one in planned) else DONE
     return code, planned_text(config, planned), planned_document(config, planned)
@@ -425,14 +444,13 @@ def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
 
 
 def _watch(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import controlling_pid
     from ident_service.motion.read_only_monitor import watch
     from ident_service.operations.arm_checks import watch_document, watch_text
     from ident_service.registry.state_folder import control_path
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
         raise DriverError(f"{config.name}: process {pid} is moving the arm; see its recording")
     stopping = StopOnSignal()
@@ -455,7 +473,6 @@ _PREFLIGHT = {
 def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import ControlFile, InterruptibleArm
@@ -467,7 +484,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.recordings.files import require_writable
     from ident_service.registry.state_folder import arm_folder, control_path, fault_file, ticket_path
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
 
     def confirm(question: str) -> str:
         if arguments.confirm is not None:
@@ -544,9 +561,8 @@ def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float |
     """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     lease = requested_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s"
@@ -588,13 +604,12 @@ def _target(arguments: argparse.Namespace) -> Target | None:
 def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 
     if arguments.lease_from_stdin:
         return _move(arguments, share_of_speed, HOLD_TO_RUN_SECONDS)
     terminal = require_terminal(arguments)
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
@@ -700,10 +715,15 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
 
 def _release_drives(arguments: argparse.Namespace) -> Answer:
     """Switch off the drives that still hold an arm after the motion process has ended."""
-    from ident_service.config.load import load_arm
     from ident_service.operations.recovery import release_held_drives
 
-    config = load_arm(arguments.arm)
+    try:
+        config = described_arm(arguments)
+    except UsageError:
+        raise UsageError(
+            f"{arguments.arm}: no process holds it, and nothing has changed; without its description its drives cannot "
+            "be asked whether they hold it: give the description's file instead of the name"
+        ) from None
     held = release_held_drives(config, writable_state_folder(arguments))
     write_audit_entry(arguments, "supported", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "supported", "let_go": list(held)}

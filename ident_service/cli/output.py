@@ -52,13 +52,18 @@ def print_answer(arguments: argparse.Namespace, code: int, text: str, document: 
 
 
 def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
-    """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`."""
-    _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
+    """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`.
+
+    Where it cannot be written, on a full disk for example, the exit code is left to say it.
+    """
+    with suppress(OSError):
+        _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
 
 
 def print_to_person(text: str) -> None:
-    """Print on stderr; a closed stderr is ignored."""
-    write(sys.stderr, text)
+    """Print on stderr; one that is closed, or on a full disk, is ignored."""
+    with suppress(OSError):
+        write(sys.stderr, text)
 
 
 def _print_json(document: dict[str, Any]) -> None:
@@ -88,8 +93,24 @@ def write(stream: TextIO | None, text: str) -> None:
         stream.flush()
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.EIO):
+            _forget_unwritten(stream)
             raise
         discard(stream)
+
+
+def _forget_unwritten(stream: TextIO) -> None:
+    """Drop what a stream could not write, which would fail again with each later line and at exit; later lines count.
+
+    A stream without a file has nothing that could be dropped.
+    """
+    with suppress(OSError, ValueError):
+        kept = os.dup(stream.fileno())
+        try:
+            discard(stream)
+            stream.flush()
+            os.dup2(kept, stream.fileno())
+        finally:
+            os.close(kept)
 
 
 def discard(stream: TextIO) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
-from ident_service.cli.motion_commands import add_can_log, add_dry_run, dry_run, run_and_report
+from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -88,10 +88,9 @@ def _add_recovery(verbs: VerbList) -> None:
 def _home(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.motion.run_plan import Destination
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if arguments.zero:
         if arguments.out is not None or arguments.can_log:
             raise UsageError("--out and --can-log are for a motion; here nothing moves")
@@ -168,11 +167,10 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 def _recover(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.operations.arm_checks import watch_document
     from ident_service.operations.recovery import recover
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if arguments.leave_limit:
         from ident_service.motion.run_plan import Destination
 

@@ -48,6 +48,7 @@ from ident_service.fleet.reduction import (
     Tell,
     absolute_url,
     connected,
+    list_recordings,
     reduce_fleet,
 )
 from ident_service.fleet.results import (
@@ -99,10 +100,11 @@ def identify_fleet(
         SolverError: a solver stopped without an optimum.
     """
     _require_replaceable(folder)
+    listed = list_recordings(request)  # what cannot be is refused before workers start
+    for arm, _ in listed.whose.values():
+        _require_file_name(arm)
     with connected(request, tell) as client:
-        reduced = reduce_fleet(client, request, tell, step)
-        for arm in reduced.arms:
-            _require_file_name(arm)
+        reduced = reduce_fleet(client, request, listed, tell, step)
         result, written, splits = _analysed(client, request, reduced, folder, tell, step)
     with staging_beside(folder) as staging:
         _write(staging, result, written, splits, request)
