@@ -12,7 +12,11 @@ environment, so its lines are left to `--clean`. A URDF, `robot.urdf`, is at han
 from __future__ import annotations
 
 import argparse
+import array
+import importlib
+import json
 import os
+import pkgutil
 import re
 import shlex
 import shutil
@@ -20,7 +24,10 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
+import traceback
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -124,6 +131,64 @@ def clean_clone(folder: Path) -> Path:
     return folder / "ident" / ".venv" / "bin"
 
 
+CLIENT = """import array, json, os, socket, sys
+with socket.socket(socket.AF_UNIX) as server:
+    server.connect({path!r})
+    words = json.dumps([os.getcwd(), sys.argv[1:]]).encode()
+    server.sendmsg([words], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", [0, 1, 2]))])
+    sys.exit(server.recv(1)[0])
+"""
+"""The command `ident` of a walk: hands its words, folder and streams to `serve_commands`."""
+
+
+def serve_commands(path: str) -> None:
+    """Run commands in forks of this process, which has loaded everything: loading costs more than most of them take."""
+    from ident_service import cli, operations
+
+    for package in (cli, operations):
+        for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
+            importlib.import_module(found.name)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(path)
+        listener.listen()
+        while True:
+            asking, _ = listener.accept()
+            with suppress(ChildProcessError):
+                while os.waitpid(-1, os.WNOHANG)[0]:
+                    pass
+            words, ancillary, *_ = asking.recvmsg(65536, socket.CMSG_SPACE(12))
+            streams = array.array("i", ancillary[0][2])
+            if os.fork() == 0:
+                asking.sendall(bytes([_ended(*json.loads(words), streams)]))
+                os._exit(0)
+            for stream in streams:
+                os.close(stream)
+            asking.close()
+
+
+def _ended(folder: str, words: list[str], streams: Sequence[int]) -> int:
+    """Run one command in a fork; return its exit code."""
+    if (child := os.fork()) != 0:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) & 255
+    from ident_service.cli import main as ident
+
+    code = 1
+    try:
+        for number, stream in enumerate(streams):
+            os.dup2(stream, number)
+        os.chdir(folder)
+        sys.argv = ["ident", *words]
+        code = ident(words)
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 1
+    finally:
+        if (error := sys.exc_info()[1]) is not None:
+            traceback.print_exception(error)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
 def walk(
     pages: Sequence[Path], folder: Path, *, clean: bool = False, quiet: bool = True
 ) -> subprocess.CompletedProcess[str]:
@@ -142,6 +207,7 @@ def walk(
     tools.mkdir(parents=True)
     work.mkdir()
     environment = {**os.environ, "IDENT_STATE": str(folder / "state"), "MPLBACKEND": "agg"}
+    path, serving = "", None
     if clean:
         environment["PATH"] = f"{clean_clone(folder)}{os.pathsep}{environment['PATH']}"
         source, text = folder / "ident", script(pages)
@@ -151,28 +217,39 @@ def walk(
             port = str(free.getsockname()[1])
         source, text = quick_checkout(folder / "checkout"), script(pages).replace(f":{PORT}", f":{port}")
         environment |= {"PYTHONPATH": str(source), "PATH": f"{tools}{os.pathsep}{environment['PATH']}"}
+        path = str(folder / "commands")
         program = shlex.quote(sys.executable)
-        serve = f'if [ "$1" = serve ]; then set -- "$@" --port {port}; fi\n'
-        for name, command in (
-            ("ident", f'{serve}exec {program} -m ident_service "$@"'),
-            ("python", f'exec {program} "$@"'),
-        ):
+        (tools / "client.py").write_text(CLIENT.format(path=path))
+        serve = f'[ "$1" != serve ] || exec {program} -m ident_service "$@" --port {port}\n'
+        client = f'exec {program} -I -S {shlex.quote(str(tools / "client.py"))} "$@"'
+        for name, command in (("ident", serve + client), ("python", f'exec {program} "$@"')):
             (tools / name).write_text(f"#!/bin/sh\n{command}\n")
             (tools / name).chmod(0o755)
+        serving = subprocess.Popen([sys.executable, __file__, "--serve", path], env=environment, cwd=work)
     shutil.copy(source / "configs" / "threelink.urdf", work / "robot.urdf")
     to = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if quiet else {}
-    return subprocess.run(
-        ["bash", "-c", text], cwd=work, env=environment, stdin=subprocess.DEVNULL, text=True, check=False, **to
-    )
+    try:
+        while serving is not None and serving.poll() is None and not Path(path).exists():
+            time.sleep(0.02)
+        return subprocess.run(
+            ["bash", "-c", text], cwd=work, env=environment, stdin=subprocess.DEVNULL, text=True, check=False, **to
+        )
+    finally:
+        if serving is not None:
+            serving.kill()
+            serving.wait()
 
 
 def main() -> int:
     """Walk through the pages that are named, in a folder that is kept when something fails."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("pages", nargs="+", type=Path)
+    parser.add_argument("pages", nargs="*", type=Path)
     parser.add_argument("--clean", action="store_true", help="in a clean clone with an environment of its own")
     parser.add_argument("--print", action="store_true", help="print the script and run nothing")
+    parser.add_argument("--serve", metavar="SOCKET", help=argparse.SUPPRESS)
     words = parser.parse_args()
+    if words.serve:
+        serve_commands(words.serve)
     if words.print:
         print(script(words.pages))
         return 0
