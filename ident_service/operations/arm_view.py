@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.config.recording import RecordingFormat
@@ -25,7 +26,7 @@ from ident_service.motion.trajectory import Reference, Setpoint, plan_reduced_tr
 from ident_service.recordings.open import open_recording
 
 MOST_SAMPLES: Final = 2000
-_RATE: Final = 25.0  # Hz; a viewer goes straight from one sample to the next
+_RATE: Final = 25.0  # Hz of the motion at its own speed; a viewer goes straight from one sample to the next
 _MOST_DISTANCES: Final = 60_000  # of pairs of bodies in all samples; more would keep a caller waiting for seconds
 
 
@@ -75,7 +76,7 @@ def view_of_motion(model: ArmModel, excitation: Excitation, speed: float = 1.0) 
     if there is None or back is None:
         notes.append("the way from home and back cannot be planned; preflight says why")
     length = shown + sum(one.duration for one in (there, back) if one is not None)
-    rate = min(_RATE * speed, (MOST_SAMPLES - 10) / length)
+    rate = min(_RATE, (MOST_SAMPLES - 10) / length)
     parts: list[tuple[str, Array, Array]] = []
     if there is not None:
         time = _grid(0.0, there.duration, rate)
@@ -169,15 +170,18 @@ def _clearance(model: ArmModel, position: Array) -> tuple[dict[str, Any] | None,
     step = -(-len(position) * len(collision.pairs) // _MOST_DISTANCES)
     rows = np.arange(0, len(position), step)
     distances = collision.distances(position[rows])
-    nearest = np.argmin(distances, axis=1)
-    smallest = distances[np.arange(len(rows)), nearest]
-    named = sorted(set(nearest.tolist()))
-    return {
-        "samples": rows.tolist(),
-        "distance": np.round(smallest, 4).tolist(),
-        "pairs": [collision.pairs[pair] for pair in named],
-        "pair": [named.index(pair) for pair in nearest.tolist()],
-    }, []
+    inner = {"base", *model.chain.names}
+    itself = np.array([pair.partition(" - ")[2] in inner for pair in collision.pairs])
+    kinds = [("itself", np.flatnonzero(itself)), ("surroundings", np.flatnonzero(~itself))]
+    nearest = {name: _nearest(distances, chosen) for name, chosen in kinds if len(chosen)}
+    return {"samples": rows.tolist(), "pairs": list(collision.pairs), **nearest}, []
+
+
+def _nearest(distances: Array, chosen: NDArray[np.intp]) -> dict[str, Any]:
+    """Return the smallest distance of the chosen pairs at each sample, and which pair has it."""
+    pair = chosen[np.argmin(distances[:, chosen], axis=1)]
+    smallest = distances[np.arange(len(distances)), pair]
+    return {"distance": np.round(smallest, 4).tolist(), "pair": pair.tolist()}
 
 
 def _home(model: ArmModel) -> Array:

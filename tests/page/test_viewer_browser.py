@@ -113,15 +113,15 @@ def test_a_motion_is_seen_before_it_is_made(shown: tuple[Browser, Reached, str],
     expect(page.get_by_label("Type the arm's name")).to_be_focused()  # the viewer takes nothing from the question
     assert drawn(page) > 50
     view = page.evaluate(f"fetch('/api/v1/arms/{ARM}/view?motion=own').then((answer) => answer.json())")
-    end, least = view["time"][-1], min(view["clearance"]["distance"])
+    end, near = view["time"][-1], view["clearance"]["itself"]["distance"]
     at = page.locator("#viewer-at")
     expect(at).to_have_text(f"0.00 s of {end:.2f} s, approach")
-    expect(page.locator("#viewer-distance")).to_contain_text(f"Over the motion: {1000 * least:.0f} mm at ")
+    expect(page.locator("#viewer-itself-least")).to_contain_text(f"{1000 * min(near):.0f} mm at ")
+    expect(page.locator("#viewer-itself")).to_contain_text(f"{1000 * near[0]:.0f} mm, ")
     # The slider by keyboard, to the end.
     page.locator("#viewer-time").press("End")
     expect(at).to_have_text(f"{end:.2f} s of {end:.2f} s, return")
-    last = view["clearance"]["distance"][-1]
-    expect(page.locator("#viewer-distance")).to_contain_text(f"Nearest here: {1000 * last:.0f} mm, ")
+    expect(page.locator("#viewer-itself")).to_contain_text(f"{1000 * near[-1]:.0f} mm, ")
     play = page.get_by_role("button", name="Play")
     play.click()  # from the beginning again
     page.get_by_role("button", name="Pause").click()
@@ -140,7 +140,7 @@ def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], p
     assert drawn(page) > 50
     view = page.evaluate(f"fetch('/api/v1/runs/{run}/view').then((answer) => answer.json())")
     expect(page.locator("#viewer-at")).to_have_text(f"0.00 s of {view['time'][-1]:.2f} s")
-    path = page.locator("#viewer-clearance .line").get_attribute("d")
+    path = page.locator("#viewer-clearance .itself").get_attribute("d")
     assert path is not None
     assert path.count("L") == len(view["clearance"]["samples"]) - 1
 
@@ -190,7 +190,7 @@ def test_without_webgl_times_and_distances_stay(shown: tuple[Browser, Reached, s
     expect(page.locator("#viewer-canvas")).to_be_hidden()
     page.locator("#viewer-time").press("End")
     expect(page.locator("#viewer-at")).to_contain_text("return")
-    expect(page.locator("#viewer-distance")).to_contain_text("Nearest here: ")
+    expect(page.locator("#viewer-itself")).to_contain_text(" mm, ")
 
 
 def test_what_cannot_be_shown_is_said(shown: tuple[Browser, Reached, str], page: Page) -> None:

@@ -89,13 +89,23 @@ class ViewedPhase(BaseModel):
     begin: float
 
 
+class ViewedDistance(BaseModel):
+    """Smallest distance [m] at each sample, and the number of the pair that has it."""
+
+    distance: Numbers
+    pair: list[int]
+
+
 class ViewedClearance(BaseModel):
-    """Smallest distance [m] of bodies that must stay apart: at which samples, of which of `pairs`."""
+    """Smallest distances of bodies that must stay apart, at some of the samples: within the arm, to its surroundings.
+
+    Either is left out where there are no such pairs.
+    """
 
     samples: list[int]
-    distance: Numbers
     pairs: list[str]
-    pair: list[int]
+    itself: ViewedDistance | None = None
+    surroundings: ViewedDistance | None = None
 
 
 class ViewAnswer(BaseModel):

@@ -130,7 +130,7 @@ class Picture {
     }
     this.camera = new THREE.PerspectiveCamera(40, 1, 0.01 * this.size, 50 * this.size);
     this.camera.up.set(0, 0, 1);
-    [this.turn, this.tilt, this.distance] = [-0.9, 0.35, 1.5 * this.size];
+    [this.turn, this.tilt, this.distance] = [-0.9, 0.35, 1.3 * this.size];
     this.listen();
     new ResizeObserver(() => this.draw()).observe(canvas);
     canvas.addEventListener("webglcontextrestored", () => this.draw());
@@ -191,6 +191,8 @@ class Picture {
 
 // --- the player
 
+const millimetres = (metres) => `${(1000 * metres).toFixed(0)} mm`;
+
 // The last index whose time is not after `now`.
 function before(times, now) {
   let [low, high] = [0, times.length - 1];
@@ -249,31 +251,38 @@ class Player {
     byId("at").textContent = `${now.toFixed(2)} s of ${this.end.toFixed(2)} s${phase ? `, ${phase.name}` : ""}`;
     if (clearance) {
       const at = before(clearance.samples, k);
-      const pair = clearance.pairs[clearance.pair[at]];
-      byId("distance").textContent =
-        `Nearest here: ${(1000 * clearance.distance[at]).toFixed(0)} mm, ${pair}. ` +
-        `Over the motion: ${(1000 * this.least).toFixed(0)} mm at ${this.leastAt.toFixed(2)} s, ${this.leastPair}.`;
-      this.arm.mark(pair);
+      let nearest = null;
+      for (const { name, distance, pair } of this.kinds) {
+        byId(name).textContent = `${millimetres(distance[at])}, ${clearance.pairs[pair[at]]}`;
+        if (nearest === null || distance[at] < nearest.distance) nearest = { distance: distance[at], pair: pair[at] };
+      }
+      this.arm.mark(clearance.pairs[nearest.pair]);
       const x = (1000 * now) / this.end;
       byId("clearance").querySelector(".now").setAttribute("d", `M${x} 0V100`);
     }
     this.draw();
   }
 
-  drawClearance({ samples, distance, pairs, pair }) {
-    this.least = Math.min(...distance);
-    const at = distance.indexOf(this.least);
-    this.leastAt = this.view.time[samples[at]];
-    this.leastPair = pairs[pair[at]];
-    const high = Math.max(...distance, 1e-3);
-    const low = Math.min(this.least, 0);
-    const y = (value) => 96 - (92 * (value - low)) / (high - low);
-    const points = samples.map((k, row) => `${((1000 * this.view.time[k]) / this.end).toFixed(1)} ${y(distance[row]).toFixed(1)}`);
-    const svg = byId("clearance");
-    svg.removeAttribute("hidden");
-    svg.querySelector(".line").setAttribute("d", `M${points.join("L")}`);
-    svg.querySelector(".least").setAttribute("d", `M0 ${y(this.least)}H1000`);
-    svg.setAttribute("aria-label", `Smallest distance over the motion: from ${(1000 * this.least).toFixed(0)} to ${(1000 * high).toFixed(0)} mm`);
+  drawClearance(clearance) {
+    this.kinds = ["itself", "surroundings"].filter((name) => clearance[name]).map((name) => ({ name, ...clearance[name] }));
+    const high = Math.max(...this.kinds.flatMap(({ distance }) => distance), 1e-3);
+    const low = Math.min(...this.kinds.flatMap(({ distance }) => distance), 0);
+    const x = (k) => ((1000 * this.view.time[k]) / this.end).toFixed(1);
+    const y = (value) => (96 - (92 * (value - low)) / (high - low)).toFixed(1);
+    const said = [];
+    for (const { name, distance, pair } of this.kinds) {
+      const least = Math.min(...distance);
+      const at = distance.indexOf(least);
+      const when = this.view.time[clearance.samples[at]].toFixed(2);
+      const line = clearance.samples.map((k, row) => `${x(k)} ${y(distance[row])}`).join("L");
+      byId("clearance").querySelector(`.${name}`).setAttribute("d", `M${line}`);
+      byId(`${name}-least`).textContent = `${millimetres(least)} at ${when} s, ${clearance.pairs[pair[at]]}`;
+      byId(`${name}-row`).hidden = false;
+      said.push(`${name}: at least ${millimetres(least)}`);
+    }
+    byId("clearance").setAttribute("aria-label", `Smallest distances over the motion; ${said.join("; ")}`);
+    byId("clearance").removeAttribute("hidden");
+    byId("distances").hidden = false;
   }
 }
 
@@ -310,7 +319,8 @@ async function begin() {
     arm.mark(null);
     arm.pose(newest);
     byId("controls").hidden = true;
-    byId("distance").textContent = "";
+    byId("distances").hidden = true;
+    byId("clearance").setAttribute("hidden", "");
     byId("status").textContent = `As measured, ${detail.time[detail.time.length - 1].toFixed(1)} s after the recording began.`;
     draw();
   });
