@@ -24,7 +24,7 @@ def frame_origins(chain: Chain, position: Array) -> Array:
     return origins
 
 
-def joint_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
+def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
     """Return orientation and origin of every joint frame in the base frame, where its link's solids stand still.
 
     Args:
