@@ -12,7 +12,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
+from ident_service.cli.arguments import (
+    FEASIBLE_SETS,
+    VerbList,
+    columns_files,
+    delay,
+    payload_files_of,
+    replicates,
+    seed,
+    weight,
+    workers,
+)
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -54,6 +64,18 @@ def _add_commission(verbs: VerbList) -> None:
         default=[],
         metavar="[RECORDING=]FILE",
         help="YAML file with column names and units, for all recordings or one; may be repeated",
+    )
+    sub.add_argument(
+        "--payload",
+        action="append",
+        default=[],
+        metavar="RECORDING=FILE",
+        help="YAML file with mass and center_of_mass of the known load in a recording; may be repeated",
+    )
+    sub.add_argument(
+        "--torque-constants",
+        action="store_true",
+        help="also identify every motor's torque constant; needs a recording with a known load (--payload)",
     )
     sub.add_argument(
         "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
@@ -156,6 +178,8 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         validation=tuple(arguments.validate),
         columns=columns,
         columns_of=columns_of,
+        payloads=payload_files_of(arguments.payload),
+        torque_constants=arguments.torque_constants,
         cut_standstill=arguments.cut_standstill,
         method=arguments.method,
         set_name=arguments.feasible_set,
@@ -186,7 +210,7 @@ def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
 
 def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
     from ident_service.results.parameter_file import convex_document
-    from ident_service.results.summary import how_fitted, implausible_links
+    from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
     own = estimate.candidates[estimate.chosen]
     return {
@@ -212,6 +236,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
             for candidate in estimate.candidates
         ],
         "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+        **torque_constants_document(estimate),
         **convex_document(estimate),
     }
 

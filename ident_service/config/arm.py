@@ -266,7 +266,9 @@ class Identification(ExtendedSection):
     is the block length of the uncertainty estimate; `delay` [s] is the delay of torque stamps against position stamps,
     by default none, or one of a few samples where that predicts held-out parts clearly better; `period` [s] averages a
     periodic motion over its periods, without the filters of the torque. `torque` is what drives measured or what they
-    were told; left out, what they measured where a recording has it in every sample.
+    were told; left out, what they measured where a recording has it in every sample. `torque_factors` are what the
+    recorded torque of each motor is multiplied by, in the order of the transmission: of recordings that were made with
+    torque constants which have turned out to be wrong.
     """
 
     method: Method | Literal["choose"] = "choose"
@@ -279,7 +281,8 @@ class Identification(ExtendedSection):
     delay: Number | Literal["estimate", "choose"] = "choose"
     period: Positive | None = None
     torque: Literal["measured", "commanded"] | None = None
-    later = frozenset({"torque"})
+    torque_factors: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    later = frozenset({"torque", "torque_factors"})
 
     @model_validator(mode="after")
     def _averaged_instead(self) -> Identification:
