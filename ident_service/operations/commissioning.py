@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm import Arm
-from drivers.clock import Clock
+from drivers.clock import Clock, utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
@@ -23,6 +23,7 @@ from ident_service.estimation.least_squares import torque_error
 from ident_service.estimation.plausibility import remarks_on_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
+from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
@@ -134,6 +135,7 @@ class Commissioning:
         runs: how the two motions went.
         score: against the truth.
         unusable: why the estimate must not be used; empty where nothing says so.
+        warnings: what is wrong with the recordings, in words.
     """
 
     folder: Path
@@ -141,6 +143,7 @@ class Commissioning:
     runs: tuple[RunReport, RunReport]
     score: Score
     unusable: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def record_motion(
@@ -168,12 +171,13 @@ def record_motion(
         "excitation.json": motion.to_json().encode(),
     }
     metadata = {"arm": model.config.name, "arm_sha256": model.config.sha256, "motion": motion.name}
-    description = urdf_text(model, model.prior)
+    description = urdf_text(model, model.prior, visible_bodies(model))
+    metadata["clock"] = "virtual" if arm.clock.lock_step else "monotonic"
     recorder = RecorderProcess(
         path,
         model.chain.names,
         description,
-        arm.clock.utc_offset_ns,
+        utc_offset_of_recording_ns(arm.clock),
         attachments,
         metadata,
         lock_step=arm.clock.lock_step,
@@ -254,14 +258,20 @@ def simulate(
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         unusable = unusable_because(estimate, found)
-        write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
-        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
         warnings += [line for one, seen in found for line in remarks_on_limits(one.path.name, seen.joints, model)]
         warnings += estimate.remarks
+        write_results(
+            staging,
+            estimate,
+            {"warnings": warnings},
+            unusable,
+            described=config if described is None else described,
+        )
+        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
-    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable)
+    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable, tuple(warnings))
 
 
 def score_document(scored: Score) -> dict[str, object]:

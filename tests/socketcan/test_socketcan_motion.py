@@ -120,7 +120,7 @@ def test_a_motion_over_a_real_bus_identifies_the_arm(
     planar2 = shipped_arms()["planar2"]
     path, recording = tmp_path / "arm.yaml", tmp_path / "identification.mcap"
     section = CANOPEN if kind == "canopen" else PUCKS
-    driver = section.format(eds=planar2.parent / "puck.eds", interface=interface, channel=can_interface)
+    driver = section.format(eds=planar2.parent / "emulated_drive.eds", interface=interface, channel=can_interface)
     path.write_text(ARM.format(planar2=planar2, driver=driver) + (OF_PUCKS if kind == "barrett" else ""))
     config = load_arm(path)
     model = arm_model(config)
