@@ -305,8 +305,8 @@ class Identification(ExtendedSection):
     """Torque that drives measured, or were told; left out, what they measured where a recording has it in every sample.
     """
     torque_factors: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
-    """Factors that recorded torques of the motors are multiplied by, one a motor in the order of the transmission: for
-    recordings that were made with torque constants which have turned out to be wrong; none when left out."""
+    """Factors that recorded torques of the motors are multiplied by [1], one a motor in the order of the transmission:
+    for recordings that were made with torque constants which have turned out to be wrong; all 1 when left out."""
     later = frozenset({"torque", "torque_factors"})
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from typing import Any
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.recording import Transmission
 
-EDS = "[FileInfo]\nFileName=d.eds\n\n[DummyUsage]\nDummy0001=0\nDummy0003=1\n\n[6077]\nParameterName=Torque\n"
+EDS = "[FileInfo]\nFileName=emulated.eds\n\n[DummyUsage]\nDummy0001=0\nDummy0003=1\n\n[6077]\nParameterName=Torque\n"
 # Newton metres at the motor: FIELDBUS.md 1.1, counts of MT over counts per newton metre.
 MAX_TORQUE = (1.8, 1.8, 1.8, 1.6, 0.6, 0.6, 0.0916)
 RATED = (0.2, 0.2, 0.2, 0.2, 0.1, 0.1, 0.02)
