@@ -100,7 +100,7 @@ test-socketcan: $(READY)
 # An independent CANopen stack on the emulated drives; needs node, and npm's registry once.
 test-foreign: $(READY)
 	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
-	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
+	$(BIN)/pytest tests/emulated_drives/test_drives_foreign_stack.py
 
 # The newest of everything that pyproject.toml allows, in an environment of its own, made anew.
 LATEST := .venv-latest
