@@ -42,6 +42,7 @@ from ident_service.daemon.routes import (
     uploads,
 )
 from ident_service.daemon.routes.checks import Checks
+from ident_service.daemon.run_series import RunSeries
 from ident_service.daemon.settings import Settings
 from ident_service.daemon.uploads import delete_stale_uploads
 from ident_service.daemon.web import (
@@ -140,6 +141,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     )
     app.state.service = service
     app.state.live = LiveRuns()
+    app.state.series = RunSeries()
     app.state.watch = EventPoller(
         db, settings.state, lambda row: jobs.job_answer_document(service, row).model_dump(mode="json")
     )

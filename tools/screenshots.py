@@ -1,0 +1,124 @@
+"""Make the pictures of the documents: the daemon's pages in a browser, with a simulated arm that has a history.
+
+`python tools/screenshots.py [FOLDER]` (`make screenshots`) needs the system's Chromium, or `CHROMIUM` with its path. It
+starts a daemon on a state folder of its own, commissions a simulated arm of seven joints there, makes its joints drier,
+enters maintenance, has it re-identified, and lets a second arm fail in the middle of a run. Then it writes one
+PNG per view. With `--keep STATE` the state folder stays, and is used again if it is there: the pictures alone take
+half a minute, the history three.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from ident_service.client.client import IdentClient
+from ident_service.config.load import load_arm, shipped_arms
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.errors import IdentError
+
+IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
+ARM, FAILING, RECORDED = "bench7", "bench2", "archive2"
+MOST_BYTES = 150_000
+WIDTH, HEIGHT = 1280, 860
+_CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
+_BENCH = "extends: wam7_sim\nname: bench7\ndescription: seven-axis arm on the test bench\n"
+# A quarter of the cycles of a real arm: the picture is the same.
+_SMALL = """extends: planar2
+name: bench2
+description: two links, an encoder cable that fails
+motions:
+  identification: {kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}
+"""
+_BROKEN = "driver: {seed: 2, faults: [{kind: encoder_jump, joint: elbow, at: 7.5, size: 0.4}]}\n"
+_RECORDINGS_ONLY = """extends: planar2
+name: archive2
+description: two links, known from recordings only
+driver: null
+"""
+
+
+@contextmanager
+def served(state: Path) -> Iterator[IdentClient]:
+    """Start a daemon on a state folder, and yield a client that is its owner."""
+    daemon = subprocess.Popen(  # noqa: S603 - this very package
+        [sys.executable, "-m", "ident_service", "serve", "--state", str(state), "--port", "0"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        until = time.monotonic() + 60.0
+        while not (state / "serve.url").is_file() or not (state / "token").is_file():
+            if daemon.poll() is not None or time.monotonic() > until:
+                raise SystemExit("the daemon did not start")
+            time.sleep(0.1)
+        with IdentClient((state / "serve.url").read_text().strip(), (state / "token").read_text().strip()) as client:
+            yield client
+    finally:
+        daemon.terminate()
+        daemon.wait(60)
+
+
+def history(client: IdentClient, state: Path) -> None:
+    """Give the arms their history; what is there already is left as it is."""
+    if any(run["arm"] == FAILING for run in client.runs()):
+        return
+    arm = client.add_arm(_BENCH, replace=True)
+    _move(arm.check(confirm=ARM))
+    first = _move(arm.run(confirm=ARM))
+    second = _move(arm.run(confirm=ARM, speed=0.8))
+    made = client.compute("identify", arm=ARM, recordings=[{"run": first}], validate_on=[{"run": second}])
+    client.compute("report", run=made.run)
+    arm.accept(str(made.run), "as delivered")
+    client.compute("export", run=made.run, formats=["urdf", "mjcf"])
+    client.post("/api/v1/schedules", {"arm": ARM, "maintenance": True})
+    client.post("/api/v1/schedules", {"arm": ARM, "cron": "0 6 * * mon"})
+    client.add_arm(_BENCH + f"driver: {{seed: 5, truth: {drier()}}}\n", replace=True)
+    reidentify(client)
+    client.post(f"/api/v1/arms/{ARM}/maintenance", {"what": "gear oil of j2 changed", "note": "ISO VG 68, 0.4 l"})
+    small = client.add_arm(_SMALL, replace=True)
+    _move(small.check(confirm=FAILING))
+    good = _move(small.run(confirm=FAILING))
+    client.compute("identify", arm=FAILING, recordings=[{"run": good}])
+    small = client.add_arm(_SMALL + _BROKEN, replace=True)
+    _move(small.check(confirm=FAILING))
+    _move(small.run(confirm=FAILING))
+    client.add_arm(_RECORDINGS_ONLY, replace=True)
+    client.upload(RECORDED, state / "runs" / good / "run.mcap")
+
+
+def drier() -> str:
+    """Return the arm's true parameters as YAML, with more friction in the second joint."""
+    driver = load_arm(shipped_arms()["wam7_sim"]).driver
+    if not isinstance(driver, SimulatedDriver) or driver.truth is None:
+        raise SystemExit("the shipped arm wam7_sim has no true parameters")
+    values = dict(zip(driver.truth.names, driver.truth.values, strict=True))
+    values |= {name: 1.35 * values[name] for name in ("fc2", "fv2")}
+    return json.dumps(values)
+
+
+def _move(motion) -> str:  # type: ignore[no-untyped-def]
+    """Keep the lease of a motion to its end, whatever that is; return its run."""
+    try:
+        with motion:
+            pass
+    except IdentError as error:
+        print(f"  {error}", file=sys.stderr)
+    print(f"{motion.ended.kind}: {motion.ended.state}", file=sys.stderr)
+    return str(motion.ended.run)
+
+
+def reidentify(client: IdentClient) -> None:
+    """Re-identify the arm, with its lease kept."""
+    challenge = client.post(f"/api/v1/arms/{ARM}/challenge")["challenge"]
+    asked = {"arm": ARM, "confirm": {"name": ARM, "challenge": challenge}}
+    begun = client.post("/api/v1/reidentifications", asked)
+    while (seen := client.get(f"/api/v1/reidentifications/{begun['id']}"))["state"] == "running":
+        with suppress(IdentError):  # between two steps there is none
+            client.post(f"/api/v1/reidentifications/{begun['id']}/lease")
+        time.sleep(0.3)
+    print(f"re-identification: {seen['state']}", file=sys.stderr)
