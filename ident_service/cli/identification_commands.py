@@ -115,7 +115,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     scored, estimate = result.score, result.estimate
     lines = [
         "",
-        summary(estimate, result.unusable),
+        summary(estimate, result.unusable, warnings=result.warnings),
         "comparison with the true parameters",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
         f"  validation residual over that of the true parameters: {scored.residual_ratio:.4f}",
@@ -126,8 +126,8 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         "",
     ]
     document = {"folder": str(result.folder), "score": score_document(scored)}
-    document |= _estimate_document(estimate, result.unusable)
-    return _exit_code(estimate, result.unusable), "\n".join(lines), document
+    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    return _exit_code(document), "\n".join(lines), document
 
 
 @contextmanager
@@ -172,26 +172,29 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     result = identify_files(request, folder, lambda line: tell(arguments, line))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
-    text = summary(estimate, result.unusable, result.torque)
+    text = summary(estimate, result.unusable, result.torque, result.warnings)
     text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
     document["torque"] = result.torque
-    document |= _estimate_document(estimate, result.unusable)
-    return _exit_code(estimate, result.unusable), text, document
+    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    return _exit_code(document), text, document
 
 
-def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
-    return DONE if estimate.feasible and not unusable else VERDICT_NO
+def _exit_code(document: dict[str, Any]) -> int:
+    return DONE if document["usable"] else VERDICT_NO
 
 
-def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.assessment import assess_estimate
     from ident_service.results.parameter_file import convex_document
     from ident_service.results.summary import how_fitted, implausible_links
 
     own = estimate.candidates[estimate.chosen]
+    found = assess_estimate(estimate, unusable, warnings)
     return {
         "arm": estimate.model.config.name,
-        "usable": estimate.feasible and not unusable,
+        "assessment": found.document(),
+        "usable": found.word != "do not use",
         "unusable": list(unusable),
         "feasible": estimate.feasible,
         "margin": estimate.margin,
@@ -545,10 +548,12 @@ def _add_results(verbs: VerbList) -> None:
 
 def _report(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.report_files import make_report
+    from ident_service.results.summary import assessment_lines
 
-    page = make_report(arguments.run, arguments.out)
+    page, found = make_report(arguments.run, arguments.out)
     size = page.stat().st_size
-    return DONE, f"{page}: {size / 1e6:.2f} MB\n", {"file": str(page), "bytes": size}
+    text = "\n".join([*assessment_lines(found), "", f"{page}: {size / 1e6:.2f} MB", ""])
+    return DONE, text, {"file": str(page), "bytes": size, "assessment": found.document()}
 
 
 def _figures(arguments: argparse.Namespace) -> Answer:

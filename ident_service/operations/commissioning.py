@@ -134,6 +134,7 @@ class Commissioning:
         runs: how the two motions went.
         score: against the truth.
         unusable: why the estimate must not be used; empty where nothing says so.
+        warnings: what is wrong with the recordings, in words.
     """
 
     folder: Path
@@ -141,6 +142,7 @@ class Commissioning:
     runs: tuple[RunReport, RunReport]
     score: Score
     unusable: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def record_motion(
@@ -254,14 +256,20 @@ def simulate(
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         unusable = unusable_because(estimate, found)
-        write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
-        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
         warnings += [line for one, seen in found for line in remarks_on_limits(one.path.name, seen.joints, model)]
         warnings += estimate.remarks
+        write_results(
+            staging,
+            estimate,
+            {"warnings": warnings},
+            unusable,
+            described=config if described is None else described,
+        )
+        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
-    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable)
+    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable, tuple(warnings))
 
 
 def score_document(scored: Score) -> dict[str, object]:

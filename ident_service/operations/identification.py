@@ -162,7 +162,10 @@ def identify_files(
         warnings += remarks_on_limits(recording.path.name, seen.joints, model)
     warnings += estimate.remarks
     unusable = unusable_because(estimate, found)
-    more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
+    more: dict[str, Any] = {
+        "recording_quality": [_quality_document(recording, seen) for recording, seen in found],
+        "warnings": list(warnings),
+    }
     if request.replicates:
         tell(f"bootstrap of {request.replicates} replicates")
         more["bootstrap"] = _bootstrap(estimate, request.replicates)

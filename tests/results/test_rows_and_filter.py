@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ident_service.results.report.markup import prose
 
 from ident_service.cli import main
 from ident_service.config.arm import Identification
-from ident_service.results.report.markup import prose
 from ident_service.results.summary import rows_and_filter, wrapped
 
 PLAIN: dict[str, Any] = {
