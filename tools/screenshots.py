@@ -33,9 +33,9 @@ _SMALL = """extends: planar2
 name: bench2
 description: two links, an encoder cable that fails
 motions:
-  identification: {kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}
+  identification: {kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 6}
 """
-_BROKEN = "driver: {seed: 2, faults: [{kind: encoder_jump, joint: elbow, at: 7.5, size: 0.4}]}\n"
+_BROKEN = "driver: {seed: 2, faults: [{kind: encoder_offset, joint: elbow, at: 25.0, size: 0.4}]}\n"
 _RECORDINGS_ONLY = """extends: planar2
 name: archive2
 description: two links, known from recordings only

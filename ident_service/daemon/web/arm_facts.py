@@ -1,4 +1,4 @@
-"""Read from an arm's description what pages say of it: real or simulated, its joints with units and limits, its pictures.
+"""Read from an arm's description what pages say of it: real or simulated, joints with units and limits, pictures.
 
 What is computed from a description is kept by the file and its time of change, so that a list of arms reads each once.
 Modules that compute with mechanisms are imported only where they are needed, so that the service starts without them.
@@ -37,11 +37,13 @@ class ArmFacts:
         kind: `recordings` for an arm without a driver, which cannot be moved from here.
         driver: its kind, for a real arm; empty for others.
         joints: how many; 0 where the description does not list them.
+        description: the description's own words.
     """
 
     kind: Kind
     driver: str
     joints: int
+    description: str = ""
 
     @property
     def words(self) -> str:
@@ -91,10 +93,10 @@ def facts_of(config: ArmConfig) -> ArmFacts:
     """Return the facts of a description."""
     driver = config.driver
     if driver is None:
-        return ArmFacts("recordings", "", len(config.joints))
+        return ArmFacts("recordings", "", len(config.joints), config.description)
     if isinstance(driver, SimulatedDriver):
-        return ArmFacts("simulated", "", len(config.joints))
-    return ArmFacts("real", str(driver.kind), len(config.joints))
+        return ArmFacts("simulated", "", len(config.joints), config.description)
+    return ArmFacts("real", str(driver.kind), len(config.joints), config.description)
 
 
 def joint_facts(config: ArmConfig) -> list[dict[str, Any]]:

@@ -552,11 +552,12 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
         "given": given,
         "fields": fields,
         "motion": motion,
-        "simulated": arms.get_arm(service, who, arm).simulated,
+        "simulated": facts_of(known.known_arm(service.db, service.state, arm).config).kind == "simulated",
         "extent": extent(service, given.arm, fields["motion"], _speed(fields["speed"])) if moves else None,
     }
     if form["kind"] == "rehearse":
-        return page("rehearse", who, status, **shown)
+        joints = joint_facts(known.known_arm(service.db, service.state, arm).config)
+        return page("rehearse", who, status, joints=joints, **shown)
     return page("confirm", who, status, problem=problem, **shown)
 
 

@@ -26,12 +26,13 @@ from ident_service.results.plots import number
 STATIC: Final = {
     "page.css": "text/css",
     **dict.fromkeys(
-        ("page.js", "plots.js", "live.js", "again.js", "upload.js", "news.js", "series.js", "table.js", "new.js"),
+        ("page.js", "plots.js", "live.js", "again.js", "upload.js", "news.js", "series.js", "table.js", "trends.js", "new.js"),
         "text/javascript",
     ),
 }
 PLOTS: Final = {"uPlot.iife.min.js": "text/javascript", "uPlot.min.css": "text/css"}
 """Vendored files that pages with plots load, beside those of `STATIC`."""
+_LONGEST: Final = 90  # characters of a sentence in a list
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
@@ -116,7 +117,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(when=when, lasting=_duration_text, short=_short, figure=_figure, share=_share)
+    environment.filters.update(when=when, lasting=_duration_text, short=_short, figure=_figure, share=_share, brief=_brief)
     return environment
 
 
@@ -152,6 +153,12 @@ def _share(value: float | None, limit: float | None) -> str:
     if value is None or not limit:
         return ""
     return f"{100.0 * abs(value) / limit:.0f} %"
+
+
+def _brief(words: str) -> str:
+    """Return the first clause of a long sentence, so that a list stays one."""
+    first = words.split(";")[0]
+    return first if len(first) <= _LONGEST else f"{first[: _LONGEST - 1].rstrip()}\u2026"
 
 
 def _short(sha256: str) -> str:
