@@ -84,6 +84,7 @@ DOORS: dict[str, set[str]] = {
     "jinja2": {"daemon", "fleet"},
     "prometheus_client": {"daemon"},
     "pyarrow": {"fleet"},
+    "rerun": {"operations"},
     "standardwebhooks": {"daemon"},
     "starlette": {"daemon"},
     "uvicorn": {"daemon"},

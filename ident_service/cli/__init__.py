@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib.util
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from pathlib import Path
 from ident_service import __version__
 from ident_service.cli import (
     archive_commands,
+    completion,
     daemon_commands,
     identification_commands,
     maintenance_commands,
@@ -24,7 +26,7 @@ from ident_service.cli import (
     recovery_commands,
     remote,
 )
-from ident_service.cli.arguments import ArgumentsError, Parser, VerbList, asks_for_json
+from ident_service.cli.arguments import ArgumentsError, Parser, TopParser, VerbList, asks_for_json
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -58,7 +60,7 @@ __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", 
 
 GROUPS = (
     *(identification_commands, planning_commands, motion_commands, recovery_commands, archive_commands),
-    *(maintenance_commands, daemon_commands, remote),
+    *(maintenance_commands, daemon_commands, remote, completion),
 )
 # One rule for all verbs: USAGE when what was given cannot be used, be it words, a description or any other file; FAILED
 # when it was understood and came to nothing.
@@ -86,6 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
     """
     words = sys.argv[1:] if argv is None else argv
+    if completion.VARIABLE in os.environ and argv is None:
+        completion.complete(parser())
     enable_interrupts()
     try:
         arguments = parser().parse_args(words)
@@ -96,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise
     try:
         _require_own_packages()
+        _name_registered(arguments)
         verb: Callable[[argparse.Namespace], Answer] = (
             arguments.verb if arguments.server is None else remote.run_on_daemon
         )
@@ -149,6 +154,18 @@ def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Nam
         raise registry_error(state_folder(arguments) / FILE, error) from None
 
 
+def _name_registered(arguments: argparse.Namespace) -> None:
+    """Replace ids of runs and motions by their paths in the state folder, where no file here has that name."""
+    if getattr(arguments, "server", None) is not None:
+        return
+    for name, folder, file in (("run", "runs", ""), ("reference", "runs", ""), ("motion", "motions", "motion.json")):
+        path = getattr(arguments, name, None)
+        if isinstance(path, Path) and len(path.parts) == 1 and not path.exists():
+            registered = state_folder(arguments) / folder / path / file
+            if registered.exists():
+                setattr(arguments, name, registered)
+
+
 def _mistakes(arguments: argparse.Namespace) -> ConfigError | None:
     """Return the mistakes of the description that a model could not be made of, with their places; None without any."""
     from ident_service.operations.description_check import check_description
@@ -181,9 +198,9 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
 
 def parser() -> Parser:
     """Build the argument parser with all verbs and their arguments."""
-    top = Parser(
+    top = TopParser(
         prog="ident",
-        description="Commission a robot arm: move it, record it, and identify physically feasible dynamic parameters.",
+        description="Commission a robot arm: describe it, move it, identify its dynamic parameters.",
     )
     top.add_argument("--version", action="version", version=f"ident-service {__version__}")
     verbs = VerbList.of(top)

@@ -300,13 +300,23 @@ _HELP_ARM = "description file, or the name of a shipped one"
 
 def add(verbs: VerbList) -> None:
     """Register `watch`, `preflight`, `run`, `stop`, `pause`, `resume`, `finish`, `supported` and `acknowledge`."""
-    sub = verbs.add("watch", _watch, "show positions and drive states; sends no torque and changes nothing")
+    sub = verbs.add(
+        "watch",
+        _watch,
+        "show positions and drive states; changes nothing",
+        more="Sends no torque.",
+        examples=("my_arm.yaml", "planar2 --seconds 5"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
-    text = (
-        "test the arm and its drives before a motion, and write the ticket that `run` asks for (exit code 3: refused)"
+    sub = verbs.add(
+        "preflight",
+        _check,
+        "test arm and drives before a motion; writes a ticket",
+        more="`ident run` asks for the ticket (exit code 3: refused).",
+        former="check",
+        examples=("my_arm.yaml", "planar2 motion/motion.json --confirm planar2", "my_arm.yaml --home"),
     )
-    sub = verbs.add("preflight", _check, text, former="check")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover` instead of a motion")
@@ -322,7 +332,12 @@ def add(verbs: VerbList) -> None:
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
     add_dry_run(sub)
     add_lease(sub, confirm=False)
-    sub = verbs.add("run", _run, "move the arm along a motion and record it")
+    sub = verbs.add(
+        "run",
+        _run,
+        "move the arm along a motion and record it",
+        examples=("my_arm.yaml --hold-to-run", "planar2", "planar2 motion/motion.json --speed 0.5 --until 0.05"),
+    )
     _motion(sub)
     sub.add_argument(
         "--speed", type=speed, metavar="SHARE", help="of the motion's own speed (default: 1, with --hold-to-run 0.2)"
@@ -346,19 +361,27 @@ def add(verbs: VerbList) -> None:
     _motion(sub)
     sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
     sub.add_argument("--speed", type=speed, default=SLOW, metavar="SHARE", help="of the motion's own speed")
-    for name, text in (
-        ("stop", "stop the arm, or every arm, under control"),
-        ("pause", "pause the motion"),
-        ("resume", "resume the motion"),
-        ("finish", "end the motion early: the arm returns to where the run began"),
-        ("supported", "confirm that an arm held after a stop is supported; it is then lowered"),
+    for name, text, more in (
+        ("stop", "stop the arm, or every arm, under control", "It needs no lease and no ticket, and always works."),
+        ("pause", "pause the motion", "The arm stands, with torque."),
+        ("resume", "resume the motion", ""),
+        ("finish", "end the motion early, in order", "The arm returns to where the run began."),
+        ("supported", "confirm that a held arm is supported", "It is held after a stop, and then lowered."),
     ):
-        sub = verbs.add(name, _stop if name == "stop" else _ask, text)
+        examples = ("", "planar2") if name == "stop" else ("planar2", "my_arm.yaml")
+        sub = verbs.add(name, _stop if name == "stop" else _ask, text, more=more, examples=examples)
         sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
         if name == "supported":
             sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees the arm")
         sub.set_defaults(asks=name)
-    sub = verbs.add("acknowledge", _ack, "acknowledge an active fault by its name", former="ack")
+    sub = verbs.add(
+        "acknowledge",
+        _ack,
+        "acknowledge an active fault by its name",
+        more="When you know its cause; `ident recover` lists active faults.",
+        former="ack",
+        examples=("planar2 following_error", "my_arm.yaml drive_fault --by Ann"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("fault", metavar="FAULT")
     add_by(sub)

@@ -30,6 +30,19 @@ Answer = tuple[int, str, dict[str, Any]]
 """Exit code; text for a person, with its last line break; JSON values for a program."""
 
 
+_STYLES = {"error": "1;31", "heading": "1", "next": "36"}
+
+
+def styled(stream: TextIO | None, text: str, style: str) -> str:
+    """Return text in the style `error`, `heading` or `next` where the stream is a terminal that shows colours.
+
+    They are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
+    """
+    if stream is None or not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
+
+
 def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:
     """Print a verb's answer as text, or with `--json` as one JSON object."""
     if arguments.json:

@@ -44,7 +44,13 @@ _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 def _add_recovery(verbs: VerbList) -> None:
     """Register `home`, `set-home` and `recover`."""
-    sub = verbs.add("home", _home, "move the arm home, at a tenth of its velocity limits at most")
+    sub = verbs.add(
+        "home",
+        _home,
+        "move the arm home, slowly",
+        more="At a tenth of its velocity limits at most.",
+        examples=("planar2", "my_arm.yaml --dry-run"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
     sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
@@ -52,10 +58,13 @@ def _add_recovery(verbs: VerbList) -> None:
     add_can_log(sub)
     add_dry_run(sub)
     add_lease(sub, confirm=False)
-    text = (
-        "define the posture in which the arm stands as its home: sets the zero of incremental encoders, moves nothing"
+    sub = verbs.add(
+        "set-home",
+        _home,
+        "define the arm's present posture as its home",
+        more="Sets the zero of incremental encoders, and moves nothing.",
+        examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"),
     )
-    sub = verbs.add("set-home", _home, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
     add_lease(sub, confirm=False)
@@ -63,7 +72,9 @@ def _add_recovery(verbs: VerbList) -> None:
     sub = verbs.add(
         "recover",
         _recover,
-        "show what must be done after a fault or a stop; reset drives (exit code 3: not usable yet)",
+        "show what to do after a fault or a stop; reset drives",
+        more="Exit code 3: the arm is not usable yet.",
+        examples=("planar2", "my_arm.yaml --leave-limit"),
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
@@ -241,7 +252,11 @@ EXIT_CODES: Final = {
 def _add_reidentify(verbs: VerbList) -> None:
     """Register `reidentify`."""
     sub = verbs.add(
-        "reidentify", _reidentify, "preflight, run, identify, compare with the accepted set (exit code 3: changed)"
+        "reidentify",
+        _reidentify,
+        "identify again, and compare with the accepted set",
+        more="Preflight, run, identification, comparison in one (exit code 3: the arm has changed).",
+        examples=("planar2", "my_arm.yaml motion/motion.json --confirm my_arm"),
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
@@ -291,7 +306,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     }
     lines = f"{text}{verdict.words}\n"
     if verdict.state == "changed":
-        lines += "a drift alarm is open until `ident alarm acknowledge`, or `ident accept` of another set\n"
+        lines += "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
     return EXIT_CODES[verdict.state], lines, answer
 
 

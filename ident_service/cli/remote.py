@@ -14,7 +14,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import VerbList, columns_files, count
+from ident_service.cli.arguments import LOCAL_ONLY, VerbList, columns_files, count
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -39,6 +39,7 @@ Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
+_JOB = "20261124T101500Z-planar2-7b2f10"  # of the examples
 _MOVE = (
     "check",
     "run",
@@ -49,16 +50,25 @@ _MOVE = (
 
 
 def add(verbs: VerbList) -> None:
-    """Register `jobs list`, `jobs show`, `jobs watch` and `jobs cancel`."""
-    jobs = verbs.group("jobs", "jobs of a daemon; without --server, of the one that serves the state folder")
-    sub = jobs.add("list", _with_client(_list), "list jobs, the newest first")
+    """Register `jobs`, `jobs show`, `jobs watch` and `jobs cancel`."""
+    listed = _with_client(_list)
+    jobs = verbs.group(
+        "jobs",
+        "list a daemon's jobs; show, watch, cancel one",
+        listed,
+        more="Without --server, of the daemon that serves the state folder; the newest first.",
+        examples=("", "--most 50", "--server http://127.0.0.1:8470"),
+    )
+    jobs.parser.add_argument("--most", type=count, default=20, metavar="N", help="of the newest (default: 20)")
+    sub = jobs.add("list", listed, "list jobs, the newest first", hidden=True, word="jobs")
     sub.add_argument("--most", type=count, default=20, metavar="N")
-    for name, verb, text in (
-        ("show", _show, "show one job and its result"),
-        ("watch", _watch, "wait for a job to end and return its exit code"),
-        ("cancel", _cancel, "cancel a job; a motion ends with a controlled stop"),
+    for name, verb, text, more in (
+        ("show", _show, "show one job and its result", ""),
+        ("watch", _watch, "wait for a job to end", "Returns its exit code."),
+        ("cancel", _cancel, "cancel a job", "A motion ends with a controlled stop."),
     ):
-        sub = jobs.add(name, _with_client(verb), text)
+        examples = (_JOB, f"{_JOB} --server http://robot:8470")
+        sub = jobs.add(name, _with_client(verb), text, more=more, examples=examples)
         sub.add_argument("job", metavar="ID")
 
 
@@ -97,7 +107,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     """Return the verb as a function that opens and closes its own connection."""
 
     def connected(arguments: argparse.Namespace) -> Answer:
-        with closing(_client(arguments)) as client:
+        with closing(connection(arguments)) as client:
             try:
                 return verb(client, arguments)
             except AccessRefused as error:
@@ -107,7 +117,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
                 given = "$IDENT_TOKEN" if os.environ.get("IDENT_TOKEN") else str(state_folder(arguments) / "token")
                 raise AccessRefused(
                     f"{client.url}: the token from {given} does not count there: it was revoked, or is of another"
-                    " daemon; `ident token add NAME --role operator` makes one at the daemon's machine, and"
+                    " daemon; `ident tokens add NAME --role operator` makes one at the daemon's machine, and"
                     " IDENT_TOKEN=... gives it to this command"
                 ) from None
 
@@ -289,33 +299,15 @@ REMOTE: dict[str, Verb] = {
     **dict.fromkeys(("pause", "resume", "finish"), _ask),
     "supported": _supported,
     "acknowledge": _ack,
-    "jobs list": _list,
+    "jobs": _list,
     "jobs show": _show,
     "jobs watch": _watch,
     "jobs cancel": _cancel,
 }
 
 
-LOCAL_ONLY: dict[str, str] = {
-    "serve": "it is the daemon",
-    "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
-    **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
-    "emulate": "it is drives on a bus of this machine, until they are switched off",
-    "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
-    "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
-    "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
-    **dict.fromkeys(
-        ("bus import", "bus store", "bus restore"), "it changes what drives keep; it is an act at the arm's computer"
-    ),
-    "bus report": "it writes a file beside you; log in where the daemon runs",
-    **dict.fromkeys(("backup", "restore"), "it is done at the daemon's machine, in its state folder"),
-    "token add": "whoever got hold of an operator's token could make others that outlive it; "
-    "it is done at the daemon's machine, in its state folder",
-}
-"""Verbs that no daemon does, each with the reason."""
-
 # Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
-_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns"})
+_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind"})
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
@@ -327,7 +319,7 @@ _CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
     "supported": frozenset({"arm", "confirm"}),
     "acknowledge": frozenset({"arm", "fault"}),
-    "jobs list": frozenset({"most"}),
+    "jobs": frozenset({"most"}),
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
 }
 
@@ -412,7 +404,12 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     return str(motion)
 
 
-def _client(arguments: argparse.Namespace) -> IdentClient:
+def connection(arguments: argparse.Namespace) -> IdentClient:
+    """Connect to the daemon that `--server` names, or to that which serves the state folder.
+
+    Raises:
+        UsageError: there is none, or no token for it.
+    """
     from ident_service.client import IdentClient
     from ident_service.registry.state_folder import access_refusal
     from ident_service.registry.tokens import TOKEN_FILE, read_token

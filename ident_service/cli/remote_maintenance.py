@@ -109,25 +109,25 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 VERBS: dict[str, Callable[[IdentClient, argparse.Namespace], Answer]] = {
-    "schedule add": _add,
-    "schedule list": _list,
-    "schedule remove": _remove,
-    "schedule enable": _enabled(True),
-    "schedule disable": _enabled(False),
+    "schedules add": _add,
+    "schedules": _list,
+    "schedules remove": _remove,
+    "schedules enable": _enabled(True),
+    "schedules disable": _enabled(False),
     "maintenance": _maintenance,
-    "due list": _due,
+    "due": _due,
     "due dismiss": _dismiss,
-    "alarm list": _alarms,
-    "alarm acknowledge": _ack,
+    "alarms": _alarms,
+    "alarms acknowledge": _ack,
     "reidentify": _reidentify,
 }
 _NUMBER = frozenset({"number"})
 CARRIED: dict[str, frozenset[str]] = {
-    "schedule add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
-    **dict.fromkeys(("schedule list", "due list", "alarm list"), frozenset({"arm"})),
-    **dict.fromkeys(("schedule remove", "schedule enable", "schedule disable"), _NUMBER),
+    "schedules add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
+    **dict.fromkeys(("schedules", "due", "alarms"), frozenset({"arm"})),
+    **dict.fromkeys(("schedules remove", "schedules enable", "schedules disable"), _NUMBER),
     "maintenance": frozenset({"arm", "what", "note"}),
-    **dict.fromkeys(("due dismiss", "alarm acknowledge"), _NUMBER | {"note"}),
+    **dict.fromkeys(("due dismiss", "alarms acknowledge"), _NUMBER | {"note"}),
     "reidentify": frozenset({"arm", "motion", "confirm"}),
 }
 """Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm import Arm
-from drivers.clock import Clock
+from drivers.clock import Clock, utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
@@ -23,6 +23,7 @@ from ident_service.estimation.least_squares import torque_error
 from ident_service.estimation.plausibility import remarks_on_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
+from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
@@ -170,12 +171,13 @@ def record_motion(
         "excitation.json": motion.to_json().encode(),
     }
     metadata = {"arm": model.config.name, "arm_sha256": model.config.sha256, "motion": motion.name}
-    description = urdf_text(model, model.prior)
+    description = urdf_text(model, model.prior, visible_bodies(model))
+    metadata["clock"] = "virtual" if arm.clock.lock_step else "monotonic"
     recorder = RecorderProcess(
         path,
         model.chain.names,
         description,
-        arm.clock.utc_offset_ns,
+        utc_offset_of_recording_ns(arm.clock),
         attachments,
         metadata,
         lock_step=arm.clock.lock_step,

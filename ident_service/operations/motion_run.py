@@ -29,6 +29,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
+from drivers.clock import utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import (
     ArmError,
@@ -43,6 +44,7 @@ from ident_service.errors import (
 from ident_service.estimation.target import Target
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath
+from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.urdf import urdf_text
@@ -452,13 +454,14 @@ def run_motion(
     if excitation is not None:
         attachments["excitation.json"] = excitation.encode()
     metadata = {"arm": config.name, "arm_sha256": config.sha256, "motion": name, "speed": repr(speed)}
+    metadata["clock"] = "virtual" if clock.lock_step else "monotonic"
     recording = folder / "run.mcap"
-    description = urdf_text(model, model.prior)
+    description = urdf_text(model, model.prior, visible_bodies(model))
     recorder = RecorderProcess(
         recording,
         model.chain.names,
         description,
-        clock.utc_offset_ns,
+        utc_offset_of_recording_ns(clock),
         attachments,
         metadata,
         lock_step=clock.lock_step,
