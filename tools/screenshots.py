@@ -1,23 +1,29 @@
 """Make the pictures of the documents: the daemon's pages in a browser, with a simulated arm that has a history.
 
-`python tools/screenshots.py [FOLDER]` (`make screenshots`) needs the system's Chromium, or `CHROMIUM` with its path. It
-starts a daemon on a state folder of its own, commissions a simulated arm of seven joints there, makes its joints drier,
-enters maintenance, has it re-identified, and lets a second arm fail in the middle of a run. Then it writes one
-PNG per view. With `--keep STATE` the state folder stays, and is used again if it is there: the pictures alone take
-half a minute, the history three.
+`make screenshots` (`python tools/screenshots.py [--out FOLDER] [--keep STATE]`) needs the system's Chromium, or
+`CHROMIUM` with its path. It starts a daemon on a state folder of its own, commissions a simulated arm of seven joints,
+has it re-identified with more friction in one joint, enters maintenance, and lets a second arm fail in the middle of a
+run. Then it writes one PNG per view. With `--keep` the state folder stays, and its history is used again: the pictures
+alone take a minute, the history three.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ident_service.client.client import IdentClient
+from playwright.sync_api import Page, sync_playwright
+
+from ident_service.client.client import IdentClient, RemoteMotion
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import IdentError
@@ -101,7 +107,7 @@ def drier() -> str:
     return json.dumps(values)
 
 
-def _move(motion) -> str:  # type: ignore[no-untyped-def]
+def _move(motion: RemoteMotion) -> str:
     """Keep the lease of a motion to its end, whatever that is; return its run."""
     try:
         with motion:
@@ -122,3 +128,96 @@ def reidentify(client: IdentClient) -> None:
             client.post(f"/api/v1/reidentifications/{begun['id']}/lease")
         time.sleep(0.3)
     print(f"re-identification: {seen['state']}", file=sys.stderr)
+
+
+def views(client: IdentClient) -> dict[str, str]:
+    """Return the address of each view that is only looked at, by its name."""
+    runs = {(run["arm"], run["kind"]): run["id"] for run in reversed(list(client.runs()))}
+    faulted = next(run["id"] for run in client.runs(arm=FAILING) if run["kind"] == "motion" and run["ending"] != "done")
+    again = client.get("/api/v1/reidentifications")[0]["id"]
+    check = next(job.id for job in client.jobs(arm=ARM) if job.kind == "check")
+    return {
+        "arms": "/",
+        "arm": f"/arms/{ARM}",
+        "job": f"/jobs/{check}",
+        "run": f"/runs/{faulted}",
+        "runs": "/runs",
+        "reidentification": f"/reidentifications/{again}",
+        "maintenance": f"/arms/{ARM}/maintenance",
+        "report": f"/api/v1/runs/{runs[ARM, 'identification']}/report.html",
+    }
+
+
+def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
+    """Write a picture of every view."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, timezone_id="UTC", color_scheme="light")
+        page.set_default_timeout(120_000)
+        page.goto(url)
+        page.get_by_label("Token").fill(token)
+        page.get_by_role("button", name="Log in").click()
+        page.get_by_role("heading", name="Arms", level=1).wait_for()
+        for name, address in views(client).items():
+            page.goto(url + address)
+            if page.locator("#series").count():
+                page.locator("#series .uplot canvas").first.wait_for()
+                page.locator("#motion").scroll_into_view_if_needed()
+                page.evaluate("document.getElementById('motion').scrollIntoView()")
+            page.wait_for_load_state("networkidle")
+            save(page, name, out)
+        _move(client.arm(ARM).check(confirm=ARM))
+        page.goto(f"{url}/arms/{ARM}")
+        page.locator("#step-run").get_by_role("button", name="Run", exact=True).click()
+        page.get_by_role("heading", name=f"Run {ARM}?").wait_for()
+        page.wait_for_load_state("networkidle")
+        save(page, "confirm", out)
+        page.get_by_label("Type the arm's name").fill(ARM)
+        page.keyboard.press("Enter")
+        page.locator("#live .uplot canvas").first.wait_for()
+        page.wait_for_function("series.time.length && series.time[series.time.length - 1] > 14")
+        page.evaluate("document.getElementById('live').scrollIntoView()")
+        save(page, "live", out)
+        page.keyboard.press("Escape")
+        page.get_by_role("link", name=f"Back to {ARM}").wait_for()
+        browser.close()
+
+
+def save(page: Page, name: str, out: Path) -> None:
+    """Write what the window shows as a PNG that a document can carry.
+
+    Raises:
+        SystemExit: it is too large for that.
+    """
+    path = out / f"page-{name}.png"
+    page.screenshot(path=path, animations="disabled")
+    size = path.stat().st_size
+    print(f"{path.name}: {size / 1e3:.0f} kB", file=sys.stderr)
+    if size > MOST_BYTES:
+        raise SystemExit(f"{path}: {size} bytes, {MOST_BYTES} at most; show less in that view")
+
+
+def chromium() -> str:
+    """Return the browser's path."""
+    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, _CHROMIUM)), None)
+    if found is None:
+        raise SystemExit("install the system's package chromium, or set CHROMIUM to its path")
+    return found
+
+
+def main() -> None:
+    """Make the history, then the pictures."""
+    words = argparse.ArgumentParser(description="pictures of the daemon's pages")
+    words.add_argument("--out", type=Path, default=IMAGES, help="folder of the pictures")
+    words.add_argument("--keep", type=Path, help="state folder, made where it is missing")
+    given = words.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="ident-pictures-") as folder:
+        state = (given.keep or Path(folder) / "state").resolve()
+        with served(state) as client:
+            history(client, state)
+            shoot(client, (state / "serve.url").read_text().strip(), (state / "token").read_text().strip(), given.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -19,8 +19,8 @@ from ident_service.daemon.web.render import page
 from ident_service.daemon.web.run_pages import identified_set, run_facts
 from ident_service.errors import IdentError, UnknownId
 from ident_service.motion.ticket import ticket_from_json
-from ident_service.registry.arms import known_arm
 from ident_service.registry import jobs as rows
+from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Row
 from ident_service.registry.runs import EXPORTS
 from ident_service.registry.tokens import Access

@@ -23,12 +23,11 @@ from ident_service import __version__
 from ident_service.registry.tokens import Access
 from ident_service.results.plots import number
 
+_SCRIPTS: Final = ("page", "plots", "live", "again", "upload", "news", "series", "table", "trends", "new")
 STATIC: Final = {
     "page.css": "text/css",
-    **dict.fromkeys(
-        ("page.js", "plots.js", "live.js", "again.js", "upload.js", "news.js", "series.js", "table.js", "trends.js", "new.js"),
-        "text/javascript",
-    ),
+    "icon.svg": "image/svg+xml",
+    **{f"{name}.js": "text/javascript" for name in _SCRIPTS},
 }
 PLOTS: Final = {"uPlot.iife.min.js": "text/javascript", "uPlot.min.css": "text/css"}
 """Vendored files that pages with plots load, beside those of `STATIC`."""
@@ -117,7 +116,9 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(when=when, lasting=_duration_text, short=_short, figure=_figure, share=_share, brief=_brief)
+    environment.filters.update(
+        when=when, lasting=_duration_text, short=_short, figure=_figure, share=_share, brief=_brief
+    )
     return environment
 
 
