@@ -31,7 +31,8 @@ from ident_service.errors import IdentError
 IMAGES = Path(__file__).resolve().parents[1] / "docs" / "images"
 ARM, FAILING, RECORDED = "bench7", "bench2", "archive2"
 MOST_BYTES = 150_000
-WIDTH, HEIGHT = 1280, 860
+WIDTH, HEIGHT = 1200, 750
+_SEEN = 12.0  # s of the motion, in the picture of it
 _CHROMIUM = ("chromium", "chromium-browser", "google-chrome")
 _BENCH = "extends: wam7_sim\nname: bench7\ndescription: seven-axis arm on the test bench\n"
 # A quarter of the cycles of a real arm: the picture is the same.
@@ -162,7 +163,6 @@ def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
             page.goto(url + address)
             if page.locator("#series").count():
                 page.locator("#series .uplot canvas").first.wait_for()
-                page.locator("#motion").scroll_into_view_if_needed()
                 page.evaluate("document.getElementById('motion').scrollIntoView()")
             page.wait_for_load_state("networkidle")
             save(page, name, out)
@@ -175,7 +175,8 @@ def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
         page.get_by_label("Type the arm's name").fill(ARM)
         page.keyboard.press("Enter")
         page.locator("#live .uplot canvas").first.wait_for()
-        page.wait_for_function("series.time.length && series.time[series.time.length - 1] > 14")
+        while page.evaluate("series.time.at(-1) ?? 0") < _SEEN:
+            page.wait_for_timeout(200)
         page.evaluate("document.getElementById('live').scrollIntoView()")
         save(page, "live", out)
         page.keyboard.press("Escape")
