@@ -20,7 +20,7 @@ from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import KeyPath, Tree, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
-from ident_service.errors import ConfigError, DriverError, Problem, UsageError
+from ident_service.errors import ConfigError, DriverError, Problem, UsageError, plain_mistake
 
 _ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
@@ -240,7 +240,9 @@ def arm_from_json(path: Path) -> ArmConfig:
     try:
         return ArmConfig.model_validate_json(data)
     except ValidationError as error:
-        places = [(".".join(map(str, mistake["loc"])), mistake["msg"]) for mistake in error.errors(include_url=False)]
+        places = [
+            (".".join(map(str, mistake["loc"])), plain_mistake(mistake)) for mistake in error.errors(include_url=False)
+        ]
         raise ConfigError([Problem(path, 1, 1, f"{where}: {said}") for where, said in places[:10]]) from None
 
 
@@ -303,7 +305,7 @@ def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Proble
     seen = set()
     for mistake in error.errors(include_url=False):
         where = _where(mistake["loc"], tree.value)
-        message = mistake["msg"].removeprefix("Value error, ")
+        message = plain_mistake(mistake)
         if mistake["type"] == "extra_forbidden":
             message = f"unknown key {where[-1]!r}"
         elif mistake["type"] == "tuple_type":
