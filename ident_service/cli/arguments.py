@@ -341,6 +341,26 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     return (of_all[0] if of_all else None), of_one
 
 
+def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
+    """Return the file of the known payload of each recording.
+
+    Args:
+        given: values of `--payload`, `RECORDING=FILE`.
+
+    Raises:
+        UsageError: no recording or no file in one, or two for one recording.
+    """
+    found: dict[Path, Path] = {}
+    for words in given:
+        recording, equals, file = words.partition("=")
+        if not (recording and equals and file):
+            raise UsageError(f"--payload {words}: write RECORDING=FILE, the recording and the file of its known load")
+        if Path(recording) in found:
+            raise UsageError(f"--payload {words}: {recording} has a payload already")
+        found[Path(recording)] = Path(file)
+    return found
+
+
 def seed(text: str) -> int:
     """Parse a whole number, 0 or more."""
     if not text.isdigit():

@@ -18,6 +18,7 @@ from ident_service.cli.arguments import (
     columns_files,
     delay,
     did_you_mean,
+    payload_files_of,
     replicates,
     seed,
     weight,
@@ -79,6 +80,18 @@ def _add_commission(verbs: VerbList) -> None:
         default=[],
         metavar="[RECORDING=]FILE",
         help="YAML file with column names and units, for all recordings or one; may be repeated",
+    )
+    sub.add_argument(
+        "--payload",
+        action="append",
+        default=[],
+        metavar="RECORDING=FILE",
+        help="YAML file with mass and center_of_mass of the known load in a recording; may be repeated",
+    )
+    sub.add_argument(
+        "--torque-constants",
+        action="store_true",
+        help="also identify every motor's torque constant; needs a recording with a known load (--payload)",
     )
     sub.add_argument(
         "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
@@ -182,6 +195,8 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         validation=tuple(arguments.validate),
         columns=columns,
         columns_of=columns_of,
+        payloads=payload_files_of(arguments.payload),
+        torque_constants=arguments.torque_constants,
         cut_standstill=arguments.cut_standstill,
         method=arguments.method,
         set_name=arguments.feasible_set,
@@ -213,7 +228,7 @@ def _exit_code(document: dict[str, Any]) -> int:
 def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Sequence[str]) -> dict[str, Any]:
     from ident_service.results.assessment import assess_estimate
     from ident_service.results.parameter_file import convex_document
-    from ident_service.results.summary import how_fitted, implausible_links
+    from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
     own = estimate.candidates[estimate.chosen]
     found = assess_estimate(estimate, unusable, warnings)
@@ -241,6 +256,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Se
             for candidate in estimate.candidates
         ],
         "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+        **torque_constants_document(estimate),
         **convex_document(estimate),
     }
 

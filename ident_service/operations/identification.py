@@ -11,6 +11,7 @@ import numpy as np
 
 from ident_service.config.arm import ArmConfig, Method
 from ident_service.config.load import config_error, folder_of, load_arm, load_recording_format
+from ident_service.config.payload import Payload
 from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
@@ -29,6 +30,7 @@ from ident_service.estimation.plausibility import (
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
 from ident_service.operations.recordings import (
+    known_payloads,
     open_together,
     own_formats,
     recording_quality,
@@ -55,6 +57,8 @@ class Request:
         validation: to judge on; likewise.
         columns: a YAML file with the keys of the arm's `recording` section, instead of it.
         columns_of: such a file for one recording each, of those above.
+        payloads: a YAML file with the keys of a description's section `payload` for recordings with a known load.
+        torque_constants: whether to identify those of the motors jointly with the parameters.
         cut_standstill: whether to leave out standstill at the ends of every recording.
         method: estimator, the arm's when None.
         set_name: feasible set, the arm's when None.
@@ -73,6 +77,8 @@ class Request:
     validation: tuple[Path, ...] = ()
     columns: Path | None = None
     columns_of: Mapping[Path, Path] = field(default_factory=dict)
+    payloads: Mapping[Path, Path] = field(default_factory=dict)
+    torque_constants: bool = False
     cut_standstill: bool = False
     method: Method | None = None
     set_name: SetName | None = None
@@ -138,7 +144,8 @@ def identify_files(
         untrimmed = config.recording.model_copy(update={"trim": (0.0, 0.0)})
         model = arm_model(config.model_copy(update={"recording": untrimmed}))
     step("reading recordings", 0.0)
-    opened = open_together(paths, model, forms)
+    loads = known_payloads(request.payloads, paths, model)
+    opened = open_together(paths, model, forms, payloads=loads)
     recordings = opened.recordings[: len(request.recordings)]
     validation = opened.recordings[len(request.recordings) :]
     for recording in (*recordings, *validation):
@@ -164,6 +171,7 @@ def identify_files(
             solver=request.solver,
             again=request.second_opinion,
             step=lambda words, share: step(words, 0.2 + share * (estimated - 0.2)),
+            torque_constants=request.torque_constants,
         )
     except CustomError as error:
         raise config_error(request.arm, CUSTOM, str(error)) from error
@@ -180,6 +188,7 @@ def identify_files(
     more: dict[str, Any] = {
         "recording_quality": [_quality_document(recording, seen) for recording, seen in found],
         "warnings": list(warnings),
+        **_known_loads(loads),
     }
     if request.replicates:
         step("bootstrap", estimated)
@@ -271,6 +280,13 @@ def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
             {"joint": joint.name, "saturated": joint.saturated, "standstill": joint.standstill} for joint in seen.joints
         ],
     }
+
+
+def _known_loads(loads: Mapping[Path, Payload]) -> dict[str, Any]:
+    if not loads:
+        return {}
+    said = [{"recording": path.name, **load.model_dump(mode="json")} for path, load in loads.items()]
+    return {"known_payloads": said}
 
 
 def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:

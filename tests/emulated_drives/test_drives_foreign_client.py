@@ -11,11 +11,11 @@ import can
 import canopen
 import pytest
 from canopen.profiles.p402 import BaseNode402
-from pucks_bench import EDS, pucks_config
+from drives_bench import EDS, drives_config
 
 from sim_backend.emulator.process import Emulated, emulate
 
-CHANNEL = "pucks-foreign"
+CHANNEL = "drives-foreign"
 
 
 class Bus:
@@ -36,7 +36,7 @@ class Bus:
 
 @pytest.fixture
 def bus(tmp_path: Path) -> Iterator[Bus]:
-    config = pucks_config(tmp_path, buses=[{"interface": "virtual", "channel": CHANNEL}])
+    config = drives_config(tmp_path, buses=[{"interface": "virtual", "channel": CHANNEL}])
     end = threading.Event()
     done: list[Emulated] = []
     network = canopen.Network()
@@ -135,7 +135,7 @@ def test_heartbeat_emergency_and_fault_reset(bus: Bus) -> None:
 
 
 def test_an_unknown_interface_is_said_so(tmp_path: Path) -> None:
-    config = pucks_config(tmp_path, buses=[{"interface": "no_such_interface"}])
+    config = drives_config(tmp_path, buses=[{"interface": "no_such_interface"}])
     with pytest.raises(OSError, match="bus 0: no_such_interface can0"):
         emulate(config, seconds=0.01)
 
@@ -146,8 +146,8 @@ def test_frames_are_of_the_kind_they_were_sent_as() -> None:
     from ident_service.config.can_bus import CanBus
     from sim_backend.emulator.process import PythonCanBuses
 
-    with can.Bus(interface="virtual", channel="pucks-kinds") as other:
-        station = PythonCanBuses([CanBus(interface="virtual", channel="pucks-kinds")])
+    with can.Bus(interface="virtual", channel="drives-kinds") as other:
+        station = PythonCanBuses([CanBus(interface="virtual", channel="drives-kinds")])
         station.send([(0, Frame(0x123, b"\x01")), (0, Frame(0x040, bytes(8), error=True))])
         first, second = other.recv(1.0), other.recv(1.0)
         assert first is not None

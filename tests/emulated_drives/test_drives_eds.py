@@ -8,7 +8,7 @@ import struct
 import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
-from pucks_bench import EDS
+from drives_bench import EDS
 
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError

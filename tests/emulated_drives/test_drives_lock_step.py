@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pucks_bench import MS, Host, pucks_config
+from drives_bench import MS, Host, drives_config
 
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import open_links
@@ -50,7 +50,7 @@ def test_the_lowest_identifier_wins_whoever_was_first(enabled: Host) -> None:
 
 
 def test_a_slower_bus_is_slower(tmp_path: Path) -> None:
-    host = Host.on(pucks_config(tmp_path, buses=[{"interface": "lock_step", "bitrate": 500_000}]))
+    host = Host.on(drives_config(tmp_path, buses=[{"interface": "lock_step", "bitrate": 500_000}]))
     begun = host.now
     host.read(1, 0x1000, 0, "I")
     assert host.now - begun == 2 * 2000 * bits(8)
@@ -101,19 +101,19 @@ def test_positions_are_those_of_the_sync(enabled: Host) -> None:
 def test_runs_repeat_to_the_bit(tmp_path: Path) -> None:
     runs = []
     for _ in range(2):
-        host = Host.on(pucks_config(tmp_path, emulation={"torque_noise": 0.2, "seed": 4}))
+        host = Host.on(drives_config(tmp_path, emulation={"torque_noise": 0.2, "seed": 4}))
         host.configure(deadline=10)
         host.enable()
         runs.append([(host.cycle(200, -100), host.now) for _ in range(100)])
     assert runs[0] == runs[1]
-    other = Host.on(pucks_config(tmp_path, emulation={"torque_noise": 0.2, "seed": 5}))
+    other = Host.on(drives_config(tmp_path, emulation={"torque_noise": 0.2, "seed": 5}))
     other.configure(deadline=10)
     other.enable()
     assert [(other.cycle(200, -100), other.now) for _ in range(100)] != runs[0]
 
 
 def test_two_buses_have_one_arm_and_one_clock(tmp_path: Path) -> None:
-    links = open_links(pucks_config(tmp_path, buses=TWO, drives=SPREAD))
+    links = open_links(drives_config(tmp_path, buses=TWO, drives=SPREAD))
     hosts = [Host(link, (1,)) for link in links]
     assert hosts[0].arm is hosts[1].arm
     assert links[0].clock is links[1].clock
@@ -137,7 +137,7 @@ def test_two_buses_have_one_arm_and_one_clock(tmp_path: Path) -> None:
 
 
 def test_each_opening_builds_the_arm_anew_unless_it_stands(tmp_path: Path) -> None:
-    config = pucks_config(tmp_path)
+    config = drives_config(tmp_path)
     first, second = open_links(config)[0], open_links(config)[0]
     assert Host(first).arm is not Host(second).arm
     clock = VirtualClock(5 * MS)
@@ -160,18 +160,18 @@ def test_each_opening_builds_the_arm_anew_unless_it_stands(tmp_path: Path) -> No
 def test_interfaces_do_not_mix(tmp_path: Path) -> None:
     buses = [{"interface": "lock_step"}, {"interface": "virtual"}]
     with pytest.raises(DriverError, match="either all buses are 'lock_step' or none"):
-        open_links(pucks_config(tmp_path, buses=buses, drives=SPREAD))
+        open_links(drives_config(tmp_path, buses=buses, drives=SPREAD))
 
 
 def test_a_bus_of_another_arm_cannot_be_joined(tmp_path: Path) -> None:
     from sim_backend.emulator.lock_step import from_config
 
     with pytest.raises(DriverError, match="bus 1 was opened before bus 0"):
-        from_config(pucks_config(tmp_path, buses=TWO, drives=SPREAD), 1)
+        from_config(drives_config(tmp_path, buses=TWO, drives=SPREAD), 1)
 
 
 def test_a_data_sheet_that_cannot_be_read_is_refused(tmp_path: Path) -> None:
     broken = tmp_path / "broken.eds"
     broken.write_text("[DeviceInfo]\n[DummyUsage]\nDummy0003=1\n", encoding="utf-8")
     with pytest.raises(DriverError, match="not an EDS"):
-        open_links(pucks_config(tmp_path, eds=str(broken)))
+        open_links(drives_config(tmp_path, eds=str(broken)))

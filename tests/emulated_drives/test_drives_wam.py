@@ -1,4 +1,4 @@
-"""The WAM's seven drives, two differentials and all, on emulated pucks: held against gravity by whole per mille."""
+"""The WAM's seven drives, two differentials and all, emulated: held against gravity by whole per mille."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pucks_bench import CONFIGS, Host, pucks_config
-from test_pucks_body import WAM
+from drives_bench import CONFIGS, Host, drives_config
+from test_drives_body import WAM
 
 from drivers.can.can_link import open_links
 
@@ -20,7 +20,7 @@ def test_the_wam_stands_under_its_own_gravity_torque(tmp_path: Path) -> None:
     gears = {"ratios": list(WAM.ratios), "coupling": [list(row) for row in WAM.coupling or ()], "drive_terms": "joints"}
     drives = [{"node": k, "rated_torque": 1.0, "max_torque": 8.0, "max_speed": 6000.0} for k in range(1, 8)]
     truth = {"truth": str(CONFIGS / "wam7_truth.json")}
-    config = pucks_config(tmp_path, name="wam7.yaml", gears=gears, drives=drives, emulation=truth)
+    config = drives_config(tmp_path, name="wam7.yaml", gears=gears, drives=drives, emulation=truth)
     (link,) = open_links(config)
     host = Host(link, tuple(range(1, 8)))
     for node in host.nodes:

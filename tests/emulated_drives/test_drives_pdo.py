@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from pucks_bench import MS, Host
+from drives_bench import MS, Host
 
 WRONG_STATE, WRONG_VALUE = 0x08000022, 0x06090030
 

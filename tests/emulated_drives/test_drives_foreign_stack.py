@@ -17,12 +17,12 @@ from typing import Any
 import can
 import numpy as np
 import pytest
-from pucks_bench import EDS, GEARS, pucks_config
+from drives_bench import EDS, GEARS, drives_config
 
 from sim_backend.emulator.process import emulate
 
 STACK = Path(__file__).parents[1] / "foreign_stack"
-CHANNEL = "pucks-foreign-stack"
+CHANNEL = "drives-foreign-stack"
 NODE = shutil.which("node")
 
 pytestmark = [
@@ -74,7 +74,7 @@ def test_a_foreign_stack_configures_and_moves_an_emulated_drive(tmp_path: Path, 
     assert host.stdout is not None
     assert host.stdout.readline() == "ready\n"
     gears = GEARS | {"offsets": [0.3, -0.2]}
-    config = pucks_config(tmp_path, gears=gears, buses=[{"interface": "virtual", "channel": CHANNEL}])
+    config = drives_config(tmp_path, gears=gears, buses=[{"interface": "virtual", "channel": CHANNEL}])
     end = threading.Event()
     with can.Bus(interface="virtual", channel=CHANNEL) as bus:
         threads = [

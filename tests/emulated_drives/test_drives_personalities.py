@@ -6,7 +6,7 @@ import struct
 from pathlib import Path
 
 import pytest
-from pucks_bench import Host, pucks_config
+from drives_bench import Host, drives_config
 
 from drivers.can.can_frame import Frame
 from ident_service.config.arm import ArmConfig
@@ -39,7 +39,7 @@ class Still:
 
 
 def arm_of(folder: Path, *names: str, **driver: object) -> ArmConfig:
-    return with_sheets(pucks_config(folder, **driver), [str(SHEETS / name) for name in names])
+    return with_sheets(drives_config(folder, **driver), [str(SHEETS / name) for name in names])
 
 
 def host_of(config: ArmConfig) -> Host:
@@ -55,7 +55,7 @@ def answer(drive: CanopenDrive, request: bytes) -> bytes:
 def test_every_entry_of_a_file_is_there_and_no_other(file: Path, tmp_path: Path) -> None:
     text = file.read_text(encoding="latin-1")
     sheet = data_sheet(text)
-    driver = pucks_config(tmp_path).driver
+    driver = drives_config(tmp_path).driver
     assert isinstance(driver, CanopenDriver)
     motor = Motor(Still(), 0, counts=4096, scale=1.0, braking=1.0)
     drive = CanopenDrive(text, 5, motor, like=personality_of(text, driver.drives[0]))
@@ -152,12 +152,12 @@ def test_pdos_that_the_file_has_off_are_born_off(tmp_path: Path) -> None:
     assert "$NODEID+0x200" in text
     sheet.write_text(text.replace("$NODEID+0x200", "$NODEID+0x80000200"), encoding="latin-1")
     for file, on in ((SHEETS / E35, True), (sheet, False)):
-        drive = LockStepArm(with_sheets(pucks_config(tmp_path), [str(file)])).emulator.faces[0]
+        drive = LockStepArm(with_sheets(drives_config(tmp_path), [str(file)])).emulator.faces[0]
         assert drive.listens(0x201) is on
 
 
 def test_files_are_for_drives_of_canopen_and_must_be_there(tmp_path: Path) -> None:
-    config = pucks_config(tmp_path)
+    config = drives_config(tmp_path)
     with pytest.raises(UsageError, match="no such file"):
         with_sheets(config, ["none.eds"])
     with pytest.raises(UsageError, match="not CANopen's"):

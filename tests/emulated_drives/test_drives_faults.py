@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pucks_bench import MS, Host, pucks_config
+from drives_bench import MS, Host, drives_config
 
 from ident_service.config.simulation import FAULT_RULES, FaultKind
 from ident_service.errors import DriverError
-from sim_backend.emulator.faults import _NO_COUNTERPART, PUCK_FAULTS, DriveFault, parse_fault
+from sim_backend.emulator.faults import _NO_COUNTERPART, DRIVE_FAULTS, DriveFault, parse_fault
 from sim_backend.emulator.motor import Power
 
 NAMES = ("shoulder", "elbow")
@@ -31,9 +31,9 @@ def true_counts(host: Host) -> list[float]:
 
 def test_every_kind_of_the_simulated_arm_is_there_or_said_to_be_impossible() -> None:
     simulated = {kind.value for kind in FaultKind}
-    assert simulated == (simulated & set(PUCK_FAULTS)) | set(_NO_COUNTERPART)
-    for kind in simulated & set(PUCK_FAULTS):
-        rule, ours = FAULT_RULES[FaultKind(kind)], PUCK_FAULTS[kind]
+    assert simulated == (simulated & set(DRIVE_FAULTS)) | set(_NO_COUNTERPART)
+    for kind in simulated & set(DRIVE_FAULTS):
+        rule, ours = FAULT_RULES[FaultKind(kind)], DRIVE_FAULTS[kind]
         assert (rule.size is None, rule.of_joint) == (ours.size is None, ours.of_joint), kind
 
 
@@ -234,7 +234,7 @@ def test_faults_of_the_configuration_count_from_the_first_sync(tmp_path: Path) -
         {"kind": "lost_feedback", "joint": "elbow", "cycle": 5},
         {"kind": "drive_fault", "joint": "shoulder", "at": 0.02},
     ]
-    host = Host.on(pucks_config(tmp_path, emulation={"faults": faults}))
+    host = Host.on(drives_config(tmp_path, emulation={"faults": faults}))
     host.configure()
     host.listen(100)
     answers = [set(host.cycle()) for _ in range(30)]
@@ -245,7 +245,7 @@ def test_faults_of_the_configuration_count_from_the_first_sync(tmp_path: Path) -
 @pytest.mark.parametrize("fault", [{"kind": "nan_position", "at": 1.0}, {"kind": "clock_jump", "size": 1.0, "at": 0.0}])
 def test_faults_that_no_drive_can_have_are_refused(tmp_path: Path, fault: dict[str, object]) -> None:
     with pytest.raises(DriverError, match=r"driver\.emulation\.faults: "):
-        Host.on(pucks_config(tmp_path, emulation={"faults": [fault]}))
+        Host.on(drives_config(tmp_path, emulation={"faults": [fault]}))
 
 
 def test_a_fault_in_words() -> None:
@@ -288,4 +288,4 @@ def test_a_fault_that_nobody_understands(text: str, complaint: str) -> None:
 def test_the_document_lists_every_fault_as_it_is() -> None:
     text = (Path(__file__).parents[2] / "docs" / "fieldbus.md").read_text(encoding="utf-8")
     listed = dict(re.findall(r"^\| `(\w+)` \| (.*?) \| .*? \| (?:a drive, or all|the arm) \| ", text, re.MULTILINE))
-    assert listed == {kind: rule.does for kind, rule in PUCK_FAULTS.items()}
+    assert listed == {kind: rule.does for kind, rule in DRIVE_FAULTS.items()}

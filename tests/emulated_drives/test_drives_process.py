@@ -17,7 +17,7 @@ from pathlib import Path
 import can
 import pytest
 import yaml
-from pucks_bench import GEARS, pucks_config
+from drives_bench import GEARS, drives_config
 
 from ident_service.cli import USAGE, main
 from sim_backend.emulator.process import Emulated, emulate
@@ -79,8 +79,8 @@ class Master:
 
 
 def arm_file(folder: Path, port: int) -> Path:
-    pucks_config(folder)  # the file with the arm; only the bus is another one
-    path = folder / "pucks.yaml"
+    drives_config(folder)  # the file with the arm; only the bus is another one
+    path = folder / "drives.yaml"
     tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     tree["driver"]["buses"] = [multicast(port)]
     tree["driver"]["emulation"] = {
@@ -148,10 +148,10 @@ def test_a_process_of_its_own_outlives_its_host_and_stops_the_arm(tmp_path: Path
 
 
 def test_two_interfaces_are_served_at_once(tmp_path: Path) -> None:
-    names = [f"pucks-{os.getpid()}-{k}" for k in range(2)]
+    names = [f"drives-{os.getpid()}-{k}" for k in range(2)]
     drives = [{"node": 4, "bus": k, "rated_torque": 1.0, "max_torque": 5.0, "max_speed": 6000.0} for k in range(2)]
     buses = [{"interface": "virtual", "channel": name} for name in names]
-    config = pucks_config(tmp_path, gears=GEARS, buses=buses, drives=drives)
+    config = drives_config(tmp_path, gears=GEARS, buses=buses, drives=drives)
     end, done, lines = threading.Event(), [], ["state", "quit"]
     said: list[str] = []
     with can.Bus(interface="virtual", channel=names[0]) as one, can.Bus(interface="virtual", channel=names[1]) as two:
@@ -181,8 +181,8 @@ def test_two_interfaces_are_served_at_once(tmp_path: Path) -> None:
 def test_a_fault_and_an_interface_are_checked_before_anything_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pucks_config(tmp_path)
-    path = str(tmp_path / "pucks.yaml")
+    drives_config(tmp_path)
+    path = str(tmp_path / "drives.yaml")
     assert main(["emulate", path]) == USAGE
     assert "name an interface such as socketcan" in capsys.readouterr().err
     assert main(["emulate", str(arm_file(tmp_path, 1)), "--fault", "earthquake"]) == USAGE

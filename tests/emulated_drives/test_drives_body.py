@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from drives_bench import GEARS, MS, drives_config
 from hypothesis import given
 from hypothesis import strategies as st
-from pucks_bench import GEARS, MS, pucks_config
 
 from ident_service.config.load import load_arm
 from ident_service.config.recording import Transmission
@@ -34,7 +34,7 @@ WAM = Transmission(
 
 
 def body_of(folder: Path, **emulation: object) -> Body:
-    return build_emulator(pucks_config(folder, emulation={"seed": 3, **emulation})).body
+    return build_emulator(drives_config(folder, emulation={"seed": 3, **emulation})).body
 
 
 def test_gears_of_the_wam_are_those_of_its_tables() -> None:
@@ -163,17 +163,17 @@ def test_gears_of_another_arm_are_refused() -> None:
 
 def test_an_encoder_counts_motor_turns_from_the_zero_of_the_joints(tmp_path: Path) -> None:
     gears = dict(GEARS, offsets=[0.3, -0.2])
-    absolute = build_emulator(pucks_config(tmp_path, gears=gears)).body
+    absolute = build_emulator(drives_config(tmp_path, gears=gears)).body
     expected = gears["ratios"] * (np.array(gears["coupling"]) @ (absolute.plant.position - [0.3, -0.2]))
     counts = [motor.encoder(0) for motor in absolute.motors]
     assert counts == np.rint(expected * 4096 / (2 * np.pi)).astype(int).tolist()
-    relative = build_emulator(pucks_config(tmp_path, gears=gears, zero="at_home"))
+    relative = build_emulator(drives_config(tmp_path, gears=gears, zero="at_home"))
     relative.power_up(0)
     assert [motor.encoder(0) for motor in relative.body.motors] == [0, 0]
 
 
 def test_a_late_host_finds_the_arm_moved_on_already(tmp_path: Path) -> None:
-    emulator = build_emulator(pucks_config(tmp_path))
+    emulator = build_emulator(drives_config(tmp_path))
     emulator.power_up(0)
     body = emulator.body
     emulator.go_on(100 * MS)

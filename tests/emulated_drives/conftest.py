@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import pytest
-from pucks_bench import Host, pucks_config
+from drives_bench import Host, drives_config
 
 from ident_service.config.arm import ArmConfig
 
 
 @pytest.fixture(scope="session")
 def planar2(tmp_path_factory: pytest.TempPathFactory) -> ArmConfig:
-    """The arm of `pucks_config`, which nobody can change."""
-    return pucks_config(tmp_path_factory.mktemp("pucks"))
+    """The arm of `drives_config`, which nobody can change."""
+    return drives_config(tmp_path_factory.mktemp("drives"))
 
 
 @pytest.fixture

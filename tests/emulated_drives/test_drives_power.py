@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pucks_bench import MS, Host, pucks_config
+from drives_bench import MS, Host, drives_config
 
 from sim_backend.canopen_device.drive import TRANSITIONS, Command, PowerState, command_of
 from sim_backend.emulator.faults import parse_fault
@@ -200,7 +200,7 @@ def test_torque_acts_beyond_a_software_limit_which_is_of_the_position_modes(enab
 def test_without_power_the_motor_is_left_as_the_description_says(
     tmp_path: Path, windings_off: str, brake: bool, power: Power, off: tuple[int, ...]
 ) -> None:
-    host = Host.on(pucks_config(tmp_path, brake=brake, emulation={"windings_off": windings_off}))
+    host = Host.on(drives_config(tmp_path, brake=brake, emulation={"windings_off": windings_off}))
     motor = host.arm.emulator.body.motors[0]
     assert motor.power is power
     host.configure()
@@ -225,7 +225,7 @@ def test_without_power_the_motor_is_left_as_the_description_says(
 def test_how_far_an_arm_falls_after_its_host_has_died(
     tmp_path: Path, windings_off: str, brake: bool, least: float, most: float
 ) -> None:
-    host = Host.on(pucks_config(tmp_path, brake=brake, gears=PLAIN, emulation={"windings_off": windings_off}))
+    host = Host.on(drives_config(tmp_path, brake=brake, gears=PLAIN, emulation={"windings_off": windings_off}))
     host.configure(deadline=10)
     host.enable()
     for _ in range(5):
@@ -239,7 +239,7 @@ def test_how_far_an_arm_falls_after_its_host_has_died(
 
 def test_a_drive_that_nobody_asks_stops_an_arm_by_itself(tmp_path: Path) -> None:
     """The host dies: torques stop, and the arm sinks and comes to rest."""
-    enabled = Host.on(pucks_config(tmp_path, emulation={"windings_off": "shorted"}))
+    enabled = Host.on(drives_config(tmp_path, emulation={"windings_off": "shorted"}))
     enabled.configure(deadline=10)
     enabled.enable()
     for _ in range(200):

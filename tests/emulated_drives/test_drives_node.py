@@ -6,9 +6,9 @@ import struct
 from pathlib import Path
 
 import pytest
+from drives_bench import HOST, MS, Host, drives_config
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pucks_bench import HOST, MS, Host, pucks_config
 
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import open_links
@@ -19,7 +19,7 @@ def beat(host: Host) -> None:
 
 
 def test_nodes_say_once_that_they_have_booted(tmp_path: Path) -> None:
-    (link,) = open_links(pucks_config(tmp_path))
+    (link,) = open_links(drives_config(tmp_path))
     frames = []
     while (frame := link.receive(500 * MS)) is not None:
         frames.append((frame.identifier, frame.data))
@@ -115,7 +115,7 @@ def test_identity_is_what_the_configuration_expects(tmp_path: Path) -> None:
         }
         for n in (3, 9)
     ]
-    (link,) = open_links(pucks_config(tmp_path, drives=drives))
+    (link,) = open_links(drives_config(tmp_path, drives=drives))
     host = Host(link, (3, 9))
     assert [host.read(n, 0x1018, k, "I") for n in (3, 9) for k in (1, 2, 4)] == [7, 1, 3, 7, 1, 9]
 

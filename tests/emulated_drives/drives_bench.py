@@ -15,14 +15,14 @@ from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 from sim_backend.machine import Truth
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-EDS = CONFIGS / "puck.eds"
+EDS = CONFIGS / "emulated_drive.eds"
 MS = 1_000_000
 # A differential: both motors turn both joints.
 GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}
 HOST = 127
 
 
-def pucks_config(
+def drives_config(
     folder: Path, *, name: str = "planar2.yaml", gears: dict | None = None, brake: bool = False, **driver: object
 ) -> ArmConfig:
     """A shipped arm on emulated drives in virtual time; planar2 with a differential unless told otherwise."""
@@ -32,10 +32,10 @@ def pucks_config(
         for k in range(len(transmission["ratios"]))
     ]
     section = {"kind": "canopen", "eds": str(EDS), "buses": [{"interface": "lock_step"}], "drives": drives} | driver
-    tree = {"extends": str(CONFIGS / name), "name": "pucks", "transmission": transmission, "driver": section}
+    tree = {"extends": str(CONFIGS / name), "name": "drives", "transmission": transmission, "driver": section}
     if name == "planar2.yaml":
         tree["joints"] = {joint: {"brake": brake} for joint in ("shoulder", "elbow")}
-    path = folder / "pucks.yaml"
+    path = folder / "drives.yaml"
     path.write_text(yaml.safe_dump(tree), encoding="utf-8")
     return load_arm(path)
 
