@@ -1,4 +1,4 @@
-"""Register and run the verbs about the daemon: `serve`, and `token` for its access tokens."""
+"""Register and run the verbs about the daemon: `serve`, and `tokens` for its access tokens."""
 
 from __future__ import annotations
 
@@ -16,8 +16,13 @@ _PORT = 8470
 
 
 def add(verbs: VerbList) -> None:
-    """Register `serve`, `token add`, `token list` and `token revoke`."""
-    sub = verbs.add("serve", _serve, "start the daemon: HTTP API, pages, jobs and schedules")
+    """Register `serve`, `tokens`, `tokens add` and `tokens revoke`."""
+    sub = verbs.add(
+        "serve",
+        _serve,
+        "start the daemon: pages, HTTP API, jobs and schedules",
+        examples=("", "--port 0", "--host 0.0.0.0 --tls-cert chain.pem --tls-key key.pem"),
+    )
     sub.add_argument("--host", default="127.0.0.1", help="address to listen on; other than loopback needs TLS")
     sub.add_argument("--port", type=_port, default=_PORT, help=f"default {_PORT}; 0 for any that is free")
     sub.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
@@ -34,13 +39,23 @@ def add(verbs: VerbList) -> None:
         "--webhook-secret", type=Path, metavar="FILE", help="file with the secret that signs notices; chmod 600"
     )
 
-    token = verbs.group("token", "access tokens of the daemon")
-    sub = token.add("add", _add, "create a token and print it once")
+    tokens = verbs.group(
+        "tokens",
+        "list the daemon's access tokens; add, revoke",
+        _list,
+        former="token",
+        examples=("", "--server http://127.0.0.1:8470"),
+    )
+    sub = tokens.add(
+        "add", _add, "create a token and print it once", examples=("ann --role operator", "wall --role viewer")
+    )
     sub.add_argument("name", metavar="NAME", help="shown in the audit log")
     sub.add_argument("--role", choices=["viewer", "operator"], required=True)
     add_by(sub)
-    token.add("list", _list, "list names and roles")
-    sub = token.add("revoke", _revoke, "revoke a token and its sessions")
+    tokens.add("list", _list, "list names and roles", hidden=True, word="tokens")
+    sub = tokens.add(
+        "revoke", _revoke, "revoke a token and its sessions", examples=("ann", "ann --server http://127.0.0.1:8470")
+    )
     sub.add_argument("name", metavar="NAME")
     add_by(sub)
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
-from ident_service.cli.motion_commands import add_can_log, add_dry_run, dry_run, run_and_report
+from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -30,6 +30,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
 if TYPE_CHECKING:
@@ -44,7 +45,13 @@ _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 def _add_recovery(verbs: VerbList) -> None:
     """Register `home`, `set-home` and `recover`."""
-    sub = verbs.add("home", _home, "move the arm home, at a tenth of its velocity limits at most")
+    sub = verbs.add(
+        "home",
+        _home,
+        "move the arm home, slowly",
+        more="At a tenth of its velocity limits at most.",
+        examples=("planar2", "my_arm.yaml --dry-run"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
     sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
@@ -52,10 +59,13 @@ def _add_recovery(verbs: VerbList) -> None:
     add_can_log(sub)
     add_dry_run(sub)
     add_lease(sub, confirm=False)
-    text = (
-        "define the posture in which the arm stands as its home: sets the zero of incremental encoders, moves nothing"
+    sub = verbs.add(
+        "set-home",
+        _home,
+        "define the arm's present posture as its home",
+        more="Sets the zero of incremental encoders, and moves nothing.",
+        examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"),
     )
-    sub = verbs.add("set-home", _home, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
     add_lease(sub, confirm=False)
@@ -63,7 +73,9 @@ def _add_recovery(verbs: VerbList) -> None:
     sub = verbs.add(
         "recover",
         _recover,
-        "show what must be done after a fault or a stop; reset drives (exit code 3: not usable yet)",
+        "show what to do after a fault or a stop; reset drives",
+        more="Exit code 3: the arm is not usable yet.",
+        examples=("planar2", "my_arm.yaml --leave-limit"),
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
@@ -76,10 +88,9 @@ def _add_recovery(verbs: VerbList) -> None:
 def _home(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.motion.run_plan import Destination
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if arguments.zero:
         if arguments.out is not None or arguments.can_log:
             raise UsageError("--out and --can-log are for a motion; here nothing moves")
@@ -139,7 +150,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
@@ -148,7 +159,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
         lines.append(
             "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )
-    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident preflight {arguments.arm}`")
+    lines.append("compare what `ident watch` shows with the arm, then make a new preflight")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -156,11 +167,10 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 def _recover(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.operations.arm_checks import watch_document
     from ident_service.operations.recovery import recover
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if arguments.leave_limit:
         from ident_service.motion.run_plan import Destination
 
@@ -225,7 +235,7 @@ def _text(found: Recovery) -> str:
     lines += [f"  outside its position limits: {words}" for words in found.outside]
     if found.seen is not None:
         lines += ["", watch_text(found.seen).rstrip("\n")]
-    lines += ["", "next:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
+    lines += ["", "steps:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
     return "\n".join(lines)
 
 
@@ -241,7 +251,11 @@ EXIT_CODES: Final = {
 def _add_reidentify(verbs: VerbList) -> None:
     """Register `reidentify`."""
     sub = verbs.add(
-        "reidentify", _reidentify, "preflight, run, identify, compare with the accepted set (exit code 3: changed)"
+        "reidentify",
+        _reidentify,
+        "identify again, and compare with the accepted set",
+        more="Preflight, run, identification, comparison in one (exit code 3: the arm has changed).",
+        examples=("planar2", "my_arm.yaml motion/motion.json --confirm my_arm"),
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
@@ -291,7 +305,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     }
     lines = f"{text}{verdict.words}\n"
     if verdict.state == "changed":
-        lines += "a drift alarm is open until `ident alarm acknowledge`, or `ident accept` of another set\n"
+        lines += "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
     return EXIT_CODES[verdict.state], lines, answer
 
 
@@ -301,6 +315,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
 
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
+    parsed.progress = getattr(arguments, "progress", None)
     parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
     tell(arguments, f"-- {words[0]}")
     try:

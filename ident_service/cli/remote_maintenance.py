@@ -57,14 +57,21 @@ def _enabled(enabled: bool) -> Callable[[IdentClient, argparse.Namespace], Answe
 def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
-    due = client.get(_of(arguments, "due"))
+    due = _pending(client, arguments)
     text = f"{arguments.arm}: recorded: {row['what']}\n" + "".join(map(due_line, due))
     return DONE, text, {**row, "due": due}
 
 
 def _due(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = client.get(_of(arguments, "due"))
+    rows = _pending(client, arguments)
     return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
+
+
+def _pending(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    rows = client.get(_of(arguments, "due"))
+    arms = {row["arm"] for row in rows}
+    accepted = {arm for arm in arms if client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")}
+    return [{**row, "accepted": row["arm"] in accepted} for row in rows]
 
 
 def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -109,25 +116,25 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 VERBS: dict[str, Callable[[IdentClient, argparse.Namespace], Answer]] = {
-    "schedule add": _add,
-    "schedule list": _list,
-    "schedule remove": _remove,
-    "schedule enable": _enabled(True),
-    "schedule disable": _enabled(False),
+    "schedules add": _add,
+    "schedules": _list,
+    "schedules remove": _remove,
+    "schedules enable": _enabled(True),
+    "schedules disable": _enabled(False),
     "maintenance": _maintenance,
-    "due list": _due,
+    "due": _due,
     "due dismiss": _dismiss,
-    "alarm list": _alarms,
-    "alarm acknowledge": _ack,
+    "alarms": _alarms,
+    "alarms acknowledge": _ack,
     "reidentify": _reidentify,
 }
 _NUMBER = frozenset({"number"})
 CARRIED: dict[str, frozenset[str]] = {
-    "schedule add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
-    **dict.fromkeys(("schedule list", "due list", "alarm list"), frozenset({"arm"})),
-    **dict.fromkeys(("schedule remove", "schedule enable", "schedule disable"), _NUMBER),
+    "schedules add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
+    **dict.fromkeys(("schedules", "due", "alarms"), frozenset({"arm"})),
+    **dict.fromkeys(("schedules remove", "schedules enable", "schedules disable"), _NUMBER),
     "maintenance": frozenset({"arm", "what", "note"}),
-    **dict.fromkeys(("due dismiss", "alarm acknowledge"), _NUMBER | {"note"}),
+    **dict.fromkeys(("due dismiss", "alarms acknowledge"), _NUMBER | {"note"}),
     "reidentify": frozenset({"arm", "motion", "confirm"}),
 }
 """Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

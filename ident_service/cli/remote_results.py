@@ -10,7 +10,14 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.archive_commands import deleted_text, deleted_with_anyway, pruned_text
+from ident_service.cli.archive_commands import (
+    arm_line,
+    deleted_text,
+    deleted_with_anyway,
+    motions_text,
+    pruned_text,
+    runs_text,
+)
 from ident_service.cli.daemon_commands import token_line
 from ident_service.cli.identification_commands import accepted_name
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, with_answer_lines
@@ -54,6 +61,7 @@ def _compare(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
     if (arm := accepted_name(run)) is not None:
         acts = client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")
         if not acts:
+            client.get(f"{_API}/arms/{word_of_address(arm)}")  # that it is unknown is told first
             raise UsageError(
                 f"{arm}: nothing has been accepted yet; `ident accept RUN` makes a run's parameters its own"
             )
@@ -134,7 +142,7 @@ def _rollback(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _delete(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    kind, name = arguments.word.rpartition(" ")[2], word_of_address(arguments.name)
+    kind, name = arguments.kind, word_of_address(arguments.name)
     with deleted_with_anyway(kind, name):
         done = client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else ""))
     return DONE, deleted_text(done), done
@@ -143,6 +151,27 @@ def _delete(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 def _prune(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     found = client.post(f"{_API}/recordings/prune", {"keep": arguments.keep, "yes": arguments.yes})
     return DONE, pruned_text(found), found
+
+
+def _arms(client: IdentClient, _: argparse.Namespace) -> Answer:
+    rows = client.get(f"{_API}/arms")
+    return DONE, "".join(map(arm_line, rows)), {"arms": rows}
+
+
+def _listed(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    arm = "" if arguments.arm is None else f"&arm={word_of_address(arguments.arm)}"
+    rows: list[dict[str, Any]] = client.get(f"{_API}/{arguments.word}?most={min(arguments.most, 500)}{arm}")
+    return rows
+
+
+def _runs(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    rows = _listed(client, arguments)
+    return DONE, runs_text(rows), {"runs": rows}
+
+
+def _motions(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    rows = _listed(client, arguments)
+    return DONE, motions_text(rows), {"motions": rows}
 
 
 def _tokens(client: IdentClient, _: argparse.Namespace) -> Answer:
@@ -155,7 +184,7 @@ def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return DONE, f"{arguments.name}: revoked\n", row
 
 
-_DELETES = ("delete run", "delete motion", "delete arm")
+_DELETES = ("runs delete", "motions delete", "arms delete")
 VERBS: dict[str, Verb] = {
     "report": job_verb(_run, _reported),
     "export": job_verb(_export, _fetched),
@@ -169,8 +198,11 @@ VERBS: dict[str, Verb] = {
     "rollback": _rollback,
     "prune": _prune,
     **dict.fromkeys(_DELETES, _delete),
-    "token list": _tokens,
-    "token revoke": _revoke,
+    "arms": _arms,
+    "runs": _runs,
+    "motions": _motions,
+    "tokens": _tokens,
+    "tokens revoke": _revoke,
 }
 _FILE = frozenset({"file", "feasible_set", "arm"})
 CARRIED: dict[str, frozenset[str]] = {
@@ -185,7 +217,9 @@ CARRIED: dict[str, frozenset[str]] = {
     "rollback": frozenset({"arm", "note", "to"}),
     "prune": frozenset({"keep", "yes"}),
     **dict.fromkeys(_DELETES, frozenset({"name", "anyway"})),
-    "token list": frozenset(),
-    "token revoke": frozenset({"name"}),
+    "arms": frozenset(),
+    **dict.fromkeys(("runs", "motions"), frozenset({"arm", "most"})),
+    "tokens": frozenset(),
+    "tokens revoke": frozenset({"name"}),
 }
 """Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

@@ -81,7 +81,13 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Number = Annotated[float, Field(strict=True)]
-Angle = Annotated[float, Field(strict=True), BeforeValidator(_angle)]
+Angle = Annotated[
+    float,
+    Field(strict=True),
+    BeforeValidator(
+        _angle, json_schema_input_type=float | Annotated[str, Field(pattern=f"{_PI.pattern}|{_DEGREES.pattern}")]
+    ),
+]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, strict=True)]
@@ -136,13 +142,21 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
         raise ValueError(f"{path} is not UTF-8 text") from None
 
 
-TextBeside = Annotated[TextFile, BeforeValidator(read_relative_file)]
-AnyTextBeside = Annotated[TextFile, BeforeValidator(_read_any)]
+TextBeside = Annotated[TextFile, BeforeValidator(read_relative_file, json_schema_input_type=str)]
+AnyTextBeside = Annotated[TextFile, BeforeValidator(_read_any, json_schema_input_type=str)]
 """Text of any encoding: makers' data sheets are often not UTF-8."""
+
+
+def _table_schema(schema: dict[str, Any]) -> None:
+    """Describe a parameter table as people write it, in place of its two lists."""
+    schema.clear()
+    schema["anyOf"] = [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "number"}}]
 
 
 class ParameterTable(Section):
     """Named link parameters: inline `{m1: 2.0, ...}` or a JSON file with `names` and `values`."""
+
+    model_config = ConfigDict(json_schema_extra=_table_schema)
 
     names: tuple[str, ...]
     values: tuple[Number, ...]

@@ -18,13 +18,23 @@ import yaml
 from ident_service.config.quantities import LocatedStr
 from ident_service.errors import ConfigError, Problem
 
+SCHEMA = "ident-arm.schema.json"
+MODELINE = f"# yaml-language-server: $schema={SCHEMA}"  # with it, editors complete and explain keys
 _FOLDERS = (Path(__file__).parent.parent / "configs", Path(__file__).parent.parent.parent / "configs")
 
 
 def shipped_arms() -> dict[str, Path]:
     """Return names and files of the arm descriptions that come with this package."""
-    folder = next((folder for folder in _FOLDERS if folder.is_dir()), None)
-    return {} if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(_shipped_folder().glob("*.yaml"))}
+
+
+def arm_schema_file() -> Path:
+    """Return the JSON schema of descriptions that comes with this package (`config/schema.py`)."""
+    return _shipped_folder() / SCHEMA
+
+
+def _shipped_folder() -> Path:
+    return next((folder for folder in _FOLDERS if folder.is_dir()), _FOLDERS[-1])
 
 
 KeyPath = tuple[str | int, ...]

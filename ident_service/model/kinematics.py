@@ -24,6 +24,21 @@ def frame_origins(chain: Chain, position: Array) -> Array:
     return origins
 
 
+def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
+    """Return orientation and origin of every joint frame in the base frame, where its link's solids stand still.
+
+    Args:
+        chain: the mechanism.
+        position: [rad or m], shape (postures, joints).
+
+    Returns:
+        Joint frame to base frame, shape (postures, joints, 3, 3), and its origin in the base frame [m], shape
+        (postures, joints, 3).
+    """
+    poses = _joint_poses(chain, position)
+    return np.stack([R for R, _ in poses], axis=1), np.stack([p for _, p in poses], axis=1)
+
+
 def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
     """Return orientation and origin of every link frame in the base frame.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,32 @@ def test_a_deletion_that_broke_off_is_completed(state: Path, commissioned: Path)
         assert [run["id"] for run in daemon.get("/api/v1/runs").json()] == [SECOND]
 
 
+def test_a_deletion_that_the_registry_has_no_room_for_changes_nothing(
+    filled: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = filled.service.state
+    assert filled.post("/api/v1/arms", {"description": quick_text("other")}).status_code == 201
+    described = [path.name for path in (state / "descriptions").iterdir()]
+    (state / "arms" / "other").mkdir(parents=True)
+
+    def full(*_: object, **__: object) -> None:
+        error = sqlite3.OperationalError("database or disk is full")
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(deletion, "note", full)
+        for path in (f"runs/{FIRST}?anyway=true", "arms/other"):
+            status, answer = delete(filled, path)
+            assert (status, answer["error"]["kind"]) == (507, "DiskFull")
+    assert (state / "runs" / FIRST / "manifest.json").is_file()
+    assert (state / "arms" / "other").is_dir()
+    assert [path.name for path in (state / "descriptions").iterdir()] == described
+    assert filled.get(f"/api/v1/runs/{FIRST}").status_code == 200
+    assert delete(filled, f"runs/{FIRST}?anyway=true")[0] == 200
+    assert not list((state / "runs").glob(f"*{FIRST}*"))
+
+
 def test_the_command_deletes_and_names(state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     state.mkdir(mode=0o700, parents=True)
     shutil.copytree(commissioned, state / "runs" / FIRST)
@@ -206,7 +233,7 @@ def test_the_command_deletes_and_names(state: Path, commissioned: Path, capsys: 
     words = ["delete", "run", FIRST, "--state", str(state)]
     assert main(words) == 2
     said = f"the run {FIRST} is referred to by acceptance 1; to delete it all the same: "
-    assert capsys.readouterr().err == f"ident: {said}`ident delete run {FIRST} --anyway`\n"
+    assert capsys.readouterr().err == f"ident: {said}`ident runs delete {FIRST} --anyway`\n"
     assert main([*words, "--anyway", "--json", "--by", "ann"]) == 0
     assert json.loads(capsys.readouterr().out)["dependents"] == [{"kind": "acceptance", "id": "1", "becomes": "kept"}]
     with Database(state) as db:

@@ -91,6 +91,7 @@ def test_from_the_first_page_to_the_urdf_and_back(browser: Browser, reached: Rea
         seen.add(page.locator("#values").inner_text())
         page.wait_for_timeout(100)
     assert len(seen) >= 4  # values that move
+    expect(page.locator("#viewer-status")).to_contain_text("As measured, ")
     drawn = page.evaluate(
         "() => { const c = document.getElementById('plot-position');"
         " return c.getContext('2d').getImageData(0, 0, c.width, c.height).data.some((v) => v); }"

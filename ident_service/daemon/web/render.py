@@ -27,7 +27,10 @@ STATIC: Final = {
     "again.js": "text/javascript",
     "upload.js": "text/javascript",
     "news.js": "text/javascript",
+    "viewer.js": "text/javascript",
 }
+THREE: Final = {"three.module.min.js": "text/javascript", "three.core.min.js": "text/javascript"}
+"""Vendored files that the arm in three dimensions is drawn by; `viewer.js` loads them from its own folder."""
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
@@ -82,7 +85,8 @@ def _vendored() -> Traversable:
 def static() -> dict[str, bytes]:
     """Return the static files of pages, name to content."""
     place = files(__package__).joinpath("static")
-    return {name: place.joinpath(name).read_bytes() for name in STATIC}
+    own = {name: place.joinpath(name).read_bytes() for name in STATIC}
+    return own | {name: _vendored().joinpath(name).read_bytes() for name in THREE}
 
 
 @lru_cache(maxsize=1)

@@ -82,6 +82,21 @@ class Spectrum:
 
 
 @dataclass(frozen=True)
+class Spike:
+    """Sample of a recording at which a joint in motion has its largest residual.
+
+    Attributes:
+        time: since the recording's first sample [s].
+        residual: measured less predicted [N m or N].
+        position: of all joints then [rad or m], shape (joints,).
+    """
+
+    time: float
+    residual: float
+    position: Array
+
+
+@dataclass(frozen=True)
 class PredictionTrace:
     """Traces and spectra of one recording against the chosen estimate.
 
@@ -93,6 +108,7 @@ class PredictionTrace:
         width: of a stretch [s].
         joints: one per joint.
         spectra: one per joint; empty where the recording is too short for one.
+        spikes: one per joint, None of a joint that never moves; empty in files of earlier versions.
     """
 
     name: str
@@ -102,6 +118,7 @@ class PredictionTrace:
     width: float
     joints: tuple[JointTrace, ...]
     spectra: tuple[Spectrum, ...]
+    spikes: tuple[Spike | None, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from ident_service.results.evidence.evidence import (
     PosedArm,
     PredictionTrace,
     Spectrum,
+    Spike,
     Timing,
 )
 from ident_service.results.manifest import write_atomically
@@ -219,6 +220,10 @@ def _recording_document(one: PredictionTrace) -> dict[str, Any]:
             }
             for spectrum in one.spectra
         ],
+        "spikes": [
+            spike and {"time": spike.time, "residual": spike.residual, "position": spike.position.tolist()}
+            for spike in one.spikes
+        ],
     }
 
 
@@ -349,7 +354,14 @@ def _traced(content: Mapping[str, Any], joints: int) -> PredictionTrace:
         for one in content["spectra"]
     )
     time = (numbers + 0.5) * content["width"]
-    return PredictionTrace(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra)
+    spikes = content.get("spikes", [])
+    _require(len(spikes) in (0, joints), f"{content['name']!r} has {len(spikes)} spikes, not {joints}")
+    for spike in filter(None, spikes):
+        _require(len(spike["position"]) == joints, f"a spike of {content['name']!r} is not of {joints} joints")
+    return PredictionTrace(
+        *(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra),
+        tuple(one and Spike(one["time"], one["residual"], _numbers(one["position"])) for one in spikes),
+    )
 
 
 def _friction(content: Mapping[str, Any]) -> Friction:

@@ -399,6 +399,10 @@ def _run(parameters: ParameterFile) -> list[str]:
     scales = parameters.content.get("torque_scales", [])
     if any(scale != 1.0 for scale in scales):
         rows.append("Measured torques multiplied by " + ", ".join(number(scale, 4) for scale in scales) + ".")
+    for one in parameters.content.get("torque_constants", []):
+        doubt = one["standard_deviation"]
+        told = "not shown" if doubt is None else f"{number(one['factor'], 4)} \u00b1 {number(doubt)}"
+        rows.append(f"Torque of motor {one['motor']} ({', '.join(one['joints'])}) for one by its description: {told}.")
     rows.append(f"Made {origin.get('created', 'at an unknown time')} by {origin.get('software', 'unknown software')}")
     rows[-1] += f", commit {origin['git']}." if origin.get("git") else "."
     return [*rows, *(fit or {}).get("rows_and_filter", [])]

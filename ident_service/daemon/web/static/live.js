@@ -129,6 +129,7 @@ let play = null; // s of the recording that the right edge shows
 
 function addSamples(text) {
   const piece = JSON.parse(text);
+  document.dispatchEvent(new CustomEvent("samples", { detail: piece }));
   if (!series.joints.length) {
     series.joints = piece.joints;
     for (const kind of ["position", "torque", "error"]) series[kind] = piece.joints.map(() => []);
