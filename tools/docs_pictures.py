@@ -90,7 +90,7 @@ def main() -> None:
         browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": 1000, "height": 760})
         document(page, work / "first" / "report.html", "tutorial-report", height=720)
-        document(page, work / "result" / "report.html", "tutorial-identify", "Torque")
+        document(page, work / "result" / "report.html", "tutorial-identify", "Measured and predicted torque")
         terminal(page, done.stdout, "ident preflight planar2", "tutorial-preflight")
         terminal(page, done.stdout, "ident compare", "tutorial-compare")
         daemon(page, Path(folder, "state"))

@@ -96,7 +96,7 @@ def _commands(block: Block, page: str) -> Iterator[str]:
     for number, line in lines_of(block.text):
         if line.startswith("make ") or line.lstrip().startswith("#"):
             continue
-        place = f"{page}:{block.line + 1 + number}: {line}"
+        place = f"{page}:{block.line + number}: {line}"
         yield f"echo {shlex.quote('+ ' + line)}\n{line}"
         if not line.split("#")[0].rstrip().endswith("&"):
             codes = next((found.groups() for found in EXIT_CODE.finditer(line)), ("0",))
