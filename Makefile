@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock clean
+	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -107,7 +107,7 @@ test-socketcan: $(READY)
 # An independent CANopen stack on the emulated drives; needs node, and npm's registry once.
 test-foreign: $(READY)
 	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
-	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
+	$(BIN)/pytest tests/emulated_drives/test_drives_foreign_stack.py
 
 # The newest of everything that pyproject.toml allows, in an environment of its own, made anew.
 LATEST := .venv-latest
@@ -139,6 +139,10 @@ endif
 $(VENV)/.mutants: $(READY)
 	$(BIN)/python -m pip install --quiet --group mutants
 	touch $@
+
+# Pictures of the daemon's pages for the documents; needs the system's Chromium and five minutes.
+screenshots: $(READY)
+	$(BIN)/python tools/screenshots.py
 
 clean:
 	rm -rf $(VENV) $(LATEST) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -15,6 +15,7 @@ from ident_service.config.barrett import BarrettDriver
 from ident_service.config.canopen import ABORTING, CanopenDriver, joint_torques, motor_speeds
 from ident_service.config.eds import data_sheet
 from ident_service.config.kinematics import DHTable
+from ident_service.config.payload import Payload
 from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
@@ -269,6 +270,19 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
     return _validated(RecordingFormat, read_tree(path), path)
 
 
+def load_payload(path: str | Path) -> Payload:
+    """Read and check a YAML file that has the keys of an arm description's `payload` and nothing else.
+
+    Raises:
+        UsageError: no such file.
+        ConfigError: every mistake in it, each with file, line and column.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; expected a YAML file with mass and center_of_mass of a payload")
+    return _validated(Payload, read_tree(path), path)
+
+
 def folder_of(arm: str | Path, where: KeyPath) -> Path:
     """Return the folder of the file in which a key stands: of the description, or of one that it extends.
 
@@ -369,6 +383,12 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             )
     if config.payload is not None and config.payload.link is not None and names and config.payload.link not in names:
         yield ("payload", "link"), f"payload.link: {config.payload.link!r} is none of {', '.join(names)}"
+    factors = config.identification.torque_factors
+    if factors is not None and names and len(factors) != len(names):
+        yield (
+            ("identification", "torque_factors"),
+            f"identification.torque_factors: {len(factors)} values for {len(names)} motors",
+        )
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from motion_design.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from motion_design.design_disagreements(config.design, names)

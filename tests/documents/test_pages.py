@@ -13,7 +13,7 @@ from documents.walk import PORT, ROOT, Block, blocks, script, walk
 from ident_service.motion.faults import FAULTS, Reaction
 from ident_service.motion.state_machine import TRANSITIONS
 from ident_service.motion.ticket import CODES
-from ident_service.operations.arm_checks import _TITLES
+from ident_service.operations.arm_checks import TITLES
 
 DOCS = ROOT / "docs"
 # The newcomer's walk, and what else the same folder is good for; then the arm of one's own.
@@ -112,7 +112,7 @@ def test_every_fault_has_an_entry_with_three_checks() -> None:
 def test_every_row_of_the_preflight_is_explained() -> None:
     rows = re.findall(r"(?m)^\| ([^|]+) \| `(\w+)` \| [^|]+ \| [^|]+ \|$", text("commissioning.md"))
     assert [code for _, code in rows] == list(CODES)
-    assert {code: title for title, code in rows} == _TITLES
+    assert {code: title for title, code in rows} == TITLES
 
 
 def test_the_figure_of_the_states_is_that_of_the_code() -> None:
