@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	docs docs-figures mutants test-socketcan test-foreign test-latest lock screenshots clean
+	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -53,6 +53,13 @@ docs: $(READY)
 # Figures that pages show, drawn from what the code computes; they are committed.
 docs-figures: $(READY)
 	$(BIN)/python tools/docs_figures.py
+
+docs-pictures: $(READY)
+	$(BIN)/python tools/docs_pictures.py
+
+# What a newcomer does, in a clean clone, by the documents' own commands.
+walk: $(READY)
+	$(BIN)/python tests/documents/walk.py --clean README.md $(addprefix docs/,tutorial.md your-own-arm.md identify-recordings.md)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
