@@ -304,7 +304,7 @@ REMOTE: dict[str, Verb] = {
 LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
-    **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
+    "fleet status": "its store is in the daemon's state folder; log in where the daemon runs",
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
