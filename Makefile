@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	docs docs-figures mutants test-socketcan test-foreign test-latest lock clean
+	docs docs-figures mutants test-socketcan test-foreign test-latest lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -132,6 +132,10 @@ endif
 $(VENV)/.mutants: $(READY)
 	$(BIN)/python -m pip install --quiet --group mutants
 	touch $@
+
+# Pictures of the daemon's pages for the documents; needs the system's Chromium and five minutes.
+screenshots: $(READY)
+	$(BIN)/python tools/screenshots.py
 
 clean:
 	rm -rf $(VENV) $(LATEST) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

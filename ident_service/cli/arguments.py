@@ -36,6 +36,7 @@ HELP_GROUPS: dict[str, tuple[str, ...]] = {
 
 LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
+    "schema": "it is the same for every machine of this version",
     "completion": "it is for the shell that it is typed into",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
     **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),

@@ -57,14 +57,21 @@ def _enabled(enabled: bool) -> Callable[[IdentClient, argparse.Namespace], Answe
 def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
-    due = client.get(_of(arguments, "due"))
+    due = _pending(client, arguments)
     text = f"{arguments.arm}: recorded: {row['what']}\n" + "".join(map(due_line, due))
     return DONE, text, {**row, "due": due}
 
 
 def _due(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = client.get(_of(arguments, "due"))
+    rows = _pending(client, arguments)
     return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
+
+
+def _pending(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    rows = client.get(_of(arguments, "due"))
+    arms = {row["arm"] for row in rows}
+    accepted = {arm for arm in arms if client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")}
+    return [{**row, "accepted": row["arm"] in accepted} for row in rows]
 
 
 def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> Answer:

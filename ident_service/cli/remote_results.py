@@ -61,6 +61,7 @@ def _compare(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
     if (arm := accepted_name(run)) is not None:
         acts = client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")
         if not acts:
+            client.get(f"{_API}/arms/{word_of_address(arm)}")  # that it is unknown is told first
             raise UsageError(
                 f"{arm}: nothing has been accepted yet; `ident accept RUN` makes a run's parameters its own"
             )

@@ -122,8 +122,11 @@ class ProgressAnswer(BaseModel):
 class JobAnswer(BaseModel):
     """A job; `run` is the id of the run, motion or export that it makes or is about, null where it ended and made none.
 
+    `detail` says why it ended so, and of a queued job what it waits for.
+
     `held` says that its motion has stopped, and that the arm, which has no brakes, is held until a person confirms that
-    it is supported; until then the job runs.
+    it is supported. Until then the job runs; after a kill of the daemon it is `interrupted`, and the arm held all the
+    same.
     """
 
     number: int
@@ -192,13 +195,15 @@ class ParametersAnswer(BaseModel):
 
 
 class RunLine(BaseModel):
-    """One run in the list of runs."""
+    """One run in the list of runs, with the tags and the note that people gave it."""
 
     id: str
     kind: str
     arm: str
     created: float
     ending: str
+    tags: list[str] = []
+    note: str = ""
 
 
 class RunAnswer(RunLine):
@@ -209,6 +214,34 @@ class RunAnswer(RunLine):
     files: dict[str, str]
     recordings: list[RecordingAnswer]
     parameters: ParametersAnswer | None
+
+
+class SeriesEvent(BaseModel):
+    """Line that was logged while a run was recorded: a `state`, a `warning`, or a `fault` that stopped the arm."""
+
+    time: float
+    kind: Literal["state", "warning", "fault"]
+    message: str
+
+
+class SeriesAnswer(BaseModel):
+    """Recording of a run, thinned for display: times [s] after its first sample, a list per joint of each quantity.
+
+    `position` and `reference` (commanded) are in rad or m; `torque`, which was commanded, and `measured` in N m or N;
+    `error` is the largest following error near each time. Quantities that were not recorded are null. `begins` is when
+    the motion itself began, `start` the stamp of the first sample [s].
+    """
+
+    joints: list[str]
+    time: list[float]
+    position: list[list[float | None]]
+    torque: list[list[float | None]]
+    reference: list[list[float | None]] | None = None
+    error: list[list[float | None]] | None = None
+    measured: list[list[float | None]] | None = None
+    start: float
+    begins: float | None
+    events: list[SeriesEvent]
 
 
 class AuditLine(BaseModel):

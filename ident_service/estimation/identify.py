@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -192,6 +192,7 @@ def identify(
     custom: CustomFunction | None = None,
     solver: str | None = None,
     again: bool = False,
+    step: Callable[[str, float], None] = lambda words, share: None,
     torque_constants: bool = False,
 ) -> Estimate:
     """Identify an arm from recordings.
@@ -205,6 +206,7 @@ def identify(
         custom: the function that the configuration's `constraints.custom` names, loaded by `load_custom`.
         solver: of the problems that are posed in cvxpy, those with `custom` and the second opinion.
         again: whether to solve the constrained problem a second time.
+        step: called with what is being done and the share of the time that is over, from 0 to 1, as a rule.
         torque_constants: whether to identify those of the motors with the parameters; needs a known payload.
 
     Raises:
@@ -227,8 +229,11 @@ def identify(
     constants: Literal["described", "unconstrained", "feasible"] = "described"
     if torque_constants:
         constants = "unconstrained" if set_name == "none" else "feasible"
+    step("choosing filter, delay and friction", 0.01)
     prepared = prepare(recordings, model, base, conditions, validation, torque_constants=constants)
+    step("estimating without conditions", 0.45)
     found = unconstrained(wanted, recordings, prepared, base, conditions)
+    step("estimating inside the feasible set", 0.85)
     unseen = [(recording, _validation_equations(recording, prepared, base)) for recording in validation]
     prior = _prior(prepared.model, found, base, conditions)
     test = feasibility_test(found.fit.beta, base, conditions)

@@ -114,6 +114,7 @@ _SHAPES = {
     "second": "stroke-width:1.4;fill:none;stroke-linejoin:round;stroke-dasharray:6 2",
     "cloud": "fill-opacity:.45",
     "body": "fill-opacity:.3;stroke-width:1.2",
+    "limb": "stroke-linejoin:round;stroke-linecap:round",
 }
 
 
@@ -130,7 +131,8 @@ def sheet() -> str:
         return "".join(f".ident-figure{f' .{name}' if name else ''}{{{body}}}" for name, body in rows)
 
     def steps(shades: Sequence[str]) -> list[tuple[str, str]]:
-        return [(f"step{number}", f"stroke:{shade}") for number, shade in enumerate(shades)]
+        strokes = [(f"step{number}", f"stroke:{shade}") for number, shade in enumerate(shades)]
+        return strokes + [(f"tone{number}", f"fill:{shade};stroke:{shade}") for number, shade in enumerate(shades)]
 
     light = rules([*_SHAPES.items(), *_LIGHT.items(), *steps(_LIGHT_STEPS)])
     dark = rules([*_DARK.items(), *steps(_DARK_STEPS)])
@@ -165,8 +167,9 @@ def _pixel(value: float) -> str:
 
 
 def points_of(x: Array, y: Array) -> str:
-    """Return the coordinates of a polyline or polygon [px]."""
-    return " ".join(f"{_pixel(a)},{_pixel(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+    """Return the coordinates of a polyline or polygon [px], to a tenth of a pixel below 1000."""
+    # One call for all: thousands of points are a third of the time that a report takes.
+    return ("%.4g,%.4g " * len(x) % tuple(np.column_stack([x, y]).ravel().tolist())).rstrip()
 
 
 def _hinted(tag: str, attributes: str, hint: str) -> str:
@@ -195,9 +198,10 @@ class Canvas:
         """Draw a line through points [px], each of shape (points,)."""
         self._parts.append(f'<polyline class="{kind}" points="{points_of(x, y)}"/>')
 
-    def polygon(self, kind: str, x: Array, y: Array) -> None:
-        """Draw a closed line through points [px], each of shape (points,)."""
-        self._parts.append(f'<polygon class="{kind}" points="{points_of(x, y)}"/>')
+    def polygon(self, kind: str, x: Array, y: Array, width: float | None = None) -> None:
+        """Draw a closed line through points [px], each of shape (points,), as wide as its kind or as `width` says."""
+        more = "" if width is None else f' stroke-width="{_pixel(width)}"'
+        self._parts.append(f'<polygon class="{kind}" points="{points_of(x, y)}"{more}/>')
 
     def circle(self, kind: str, x: float, y: float, radius: float, hint: str = "") -> None:
         """Draw a disc [px]; `hint` appears where a pointer rests on it."""

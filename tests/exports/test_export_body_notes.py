@@ -9,8 +9,7 @@ import numpy as np
 from exports.export_bench import identified, true_arm
 
 from ident_service.results.export.bodies import about_origin
-from ident_service.results.export.bodies_said import arm_reach, body_notes
-from ident_service.results.export.formats import export_texts
+from ident_service.results.export.formats import arm_reach, body_notes, export_texts
 
 LINKS = ["urdf", "mjcf", "sdf", "json"]
 
