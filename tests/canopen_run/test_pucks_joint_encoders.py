@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from canopen_run_bench import SHORT, write
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from puck_run_bench import PUCK, puck_arm
 
 from drivers.barrett.driver import BarrettArm
@@ -50,7 +52,6 @@ def test_a_motion_whose_cable_slips_ends_where_an_encoder_shows_it(read: bool, t
 
 
 def encoder_positions(path: Path) -> np.ndarray:
-    from mcap_ros2.reader import read_ros2_messages
-
-    found = [one.ros_msg.position for one in read_ros2_messages(path, topics=["/joint_encoders"])]
-    return np.array([list(position) for position in found])
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return np.array([list(one[3].position) for one in reader.iter_decoded_messages(topics=["/joint_encoders"])])

@@ -84,6 +84,7 @@ def test_ros_replays_every_message_in_order_and_latches_the_description(
     assert {topic: len(found) for topic, found in read.items()} == {
         "/robot_description": 1,
         "/events": 1,
+        "/joint_encoders": 0,
         **dict.fromkeys(("/joint_states", "/joint_commands", "/joint_torques", "/cycle"), count),
     }
     state, command = read["/joint_states"][-1], read["/joint_commands"][-1]
