@@ -109,6 +109,8 @@ class PuckEmulation(Section):
     """
     heartbeat: Positive = 0.05
     """Time without positions or torques after which the safety puck leaves ACTIVE [s]."""
+    velocity: Positive | None = None
+    """Speed of elbow and tip at which the safety puck really trips [m/s]; what it was told when left out."""
     zeroed: bool = False
     """The arm has been zeroed since power came."""
     faults: tuple[SimulatedFault, ...] = ()

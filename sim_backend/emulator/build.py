@@ -170,6 +170,7 @@ def _pucks(config: ArmConfig, driver: BarrettDriver, faults: Sequence[DriveFault
         heartbeat=emulation.heartbeat,
         operator=emulation.operator,
         zeroed=emulation.zeroed,
+        velocity=emulation.velocity,
     )
     at_home = np.rint(body.gears.motor_position(body.plant.position) / radians).astype(int).tolist()
     ipnm: Sequence[int | None] = emulation.ipnm or (None,) * len(pucks)
