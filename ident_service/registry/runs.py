@@ -9,18 +9,21 @@ a path before.
 from __future__ import annotations
 
 import json
+import re
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Final
 
 from ident_service.errors import IdentError, ParameterError, UnknownId, UsageError
 from ident_service.motion.ending import ENDED
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
-DOWNLOADABLE_KINDS: Final = frozenset({"export", "figures", "payload", "correct"})
+DOWNLOADABLE_KINDS: Final = frozenset({"export", "figures", "payload", "correct", "fleet"})
 """Kinds of jobs that make files for download, in a folder of their own below `EXPORTS`."""
 UPLOAD, COLUMNS = "upload.json", "columns.yaml"
 """Files of a run that is an uploaded recording: its announcement, and the layout of its columns."""
@@ -122,6 +125,20 @@ def recordings(db: Database, run: str) -> list[Row]:
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
 
 
+def recordings_of(db: Database, patterns: Sequence[str]) -> list[Row]:
+    """Return run, arm and name of every recording that is kept of motions and uploads of some arms, by run.
+
+    Args:
+        db: the registry.
+        patterns: names of arms, with the wildcards of file names.
+    """
+    found = db.rows(
+        "SELECT runs.id AS run, arm, name FROM recordings JOIN runs ON runs.id = recordings.run "
+        "WHERE deleted IS NULL AND kind IN ('run', 'recording') ORDER BY runs.id, name"
+    )
+    return [row for row in found if any(fnmatchcase(str(row["arm"]), pattern) for pattern in patterns)]
+
+
 def recording_name(db: Database, run: str) -> str:
     """Return the name of the only recording of a run; `run.mcap` where it has several, or none.
 
@@ -135,6 +152,52 @@ def recording_name(db: Database, run: str) -> str:
 def parameter_set(db: Database, run: str) -> Row | None:
     """Return the entry of the parameters that a run holds; None where it holds none."""
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
+
+
+LONGEST_NOTE: Final = 2000
+MOST_TAGS: Final = 16
+_TAG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:+-]{0,39}")
+
+
+def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str) -> Row:
+    """Give a run its tags and its note, in place of those that it had.
+
+    Args:
+        db: the registry.
+        run: id.
+        tags: words by which runs are found again; none takes them away.
+        words: the note; may be empty.
+        who: gives them.
+
+    Returns:
+        The labels (`run_labels`).
+
+    Raises:
+        UnknownId: no such run.
+        UsageError: too many tags, one that is no plain word, or too long a note.
+    """
+    known = str(known_run(db, run)["id"])
+    chosen = list(dict.fromkeys(tags))
+    if len(chosen) > MOST_TAGS:
+        raise UsageError(f"{len(chosen)} tags are too many; a run has {MOST_TAGS} at most")
+    if bad := [tag for tag in chosen if not _TAG.fullmatch(tag)]:
+        raise UsageError(f"{bad[0]!r}: a tag is one word of letters, digits and _ . : + -, 40 characters at most")
+    if len(words) > LONGEST_NOTE:
+        raise UsageError(f"the note has {len(words)} characters; {LONGEST_NOTE} at most")
+    with db.transaction():
+        db.write(
+            "INSERT INTO run_labels VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET "
+            "tags = excluded.tags, note = excluded.note, at = excluded.at, who = excluded.who",
+            *(known, json.dumps(chosen), words, time.time(), who),
+        )
+        note(db, who, "run labelled", known, tags=chosen, note=words)
+    return run_labels(db, known)[known]
+
+
+def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
+    """Return the labels of a run, or of all: per run its `tags`, `note`, and `who` gave them `at` what time."""
+    found = db.rows("SELECT * FROM run_labels WHERE ?1 IS NULL OR run = ?1", run)
+    return {row["run"]: {**row, "tags": json.loads(row["tags"])} for row in found}
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:

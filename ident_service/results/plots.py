@@ -114,6 +114,7 @@ _SHAPES = {
     "second": "stroke-width:1.4;fill:none;stroke-linejoin:round;stroke-dasharray:6 2",
     "cloud": "fill-opacity:.45",
     "body": "fill-opacity:.3;stroke-width:1.2",
+    "limb": "stroke-linejoin:round;stroke-linecap:round",
 }
 
 
@@ -130,7 +131,8 @@ def sheet() -> str:
         return "".join(f".ident-figure{f' .{name}' if name else ''}{{{body}}}" for name, body in rows)
 
     def steps(shades: Sequence[str]) -> list[tuple[str, str]]:
-        return [(f"step{number}", f"stroke:{shade}") for number, shade in enumerate(shades)]
+        strokes = [(f"step{number}", f"stroke:{shade}") for number, shade in enumerate(shades)]
+        return strokes + [(f"tone{number}", f"fill:{shade};stroke:{shade}") for number, shade in enumerate(shades)]
 
     light = rules([*_SHAPES.items(), *_LIGHT.items(), *steps(_LIGHT_STEPS)])
     dark = rules([*_DARK.items(), *steps(_DARK_STEPS)])
@@ -196,9 +198,10 @@ class Canvas:
         """Draw a line through points [px], each of shape (points,)."""
         self._parts.append(f'<polyline class="{kind}" points="{points_of(x, y)}"/>')
 
-    def polygon(self, kind: str, x: Array, y: Array) -> None:
-        """Draw a closed line through points [px], each of shape (points,)."""
-        self._parts.append(f'<polygon class="{kind}" points="{points_of(x, y)}"/>')
+    def polygon(self, kind: str, x: Array, y: Array, width: float | None = None) -> None:
+        """Draw a closed line through points [px], each of shape (points,), as wide as its kind or as `width` says."""
+        more = "" if width is None else f' stroke-width="{_pixel(width)}"'
+        self._parts.append(f'<polygon class="{kind}" points="{points_of(x, y)}"{more}/>')
 
     def circle(self, kind: str, x: float, y: float, radius: float, hint: str = "") -> None:
         """Draw a disc [px]; `hint` appears where a pointer rests on it."""

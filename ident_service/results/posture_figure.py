@@ -318,6 +318,59 @@ def spike_figure(mechanism: Chain, joint: int, time: float, residual: float, pos
     return stick_figure(posture, f"{name}: residual of {number(residual, 3)} {unit} at {number(time, 4)} s")
 
 
+@dataclass(frozen=True)
+class Limb:
+    """Part of an arm: all points within `radius` [m] of the convex hull of `points` [m], shape (points, 3).
+
+    `shade` is its place among the shades of a drawing, 0 (at the base) to 1 (at the tool); `behind` says that all
+    others cover it, as bodies cover the line through their frames.
+    """
+
+    points: Array
+    radius: float
+    shade: float
+    behind: bool = False
+
+
+_TURN, _TILT = np.radians(-60.0), np.radians(18.0)
+_PICTURE_WIDTH, _PICTURE_HEIGHT, _PICTURE_MARGIN = 280.0, 210.0, 12.0
+
+
+def silhouette(limbs: Sequence[Limb], title: str) -> str:
+    """Draw an arm in one posture, from the side and somewhat above, as a small picture without scales.
+
+    Args:
+        limbs: parts of the arm, one at least.
+        title: what the picture is of.
+
+    Returns:
+        A self-contained SVG.
+    """
+    for limb in limbs:
+        require_drawable("part of an arm", limb.points, (len(limb.points), 3))
+    across = np.array([np.cos(_TURN), -np.sin(_TURN), 0.0])
+    away = np.array([np.sin(_TURN) * np.cos(_TILT), np.cos(_TURN) * np.cos(_TILT), -np.sin(_TILT)])
+    views = np.stack([across, np.cross(across, away)], axis=1)
+    views[:, 1] *= np.sign(views[2, 1])
+    flat = [limb.points @ views for limb in limbs]
+    low = np.min([points.min(axis=0) - limb.radius for points, limb in zip(flat, limbs, strict=True)], axis=0)
+    high = np.max([points.max(axis=0) + limb.radius for points, limb in zip(flat, limbs, strict=True)], axis=0)
+    room = np.array([_PICTURE_WIDTH, _PICTURE_HEIGHT]) - 2.0 * _PICTURE_MARGIN
+    scale = float((room / np.maximum(high - low, 1e-3)).min())
+    half = 0.5 * np.array([_PICTURE_WIDTH, _PICTURE_HEIGHT]) / scale
+    (left, bottom), (right, top) = 0.5 * (low + high) - half, 0.5 * (low + high) + half
+    canvas = Canvas(_PICTURE_WIDTH, _PICTURE_HEIGHT)
+    axes = Axes(0.0, 0.0, _PICTURE_WIDTH, _PICTURE_HEIGHT, left, right, bottom, top)
+    # What is farther away first; seen so, nearer parts cover it.
+    depths = [(not limb.behind, -float((limb.points @ away).mean())) for limb in limbs]
+    for place in sorted(range(len(limbs)), key=lambda number: depths[number]):
+        limb, points = limbs[place], flat[place]
+        outline = _hull(points)
+        shade = round((1.0 - limb.shade) * (STEPS - 2)) + 1
+        canvas.polygon(f"limb tone{shade}", axes.x(outline[:, 0]), axes.y(outline[:, 1]), 2.0 * limb.radius * scale)
+    return canvas.svg(title, f"{title}, seen from the side and somewhat above.")
+
+
 def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures, shown: Sequence[int]) -> None:
     i, j = view
     step = _grid(canvas, axes, view)

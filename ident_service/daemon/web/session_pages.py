@@ -13,7 +13,7 @@ from ident_service.daemon.routes.jobs import stop_all
 from ident_service.daemon.web.forms import Form, PageRoute, inside, seen
 from ident_service.daemon.web.render import (
     STATIC,
-    THREE,
+    VENDORED,
     VIEWER,
     mark,
     page,
@@ -66,10 +66,10 @@ def load(version: str, name: str) -> Response:
     """Return a style sheet or script."""
     if (version, name) == (viewer_version(), VIEWER):
         return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
-    kinds = STATIC | THREE
-    if name not in kinds or version != mark():
+    kind = {**STATIC, **VENDORED}.get(name)
+    if kind is None or version != mark():
         raise HTTPException(404, "no such file; load the page again")
-    return Response(static()[name], media_type=kinds[name], headers=_KEPT)
+    return Response(static()[name], media_type=kind, headers=_KEPT)
 
 
 @router.post("/stop")
