@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	docs docs-figures mutants test-socketcan test-foreign test-latest lock screenshots clean
+	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -53,6 +53,13 @@ docs: $(READY)
 # Figures that pages show, drawn from what the code computes; they are committed.
 docs-figures: $(READY)
 	$(BIN)/python tools/docs_figures.py
+
+docs-pictures: $(READY)
+	$(BIN)/python tools/docs_pictures.py
+
+# What a newcomer does, in a clean clone, by the documents' own commands.
+walk: $(READY)
+	$(BIN)/python tests/documents/walk.py --clean README.md $(addprefix docs/,tutorial.md your-own-arm.md identify-recordings.md)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
@@ -100,7 +107,7 @@ test-socketcan: $(READY)
 # An independent CANopen stack on the emulated drives; needs node, and npm's registry once.
 test-foreign: $(READY)
 	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
-	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
+	$(BIN)/pytest tests/emulated_drives/test_drives_foreign_stack.py
 
 # The newest of everything that pyproject.toml allows, in an environment of its own, made anew.
 LATEST := .venv-latest

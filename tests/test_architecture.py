@@ -81,7 +81,7 @@ DOORS: dict[str, set[str]] = {
     "fastapi": {"daemon"},
     "httpx": {"client"},
     "fsspec": {"fleet"},
-    "jinja2": {"daemon", "fleet"},
+    "jinja2": {"results", "daemon", "fleet"},
     "prometheus_client": {"daemon"},
     "pyarrow": {"fleet"},
     "rerun": {"operations"},

@@ -10,15 +10,17 @@ import argparse
 import html
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from ident_service.cli import parser
+from ident_service.cli.arguments import HELP_GROUPS, Parser
 from ident_service.daemon.app import create_app
 from ident_service.daemon.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
+ELSEWHERE = re.compile(r'<(?:script|img|iframe|link)\b[^>]*?(?:src|href)="(?:https?:)?//[^"]*')
 PLACE = re.compile(r"<!-- made: ([a-z-]+) -->")
 
 
@@ -31,29 +33,38 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return PLACE.sub(lambda place: MADE[place[1]](), markdown)
 
 
+def on_post_page(output: str, **_: Any) -> str:
+    """Refuse a page that a browser would load something for from elsewhere.
+
+    Raises:
+        ValueError: it does; the site is read where there is no network.
+    """
+    if found := ELSEWHERE.search(output):
+        raise ValueError(f"the page loads from a network: {found[0]}")
+    return output
+
+
 def command_line() -> str:
-    """Return a section per command: what it does, its usage, and a table of its arguments."""
-    return "\n".join(_commands(parser(), "ident"))
+    """Return a section per command, in the groups of `ident --help`: usage, arguments, examples."""
+    top, lines = parser(), []
+    for title, names in HELP_GROUPS.items():
+        lines += [f"## {title}", ""]
+        for name in names:
+            if name in top.shown:
+                lines += _sections(f"ident {name}", _below(top)[name])
+    return "\n".join(lines)
 
 
-def _commands(command: argparse.ArgumentParser, name: str) -> Iterator[str]:
-    """Yield the sections of the commands below a command; hidden ones and earlier names are left out."""
-    for action in command._actions:  # argparse offers no other way to walk its commands
-        if not isinstance(action, argparse._SubParsersAction):
-            continue
-        for listed in action._choices_actions:
-            below = action.choices[listed.dest]
-            full = f"{name} {listed.dest}"
-            if any(isinstance(one, argparse._SubParsersAction) for one in below._actions):
-                yield from _commands(below, full)
-            else:
-                yield _section(full, below)
+def _below(command: Parser) -> Mapping[str, Parser]:
+    """Return the commands below a command, by name; argparse offers no other way to them."""
+    found = [action.choices for action in command._actions if isinstance(action, argparse._SubParsersAction)]
+    return found[0] if found else {}
 
 
-def _section(name: str, command: argparse.ArgumentParser) -> str:
-    about = command.description or ""
-    usage = " ".join(command.format_usage().removeprefix("usage: ").split())
-    lines = [f"### {name}", "", _plain(about[:1].upper() + about[1:]) + ".", "", "```text", usage, "```", ""]
+def _sections(name: str, command: Parser) -> list[str]:
+    """Return the section of a command, and of those below it; former names are left out."""
+    lines = [f"### {name}", "", f"{_plain(command.description or '')}.", ""]
+    lines += ["```text", " ".join(command.format_usage().removeprefix("usage: ").split()), "```", ""]
     rows = [
         (", ".join(one.option_strings) or str(one.metavar or one.dest), one.help % _facts(one))
         for one in command._actions
@@ -61,7 +72,11 @@ def _section(name: str, command: argparse.ArgumentParser) -> str:
     ]
     if rows:
         lines += ["| argument | meaning |", "|---|---|", *(f"| `{_cell(a)}` | {_plain(b)} |" for a, b in rows), ""]
-    return "\n".join(lines)
+    if command.epilog:
+        lines += ["```text", command.epilog.strip(), "```", ""]
+    for below in command.shown:
+        lines += _sections(f"{name} {below}", _below(command)[below])
+    return lines
 
 
 def _facts(action: argparse.Action) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 `python tools/renew_viewer.py PACKAGE [VERSION]` needs npm, which checks the package against the registry's own hash. It
 writes the package's files, its licence and its document (name, version, licence, SHA-256 of each file), which a test
 reads. Look at the pages afterwards: `pytest tests/page` does so in a browser, offline. Packages: `rapidoc`, the viewer
-of the API's description at `/api/docs`; `uplot`, which draws time series.
+of the API's description at `/api/docs`; `uplot`, which draws time series; `three`, which draws the arm.
 """
 
 from __future__ import annotations
@@ -33,6 +33,15 @@ PACKAGES: Final[dict[str, tuple[str, dict[str, str]]]] = {
             "package/dist/uPlot.iife.min.js": "uPlot.iife.min.js",
             "package/dist/uPlot.min.css": "uPlot.min.css",
             "package/LICENSE": "uPlot.LICENSE.txt",
+        },
+    ),
+    # From 0.186 on it comes without minified files; name an earlier version, as 0.185.1.
+    "three": (
+        "three.json",
+        {
+            "package/build/three.core.min.js": "three.core.min.js",
+            "package/build/three.module.min.js": "three.module.min.js",
+            "package/LICENSE": "three.LICENSE.txt",
         },
     ),
 }

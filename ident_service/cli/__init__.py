@@ -27,6 +27,7 @@ from ident_service.cli import (
     remote,
 )
 from ident_service.cli.arguments import ArgumentsError, Parser, TopParser, VerbList, asks_for_json
+from ident_service.cli.next_command import next_after_error, next_line
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -41,7 +42,9 @@ from ident_service.cli.output import (
     print_error,
     print_to_person,
     state_folder,
+    styled,
 )
+from ident_service.cli.progress import progress_bar
 from ident_service.errors import (
     ArmFault,
     ConfigError,
@@ -60,7 +63,7 @@ __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", 
 
 GROUPS = (
     *(identification_commands, planning_commands, motion_commands, recovery_commands, archive_commands),
-    *(maintenance_commands, daemon_commands, remote, completion),
+    *(maintenance_commands, daemon_commands, remote),
 )
 # One rule for all verbs: USAGE when what was given cannot be used, be it words, a description or any other file; FAILED
 # when it was understood and came to nothing.
@@ -104,7 +107,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         verb: Callable[[argparse.Namespace], Answer] = (
             arguments.verb if arguments.server is None else remote.run_on_daemon
         )
-        code, text, document = _asked(verb, arguments)
+        with progress_bar(arguments):
+            code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
         # A second Ctrl-C: the person does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")
@@ -114,16 +118,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except IdentError as error:
         code = next(number for kind, number in _EXIT_CODES if isinstance(error, kind))
         notes = list(getattr(error, "__notes__", ()))
-        print_to_person("\n".join([f"ident: {error}", *notes]) + "\n")
+        head = styled(sys.stderr, "ident:", "error")
+        print_to_person("\n".join([f"{head} {error}", *notes]) + f"\n{next_after_error(arguments, error)}")
         if arguments.json:
             print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
         return code
     try:
-        print_answer(arguments, code, text, document)
+        print_answer(arguments, code, text, document, "" if arguments.json else next_line(arguments, code, document))
     except OSError as error:
         print_to_person(f"ident: done, but the output cannot be written: {error.strerror}\n")
         discard(sys.stdout)
-        return FAILED
+        return FAILED if code == DONE else code
     return code
 
 
@@ -158,12 +163,26 @@ def _name_registered(arguments: argparse.Namespace) -> None:
     """Replace ids of runs and motions by their paths in the state folder, where no file here has that name."""
     if getattr(arguments, "server", None) is not None:
         return
-    for name, folder, file in (("run", "runs", ""), ("reference", "runs", ""), ("motion", "motions", "motion.json")):
-        path = getattr(arguments, name, None)
-        if isinstance(path, Path) and len(path.parts) == 1 and not path.exists():
-            registered = state_folder(arguments) / folder / path / file
-            if registered.exists():
-                setattr(arguments, name, registered)
+    for name in ("run", "reference", "others", "motion", "recordings", "validate", "after"):
+        value = getattr(arguments, name, None)
+        if isinstance(value, Path):
+            setattr(arguments, name, _registered(arguments, name, value))
+        elif isinstance(value, list):
+            setattr(arguments, name, [_registered(arguments, name, path) for path in value])
+
+
+def _registered(arguments: argparse.Namespace, name: str, path: Path) -> Path:
+    if not isinstance(path, Path) or len(path.parts) != 1 or path.exists():
+        return path
+    state = state_folder(arguments)
+    if name == "motion":
+        motion = state / "motions" / path / "motion.json"
+        return motion if motion.is_file() else path
+    if name in ("run", "reference", "others"):
+        return state / "runs" / path if (state / "runs" / path).is_dir() else path
+    run, at, seconds = path.name.partition("@")
+    found = [state / "runs" / run / file for file in ("run.mcap", "identification.mcap")]
+    return next((one.with_name(f"{one.name}{at}{seconds}") for one in found if one.is_file()), path)
 
 
 def _mistakes(arguments: argparse.Namespace) -> ConfigError | None:

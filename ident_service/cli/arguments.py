@@ -36,6 +36,7 @@ HELP_GROUPS: dict[str, tuple[str, ...]] = {
 
 LOCAL_ONLY: dict[str, str] = {
     "serve": "it is the daemon",
+    "schema": "it is the same for every machine of this version",
     "completion": "it is for the shell that it is typed into",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
     **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
@@ -338,6 +339,26 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
             f"--columns {of_all[1]}: one file is for all recordings; write RECORDING=FILE for those that differ"
         )
     return (of_all[0] if of_all else None), of_one
+
+
+def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
+    """Return the file of the known payload of each recording.
+
+    Args:
+        given: values of `--payload`, `RECORDING=FILE`.
+
+    Raises:
+        UsageError: no recording or no file in one, or two for one recording.
+    """
+    found: dict[Path, Path] = {}
+    for words in given:
+        recording, equals, file = words.partition("=")
+        if not (recording and equals and file):
+            raise UsageError(f"--payload {words}: write RECORDING=FILE, the recording and the file of its known load")
+        if Path(recording) in found:
+            raise UsageError(f"--payload {words}: {recording} has a payload already")
+        found[Path(recording)] = Path(file)
+    return found
 
 
 def seed(text: str) -> int:

@@ -12,8 +12,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
+from ident_service.cli.arguments import (
+    FEASIBLE_SETS,
+    VerbList,
+    columns_files,
+    delay,
+    did_you_mean,
+    payload_files_of,
+    replicates,
+    seed,
+    weight,
+    workers,
+)
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
+from ident_service.cli.progress import step_of
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
 
@@ -70,6 +82,18 @@ def _add_commission(verbs: VerbList) -> None:
         help="YAML file with column names and units, for all recordings or one; may be repeated",
     )
     sub.add_argument(
+        "--payload",
+        action="append",
+        default=[],
+        metavar="RECORDING=FILE",
+        help="YAML file with mass and center_of_mass of the known load in a recording; may be repeated",
+    )
+    sub.add_argument(
+        "--torque-constants",
+        action="store_true",
+        help="also identify every motor's torque constant; needs a recording with a known load (--payload)",
+    )
+    sub.add_argument(
         "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
     )
     sub.add_argument("--method", choices=["ols", "wls", "huber", "iv"], help="default: the arm's")
@@ -124,6 +148,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
             described=described,
             custom=custom_of(arguments.arm, described),
             tell=lambda line: tell(arguments, line),
+            step=step_of(arguments),
             stop_requested=stopping.requested,
         )
     scored, estimate = result.score, result.estimate
@@ -170,6 +195,8 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         validation=tuple(arguments.validate),
         columns=columns,
         columns_of=columns_of,
+        payloads=payload_files_of(arguments.payload),
+        torque_constants=arguments.torque_constants,
         cut_standstill=arguments.cut_standstill,
         method=arguments.method,
         set_name=arguments.feasible_set,
@@ -183,7 +210,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         second_opinion=arguments.second_opinion,
     )
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name)
-    result = identify_files(request, folder, lambda line: tell(arguments, line))
+    result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
     text = summary(estimate, result.unusable, result.torque, result.warnings)
@@ -201,7 +228,7 @@ def _exit_code(document: dict[str, Any]) -> int:
 def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Sequence[str]) -> dict[str, Any]:
     from ident_service.results.assessment import assess_estimate
     from ident_service.results.parameter_file import convex_document
-    from ident_service.results.summary import how_fitted, implausible_links
+    from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
     own = estimate.candidates[estimate.chosen]
     found = assess_estimate(estimate, unusable, warnings)
@@ -229,6 +256,7 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Se
             for candidate in estimate.candidates
         ],
         "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+        **torque_constants_document(estimate),
         **convex_document(estimate),
     }
 
@@ -321,7 +349,7 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     arm_model(config)  # what cannot be used is told before workers start
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name, "fleets")
-    result = identify_fleet(request, folder, lambda line: tell(arguments, line))
+    result = identify_fleet(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     good = not result.document["left_out"] and not result.changed
     return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
 
@@ -385,6 +413,17 @@ def accepted_name(path: Path) -> str | None:
     return name if word == "accepted" and name and "/" not in name and not path.exists() else None
 
 
+def _require_arm(arm: str, known: Sequence[str]) -> None:
+    """Refuse `accepted:NAME` of an arm of which nothing is known.
+
+    Raises:
+        UsageError: with the arms that are.
+    """
+    if arm not in known:
+        there = f"; known are {', '.join(known)}" if known else ""
+        raise UsageError(f"accepted:{arm}: no arm of this name has an accepted set{did_you_mean(arm, known) or there}")
+
+
 def _compare(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.parameter_files import KEPT, compare_files, compare_into
     from ident_service.results.comparison.presentation import comparison_document, comparison_text
@@ -392,7 +431,9 @@ def _compare(arguments: argparse.Namespace) -> Answer:
     reference = arguments.reference
     if (arm := accepted_name(reference)) is not None:
         from ident_service.operations.acceptance import PARAMETERS, accepted_set
+        from ident_service.registry.state_folder import known_arms
 
+        _require_arm(arm, known_arms(state_folder(arguments)))
         reference = accepted_set(state_folder(arguments), arm)[1] / PARAMETERS
     if arguments.keep:
         if len(arguments.others) != 1 or not arguments.others[0].is_dir():
@@ -585,7 +626,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
     formats = known_formats(arguments.format)
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "exports")
-    made = export_run(arguments.run, formats, folder)
+    made = export_run(arguments.run, formats, folder, step_of(arguments))
     lines, files = [f"files: {folder}"], []
     for export in made:
         lines.append(f"  {export.name} ({export.format})")
@@ -617,7 +658,10 @@ def _add_results(verbs: VerbList) -> None:
     sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
 
-    sub = verbs.add("view", _view, "show a run in Rerun: the arm, its joints, what the parameters leave of the torques")
+    sub = verbs.add(
+        *("view", _view, "show a run in Rerun: the arm, its joints, its residuals"),
+        examples=("result", "result --save result.rrd"),
+    )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
     sub.add_argument(
         *("--recording",), type=Path, action="append", default=[], metavar="FILE",

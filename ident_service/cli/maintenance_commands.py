@@ -9,6 +9,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.archive_commands import add_by, terminal_user
@@ -173,19 +174,19 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as db:
         name = _known(db, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
-        due = pending(db, name)
+        due = _with_accepted(state_folder(arguments), pending(db, name))
     text = f"{name}: recorded: {row['what']}\n" + "".join(due_line(one) for one in due)
     if not due:
         text += f"nothing is due after it; see `ident schedules add {name} --maintenance`\n"
-    return DONE, text, {**row, "due": [dict(one) for one in due]}
+    return DONE, text, {**row, "due": due}
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import pending
 
     with registry(arguments) as db:
-        rows = pending(db, arguments.arm)
-    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": [dict(row) for row in rows]}
+        rows = _with_accepted(state_folder(arguments), pending(db, arguments.arm))
+    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -225,8 +226,18 @@ def schedule_line(row: Row) -> str:
 
 
 def due_line(row: Row) -> str:
-    """Format one re-identification that is due as a line for a person."""
-    return f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}; `ident reidentify {row['arm']}`\n"
+    """Format one re-identification that is due as a line for a person; it needs an `accepted` set to compare with."""
+    line = f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}"
+    if row["accepted"]:
+        return f"{line}; `ident reidentify {row['arm']}`\n"
+    return f"{line}; nothing of it has been accepted to compare with: run, identify and accept it first\n"
+
+
+def _with_accepted(state: Path, rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return due re-identifications, each with whether its arm has an accepted set."""
+    from ident_service.operations.acceptance import acceptances
+
+    return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in rows]
 
 
 def alarm_lines(rows: Sequence[Row]) -> str:

@@ -34,6 +34,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 RELEASED = 0.15  # s without the key, after which it counts as released
 REPEATS = 4  # in a row, each in time, before it counts as held
 KEY = b" "
+_AROUND = 8.0  # s that approach, return and holding take, as a rule; for the time that is left, and for nothing else
 _MOST_MISSED = 10  # parameters that are printed
 
 
@@ -153,6 +155,7 @@ def run_and_report(
     Raises:
         As `service.run.run_motion`; MotionRefused without a ticket.
     """
+    from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.command_channel import LEASE_SECONDS
     from ident_service.motion.ticket import read_ticket
     from ident_service.operations.motion_run import run_motion
@@ -170,6 +173,20 @@ def run_and_report(
         begun = True
         tell(arguments, f"{config.name}: {sentence}, into {folder}")
 
+    step, words, reached = step_of(arguments), "preparing the motion", 0.0
+    whole = motion.duration / speed if isinstance(motion, Excitation) else None
+
+    def entered(state_name: str) -> None:
+        nonlocal words
+        words = state_name
+        tell(arguments, state_name)
+
+    def moved(seconds: float) -> None:
+        nonlocal reached
+        if seconds > reached:
+            reached = seconds
+            step(words, None if whole is None else min(seconds / (whole + _AROUND), 1.0))
+
     try:
         ran = run_motion(
             config,
@@ -182,7 +199,8 @@ def run_and_report(
             log_frames=arguments.can_log,
             begin=begin,
             asked_ns=arguments.asked_ns,
-            tell=lambda word: tell(arguments, word),
+            tell=entered,
+            moved=moved,
             stop_requested=stop_requested,
             until=until,
         )
@@ -220,12 +238,31 @@ def add_dry_run(sub: Parser) -> None:
     sub.add_argument("--dry-run", action="store_true", help=text)
 
 
+def described_arm(arguments: argparse.Namespace) -> ArmConfig:
+    """Load the description of a verb's arm: a file, a shipped one, or one that was uploaded to the daemon here.
+
+    Raises:
+        UsageError: there is none of this name.
+        ConfigError: every mistake in it.
+    """
+    from ident_service.config.load import load_arm
+
+    try:
+        return load_arm(arguments.arm)
+    except UsageError:
+        from ident_service.registry.arms import uploaded_description
+
+        path = uploaded_description(state_folder(arguments), str(arguments.arm))
+        if path is None:
+            raise
+        return load_arm(path)
+
+
 def dry_run(arguments: argparse.Namespace) -> Answer:
     """Return what opening the arm of a verb would write into its drives; nothing is written and nothing moves."""
-    from ident_service.config.load import load_arm
     from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     planned = planned_configuration(config)
     code = VERDICT_NO if any(one.refused for one in planned) else DONE
     return code, planned_text(config, planned), planned_document(config, planned)
@@ -407,26 +444,35 @@ def _chosen(config: ArmConfig, motion: Path | None) -> Excitation:
 
 
 def _watch(arguments: argparse.Namespace) -> Answer:
-    from ident_service.config.load import load_arm
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import controlling_pid
     from ident_service.motion.read_only_monitor import watch
     from ident_service.operations.arm_checks import watch_document, watch_text
     from ident_service.registry.state_folder import control_path
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
         raise DriverError(f"{config.name}: process {pid} is moving the arm; see its recording")
     stopping = StopOnSignal()
+    step_of(arguments)("watching", left=arguments.seconds)
     with stopping:
         seen = watch(make_arm(config), arguments.seconds, stop_requested=stopping.requested)
     return DONE, watch_text(seen), watch_document(seen)
 
 
+# By the check that was made last: what follows it, and the share of the time that is over, as for an arm of two joints.
+_PREFLIGHT = {
+    "configuration": ("checking that the motion fits", 0.02),
+    "motion_fits": ("proving that it keeps all limits", 0.03),
+    "motion_proven": ("looking at the arm at rest", 0.28),
+    "noise": ("moving each joint a little", 0.3),
+    "gravity": ("testing the drives' watchdog", 0.95),
+}
+
+
 def _check(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import ControlFile, InterruptibleArm
@@ -438,12 +484,12 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.recordings.files import require_writable
     from ident_service.registry.state_folder import arm_folder, control_path, fault_file, ticket_path
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
 
     def confirm(question: str) -> str:
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     if arguments.scale:
         return _scale(arguments, config)
@@ -466,6 +512,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     ):
         stoppable = InterruptibleArm(arm, stop_or_lapsed(lambda: controls.stop or stopping.requested(), lease))
         positions = PositionFile(arm_folder(state, config.name), config)
+        step = step_of(arguments)
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
@@ -474,6 +521,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
                 model,
                 motion,
                 confirm=confirm,
+                tell=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
                 rate_seconds=seconds,
                 closed=closed,
                 announce=lambda action: tell(arguments, f"{config.name}: {action}"),
@@ -491,7 +539,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
     if arguments.json or not sys.stdin.isatty():
         raise UsageError("--scale needs a person at a terminal who turns each joint by hand")
-    found = check_scale(config, writable_state_folder(arguments), lambda question: input(f"{question} "))
+    found = check_scale(config, writable_state_folder(arguments), lambda question: ask(arguments, f"{question} "))
     lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]
     lines.append(f"kept in {FILE} of the arm's folder" if found else "no joint was turned")
     good = bool(found) and all(one.good for one in found)
@@ -513,9 +561,8 @@ def _move(arguments: argparse.Namespace, share_of_speed: float, seconds: float |
     """Run a motion; `seconds` is the duration of the lease [s] that a program renews, the default one if None."""
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     lease = requested_lease(arguments, config, seconds)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s"
@@ -557,13 +604,12 @@ def _target(arguments: argparse.Namespace) -> Target | None:
 def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 
     if arguments.lease_from_stdin:
         return _move(arguments, share_of_speed, HOLD_TO_RUN_SECONDS)
     terminal = require_terminal(arguments)
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     motion = _chosen(config, arguments.motion)
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
@@ -620,6 +666,14 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
     return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
 
 
+_ASKED = {
+    "pause": "pause requested of",
+    "resume": "resumption requested of",
+    "finish": "early end requested of",
+    "supported": "support confirmed to",
+}
+
+
 def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.command_channel import ControlFile, in_use
 
@@ -642,7 +696,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
         pid = controls.pid
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
-    return DONE, f"{name}: {arguments.asks} requested of process {pid}\n", document
+    return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
@@ -653,17 +707,23 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
     """
     typed = arguments.confirm
     if typed is None and sys.stdin.isatty() and not arguments.json:
-        typed = input(f"{name} {follows}. If it is supported and nobody is under it, type its name: ").strip()
+        question = f"{name} {follows}. If it is supported and nobody is under it, type its name: "
+        typed = ask(arguments, question).strip()
     if typed != name:
         raise UsageError(f"confirm that the arm is supported by its name: --confirm {name}; nothing has changed")
 
 
 def _release_drives(arguments: argparse.Namespace) -> Answer:
     """Switch off the drives that still hold an arm after the motion process has ended."""
-    from ident_service.config.load import load_arm
     from ident_service.operations.recovery import release_held_drives
 
-    config = load_arm(arguments.arm)
+    try:
+        config = described_arm(arguments)
+    except UsageError:
+        raise UsageError(
+            f"{arguments.arm}: no process holds it, and nothing has changed; without its description its drives cannot "
+            "be asked whether they hold it: give the description's file instead of the name"
+        ) from None
     held = release_held_drives(config, writable_state_folder(arguments))
     write_audit_entry(arguments, "supported", config.name, reached=[config.name])
     document = {"arm": config.name, "asked": "supported", "let_go": list(held)}

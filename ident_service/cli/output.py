@@ -43,22 +43,27 @@ def styled(stream: TextIO | None, text: str, style: str) -> str:
     return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
 
 
-def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:
-    """Print a verb's answer as text, or with `--json` as one JSON object."""
+def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any], last: str = "") -> None:
+    """Print a verb's answer as text with a last line, or with `--json` as one JSON object."""
     if arguments.json:
         _print_json({**document, "exit_code": code})
     else:
-        write(sys.stdout, text)
+        write(sys.stdout, text + styled(sys.stdout, last, "next") if last else text)
 
 
 def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
-    """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`."""
-    _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
+    """Print the one JSON object of a command that failed; `kind` is the name of an error of `errors.py`.
+
+    Where it cannot be written, on a full disk for example, the exit code is left to say it.
+    """
+    with suppress(OSError):
+        _print_json({"error": {"kind": kind, "message": message}, **(more or {}), "exit_code": code})
 
 
 def print_to_person(text: str) -> None:
-    """Print on stderr; a closed stderr is ignored."""
-    write(sys.stderr, text)
+    """Print on stderr; one that is closed, or on a full disk, is ignored."""
+    with suppress(OSError):
+        write(sys.stderr, text)
 
 
 def _print_json(document: dict[str, Any]) -> None:
@@ -67,6 +72,9 @@ def _print_json(document: dict[str, Any]) -> None:
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
     """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
+    bar = getattr(arguments, "progress", None)
+    if bar is not None and sys.stdout is not None and sys.stdout.isatty() and bar.tell(line):
+        return
     # With --json, stdout belongs to the one object.
     with suppress(OSError):
         write(sys.stderr if arguments.json else sys.stdout, line + "\n")
@@ -85,8 +93,24 @@ def write(stream: TextIO | None, text: str) -> None:
         stream.flush()
     except OSError as error:
         if error.errno not in (errno.EPIPE, errno.EIO):
+            _forget_unwritten(stream)
             raise
         discard(stream)
+
+
+def _forget_unwritten(stream: TextIO) -> None:
+    """Drop what a stream could not write, which would fail again with each later line and at exit; later lines count.
+
+    A stream without a file has nothing that could be dropped.
+    """
+    with suppress(OSError, ValueError):
+        kept = os.dup(stream.fileno())
+        try:
+            discard(stream)
+            stream.flush()
+            os.dup2(kept, stream.fileno())
+        finally:
+            os.close(kept)
 
 
 def discard(stream: TextIO) -> None:
@@ -211,11 +235,14 @@ def _ticket(values: Any) -> str:
 def lines_of(value: Any, indent: str = "") -> Iterator[str]:
     """Yield one line per value of a JSON object or list; nested values are indented by two spaces.
 
-    Lists of plain values, and plain values, stand on the line of their name.
+    Lists of plain values, and plain values, stand on the line of their name; sentences have a line each.
     """
     pairs = value.items() if isinstance(value, dict) else enumerate(value, 1)
     for name, part in pairs:
-        if isinstance(part, dict | list) and not _plain(part):
+        if isinstance(part, list) and any(isinstance(one, str) and one.endswith(".") for one in part):  # sentences
+            yield f"{indent}{name}:"
+            yield from (f"{indent}  {one}" for one in part)
+        elif isinstance(part, dict | list) and not _plain(part):
             yield f"{indent}{name}:"
             yield from lines_of(part, indent + "  ")
         else:

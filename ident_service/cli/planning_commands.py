@@ -21,6 +21,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
@@ -141,7 +142,6 @@ def _design(arguments: argparse.Namespace) -> Answer:
     stopping = StopOnSignal()
     with stopping:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
-    _progress_end(arguments)
     unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
     if unfinished:
         sys.stderr.write(f"ident: {unfinished}\n")
@@ -162,27 +162,24 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
-    """Return a callback that shows search progress: one line rewritten on a terminal, else a new one every 10 s."""
-    stream = sys.stderr
+    """Return a callback that shows the progress of a search: a bar on a terminal, else a line every 10 s."""
+    step, terminal = step_of(arguments), sys.stderr.isatty() and not arguments.json
     last = [-10.0]
 
     def show(progress: Progress) -> None:
+        if terminal:
+            found = "" if progress.best is None else f", best {progress.best:.4g}"
+            known = progress.remaining == progress.remaining
+            step(f"{progress.phase}: {progress.finished}{found}", None, progress.remaining if known else None)
+            return
         best = "none yet" if progress.best is None else f"{progress.best:.4f}"
         left = f", about {progress.remaining:.0f} s left" if progress.remaining == progress.remaining else ""
         words = f"{progress.phase}: {progress.finished} starts, best {best}, {progress.elapsed:.0f} s{left}"
-        if stream.isatty():
-            stream.write(f"\r{words}\x1b[K")
-            stream.flush()
-        elif progress.elapsed - last[0] >= 10.0:
+        if progress.elapsed - last[0] >= 10.0:
             last[0] = progress.elapsed
             tell(arguments, words)
 
     return show
-
-
-def _progress_end(arguments: argparse.Namespace) -> None:
-    if sys.stderr.isatty():
-        sys.stderr.write("\r\x1b[K")
 
 
 def _preview(arguments: argparse.Namespace) -> Answer:
@@ -204,14 +201,21 @@ def _add_configs(verbs: VerbList) -> None:
         "new",
         _new,
         "write a first description of an arm",
-        more="From its URDF, with a simulated driver.",
-        examples=("robot.urdf", "robot.urdf --tip wrist_3_link --out my_arm.yaml"),
+        more="From its URDF, MJCF or DH table, with a simulated driver.",
+        examples=(
+            "robot.urdf",
+            "robot.xml --tip wrist_3_link --out my_arm.yaml",
+            "table.csv --convention modified",
+        ),
     )
-    new.add_argument("urdf", metavar="URDF", type=Path)
+    help_source = "URDF (.urdf, .xml), MJCF (.xml), or DH table (.csv, .yaml)"
+    new.add_argument("source", metavar="FILE", type=Path, help=help_source)
     new.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: NAME.yaml here)")
-    new.add_argument("--name", help="of the arm (default: the URDF's file name)")
-    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: the root)")
+    new.add_argument("--name", help="of the arm (default: the file's)")
+    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: found)")
     new.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where the gripper begins)")
+    help_convention = "of a DH table that does not say it: standard (distal frames) or modified (Craig)"
+    new.add_argument("--convention", choices=["standard", "modified"], help=help_convention)
     config = verbs.group("config", "check arm descriptions")
     check = config.add(
         "check",
@@ -221,7 +225,10 @@ def _add_configs(verbs: VerbList) -> None:
         examples=("my_arm.yaml", "wam7"),
     )
     check.add_argument("file", metavar="FILE")
-    schema = verbs.add("schema", _schema, "print the JSON schema of a file format, for editors and other tools")
+    schema = verbs.add(
+        *("schema", _schema, "print the JSON schema of a file format"),
+        examples=("arm", "parameters"),
+    )
     schema.add_argument("of", metavar="FORMAT", choices=_SCHEMAS, help=f"{', '.join(_SCHEMAS)}; arm is a description")
 
 
@@ -245,11 +252,10 @@ def _new(arguments: argparse.Namespace) -> Answer:
     def tell(line: str) -> None:
         print_to_person(f"{line} ...\n")
 
-    words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
-    path, guessed = new_description(*words, tell)
+    words = (arguments.source, arguments.out, arguments.name, arguments.base, arguments.tip)
+    path, guessed = new_description(*words, tell, arguments.convention)
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
-    lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
     return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 
@@ -365,7 +371,7 @@ def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
     """Require that a person has typed the arm's name; raises UsageError."""
     typed = arguments.confirm
     if typed is None and sys.stdin.isatty() and not arguments.json:
-        typed = input(f"{name}: {what}. Type the arm's name to go on: ").strip()
+        typed = ask(arguments, f"{name}: {what}. Type the arm's name to go on: ").strip()
     if typed != name:
         raise UsageError(f"{what}: that is confirmed by the arm's name, typed: --confirm {name}; nothing was written")
 
@@ -409,7 +415,7 @@ def _driver_test(arguments: argparse.Namespace) -> Answer:
     def confirm(question: str) -> str:
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(question) if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, question) if sys.stdin.isatty() and not arguments.json else ""
 
     with ControlFile.take(control_path(writable_state_folder(arguments), config.name), None):
         found = try_driver(config, confirm)
@@ -481,6 +487,7 @@ def _doctor(arguments: argparse.Namespace) -> Answer:
     findings = kernel_findings(settings) + ([] if config is None else bus_findings(config))
     tell(arguments, f"measuring wake-up latency for {arguments.seconds:g} s; Ctrl-C ends it early")
     stopping = StopOnSignal()
+    step_of(arguments)("measuring wake-up latency", left=arguments.seconds)
     with stopping:
         woken = measure_wake_up(measuring_rate(rate), arguments.seconds, settings, stop_requested=stopping.requested)
     held = judge_rates(woken, rate, None if config is None else config.control.longest_stall, watchdogs)

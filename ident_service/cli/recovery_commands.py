@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Final
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
-from ident_service.cli.motion_commands import add_can_log, add_dry_run, dry_run, run_and_report
+from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
+from ident_service.cli.next_command import command
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -30,6 +31,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
 if TYPE_CHECKING:
@@ -87,10 +89,9 @@ def _add_recovery(verbs: VerbList) -> None:
 def _home(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.motion.run_plan import Destination
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if arguments.zero:
         if arguments.out is not None or arguments.can_log:
             raise UsageError("--out and --can-log are for a motion; here nothing moves")
@@ -129,11 +130,12 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)
     write_audit_entry(arguments, "home", config.name, reached=[config.name])
+    supported = command(arguments, ["supported", arguments.arm])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
-        return DONE, f"{config.name}: at home; held there until `ident supported {arguments.arm}`\n", document
+        return DONE, f"{config.name}: at home; held there until `{supported}`\n", document
     why = "see the events of its run" if stage is Homing.REFUSED else "it was stopped"
-    held = f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "it is not held"
+    held = f"it is still held: support it, then `{supported}`" if in_use(path) else "it is not held"
     return FAILED, f"{config.name}: not moved home, {why}; {held}\n", document
 
 
@@ -150,7 +152,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
@@ -159,7 +161,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
         lines.append(
             "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )
-    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident preflight {arguments.arm}`")
+    lines.append("compare what `ident watch` shows with the arm, then make a new preflight")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -167,11 +169,10 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 def _recover(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from ident_service.config.load import load_arm
     from ident_service.operations.arm_checks import watch_document
     from ident_service.operations.recovery import recover
 
-    config = load_arm(arguments.arm)
+    config = described_arm(arguments)
     if arguments.leave_limit:
         from ident_service.motion.run_plan import Destination
 
@@ -236,7 +237,7 @@ def _text(found: Recovery) -> str:
     lines += [f"  outside its position limits: {words}" for words in found.outside]
     if found.seen is not None:
         lines += ["", watch_text(found.seen).rstrip("\n")]
-    lines += ["", "next:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
+    lines += ["", "steps:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
     return "\n".join(lines)
 
 
@@ -316,6 +317,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
 
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
+    parsed.progress = getattr(arguments, "progress", None)
     parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
     tell(arguments, f"-- {words[0]}")
     try:

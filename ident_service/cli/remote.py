@@ -9,8 +9,8 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,9 +27,10 @@ from ident_service.cli.output import (
     tell,
     with_answer_lines,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.cli.remote_recordings import file_of, recording, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
-from ident_service.errors import AccessRefused, IdentError, UnknownId, UsageError
+from ident_service.errors import AccessRefused, ArmError, IdentError, UnknownId, UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -93,9 +94,9 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
 
 def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
     """Return the verbs that a daemon can do, and for each the arguments that are sent to it."""
-    from ident_service.cli import remote_maintenance, remote_results, remote_watching
+    from ident_service.cli import remote_results, remote_watching
 
-    groups = (remote_maintenance, remote_results, remote_watching)
+    groups = (remote_results, remote_watching)
     verbs, carried = dict(REMOTE), dict(_CARRIED)
     for group in groups:
         verbs |= group.VERBS
@@ -124,6 +125,19 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     return connected
 
 
+@contextmanager
+def telling_of_arm(arm: str, job: str) -> Iterator[None]:
+    """Add to the error of a daemon that is gone what becomes of the arm that it moved."""
+    from ident_service.client import left_alone
+
+    try:
+        yield
+    except ArmError as gone:
+        if type(gone) is not ArmError:
+            raise
+        raise left_alone(gone, arm, job) from None
+
+
 def job_verb(
     make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = with_answer_lines
 ) -> Verb:
@@ -142,7 +156,9 @@ def job_verb(
             body["confirm"] = confirmation(client, arguments)
         made = client.post("/api/v1/jobs", body)
         tell(arguments, f"job {made['id']}")
-        return ended(client, arguments, _wait_for_job(client, arguments, made, moves=moves))
+        with telling_of_arm(arguments.arm, made["id"]) if moves else nullcontext():
+            answer = _wait_for_job(client, arguments, made, moves=moves)
+        return ended(client, arguments, answer)
 
     return verb
 
@@ -224,27 +240,16 @@ def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     arm = arguments.arm
-    answer = client.post("/api/v1/stop" if arm is None else f"/api/v1/arms/{word_of_address(arm)}/stop")
-    names = ", ".join([*answer["arms"], *answer["jobs"]])
-    if arm is not None and not names and not _known(client, arm):
-        return (
-            USAGE,
-            f"{arm}: the daemon has no arm of this name; `ident stop --server {client.url}` stops all\n",
-            answer,
-        )
-    nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
-    return DONE, f"stop requested of {names}\n" if names else f"{nobody}\n", answer
-
-
-def _known(client: IdentClient, arm: str) -> bool:
-    """Return whether the daemon knows the arm, once the stop has been sent; True if it does not answer."""
     try:
-        client.get(f"/api/v1/arms/{word_of_address(arm)}")
+        answer = client.post("/api/v1/stop" if arm is None else f"/api/v1/arms/{word_of_address(arm)}/stop")
     except UnknownId:
-        return False
-    except IdentError:
-        return True
-    return True
+        text = f"{arm}: the daemon has no arm of this name; `ident stop --server {client.url}` stops all\n"
+        return USAGE, text, {"arms": [], "jobs": []}
+    parts = [f"stop requested of {', '.join(answer['arms'])}"] if answer["arms"] else []
+    parts += [f"cancelled: {', '.join(f'job {job}' for job in answer['jobs'])}"] if answer["jobs"] else []
+    names = "; ".join(parts)
+    nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
+    return DONE, f"{names or nobody}\n", answer
 
 
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -258,7 +263,10 @@ def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     name = typed(arguments)
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
-        raise UsageError(f"{name}: not held there")
+        raise UsageError(
+            f"{name}: no process of the daemon's machine holds it; nothing has changed. If its drives hold it by "
+            f"themselves, `ident supported {name}` there releases them"
+        )
     return DONE, f"{name}: support confirmed\n", answer
 
 
@@ -307,7 +315,9 @@ REMOTE: dict[str, Verb] = {
 
 
 # Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
-_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind"})
+_OURS = frozenset(
+    {"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind", "progress"}
+)
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
@@ -343,7 +353,10 @@ def _wait_for_job(
             if job["held"] and not held:
                 for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
                     tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
-            said = (job["progress"] or {}).get("phase", job["state"])
+            known = job["progress"] or {}
+            state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
+            said = known.get("phase", state)
+            step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
             if said != phase:
                 phase = said
                 tell(arguments, phase)
@@ -380,7 +393,8 @@ def typed(arguments: argparse.Namespace) -> str:
     if name is None and sys.stdin.isatty() and not arguments.json:
         what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
         what = "is lowered" if getattr(arguments, "word", "") == "supported" else what
-        name = input(f"{arguments.arm} {what} where you may not see it. Type its name to confirm: ").strip()
+        question = f"{arguments.arm} {what} where you may not see it. Type its name to confirm: "
+        name = ask(arguments, question).strip()
     if name != arguments.arm:
         raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
     return str(name)

@@ -25,6 +25,7 @@ from ident_service.cli.remote import (
     motion_id,
     renew,
     run_job,
+    telling_of_arm,
     typed,
     word_of_address,
 )
@@ -121,7 +122,7 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read as text: {error}") from None
     found = client.post(f"{_API}/descriptions/check", {"description": text, "files": named_files(path)})
-    return VERDICT_NO if found["stable"] is False else DONE, found["text"], found
+    return DONE if found["good"] else VERDICT_NO, found["text"], found
 
 
 def _run(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -151,7 +152,8 @@ def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: i
         made = client.post(f"{_API}/jobs", body)
         tell(arguments, f"job {made['id']}")
         over = stopping.requested if key is None else lambda: stopping.requested() or key.released()
-        return job_answer(client, keep_rehearsal_lease(client, arguments, made, over))
+        with telling_of_arm(arguments.arm, made["id"]):
+            return job_answer(client, keep_rehearsal_lease(client, arguments, made, over))
 
 
 def keep_rehearsal_lease(

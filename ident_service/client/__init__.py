@@ -23,3 +23,4 @@ from ident_service.client.client import Job as Job
 from ident_service.client.client import LiveSample as LiveSample
 from ident_service.client.client import RemoteArm as RemoteArm
 from ident_service.client.client import RemoteMotion as RemoteMotion
+from ident_service.client.client import left_alone as left_alone

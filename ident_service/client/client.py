@@ -406,6 +406,23 @@ class RemoteArm:
         return RemoteMotion(self.client, _job(self.client.post(f"{_API}/jobs", body)))
 
 
+def left_alone(gone: ArmError, arm: str, job: str) -> ArmError:
+    """Return the error of a daemon that is gone, with what the arm does that it moved, and what shows it.
+
+    Args:
+        gone: why the daemon cannot be reached.
+        arm: name.
+        job: id of its motion.
+    """
+    return ArmError(
+        f"{gone}. {arm} stops by itself: a daemon that ends or dies lets its motions go, and each stops under control "
+        f"within two seconds of its last lease. An arm without brakes is then held until a person has supported it "
+        f"and says so: `ident supported {arm}`. `ident recover {arm}` at the daemon's machine shows how it stands, "
+        f"`ident stop {arm}` there stops it at once; neither needs the daemon. Once the daemon is back, `ident jobs "
+        f"show {job}` tells how the motion ended"
+    )
+
+
 class RemoteMotion:
     """A motion that was asked for; a `with` block renews its lease, and waits for its end.
 
@@ -420,6 +437,7 @@ class RemoteMotion:
     def __init__(self, client: IdentClient, begun: Job) -> None:
         """Take a job that the daemon has queued; its lease lasts two seconds from now."""
         self.client, self.id, self.uncertainty = client, begun.id, dict[str, Any]()
+        self._arm = str(begun.arm)
         self._ended: Job | None = None
         self._cancelled = False
         self._leaving = threading.Event()
@@ -473,10 +491,7 @@ class RemoteMotion:
                     self.cancel()
             self._ended = self.client.wait(self.id)
         except ArmError as gone:
-            raise ArmError(
-                f"{gone}. A daemon that ends brings its arms to rest first, and without a renewed lease the arm stops "
-                f"by itself. How the motion ended is told by the job {self.id}, once the daemon is there again"
-            ) from None
+            raise left_alone(gone, self._arm, self.id) from None
         finally:
             self._leaving.set()
             self._thread.join()

@@ -45,6 +45,10 @@ _OF_HTTP: Final[dict[str, type[IdentError]]] = {
     "Interrupted": IdentError,
 }
 """What refuses a request before it reaches anything that has an error of its own, by the kind that it is told with."""
+_UNAUTHORIZED: Final = (
+    "takes no request without a valid token, and this one is not: it was revoked, or is of another daemon, or none was "
+    "given; `ident tokens add NAME --role operator` makes one at the daemon's machine"
+)
 _PLACE: Final = re.compile(r"(?P<path>.+?):(?P<line>\d+):(?P<column>\d+): (?P<message>.*)", re.DOTALL)
 
 
@@ -72,6 +76,8 @@ class Connection:
         if parts.scheme == "http" and host not in ("127.0.0.1", "::1", "localhost"):
             raise UsageError(f"{url}: a token is sent to other machines over https only")
         self.url = url.rstrip("/")
+        if token is not None and not token.strip():
+            raise UsageError(f"{url}: the token is empty; give what `ident tokens add` has printed, or None for a stop")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         secure = parts.scheme == "https"
         # Without TLS no certificate is checked; an empty context is quicker to make.
@@ -272,5 +278,7 @@ def _error(url: str, status: int, document: Any) -> IdentError:
     kind, message = str(said.get("kind", "")), str(said.get("message", f"answered {status}"))
     if not kind:
         return ArmError(f"{url}: answered {status}; is it the daemon?")
+    if kind == "Unauthorized":
+        return AccessRefused(f"{url}: {_UNAUTHORIZED}")
     refused = kind in _OF_HTTP  # of which nothing says yet whose words they are
     return error_of(kind, f"{url}: {message}" if refused else message, said.get("dependents") or ())

@@ -304,7 +304,10 @@ class Identification(ExtendedSection):
     torque: Literal["measured", "commanded"] | None = None
     """Torque that drives measured, or were told; left out, what they measured where a recording has it in every sample.
     """
-    later = frozenset({"torque"})
+    torque_factors: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    """Factors that recorded torques of the motors are multiplied by [1], one a motor in the order of the transmission:
+    for recordings that were made with torque constants which have turned out to be wrong; all 1 when left out."""
+    later = frozenset({"torque", "torque_factors"})
 
     @model_validator(mode="after")
     def _averaged_instead(self) -> Identification:

@@ -91,6 +91,15 @@ class ArmAnswer(ArmLine):
     accepted: AcceptanceAnswer | None
 
 
+class AddedArmAnswer(ArmAnswer):
+    """Arm that was added; `objections` say why it cannot be moved, each with line and column of the description.
+
+    They are null where the same description was known already: it is judged once (`POST /descriptions/check`).
+    """
+
+    objections: list[str] | None
+
+
 class ChallengeAnswer(BaseModel):
     """Challenge that confirms one motion, once."""
 
@@ -122,8 +131,11 @@ class ProgressAnswer(BaseModel):
 class JobAnswer(BaseModel):
     """A job; `run` is the id of the run, motion or export that it makes or is about, null where it ended and made none.
 
+    `detail` says why it ended so, and of a queued job what it waits for.
+
     `held` says that its motion has stopped, and that the arm, which has no brakes, is held until a person confirms that
-    it is supported; until then the job runs.
+    it is supported. Until then the job runs; after a kill of the daemon it is `interrupted`, and the arm held all the
+    same.
     """
 
     number: int

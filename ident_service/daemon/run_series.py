@@ -132,8 +132,11 @@ def _whole(pieces: Iterator[tuple[Samples, tuple[str, ...]]]) -> tuple[Thinned, 
         high, low = np.fmax.reduceat(error, starts), np.fmin.reduceat(error, starts)
     return (
         Thinned(
-            parts[0].joints,
-            *(joined(name)[ends] for name in ("time", "position", "reference", "torque")),
+            joints=parts[0].joints,
+            time=joined("time")[ends],
+            position=joined("position")[ends],
+            reference=joined("reference")[ends],
+            torque=joined("torque")[ends],
             error=np.where(high >= -low, high, low),
             measured=None if any(part.measured is None for part in parts) else joined("measured")[ends],
         ),

@@ -216,6 +216,31 @@ def require_header(db: Database, state: Path, upload: str) -> None:
         (folder / _JUDGED).touch(0o600)
 
 
+def require_readable(path: Path, announced: Announced, config: ArmConfig) -> None:
+    """Refuse a file of which no job could read anything.
+
+    Its header is looked at; what is wrong behind that is told by the job that reads it.
+
+    Args:
+        path: of the file.
+        announced: it, as announced.
+        config: of its arm.
+
+    Raises:
+        RecordingError: neither MCAP nor CSV, or not of the arm's joints.
+    """
+    from ident_service.model.arm_model import arm_model
+    from ident_service.recordings.open import open_recording
+
+    form = format_of(announced.columns, announced.name, config) if announced.columns else config.recording
+    joints = arm_model(config).chain.names
+    try:
+        open_recording(path, joints, fmt=form, transmission=config.transmission)
+    except RecordingError as error:
+        words = str(error).removeprefix(f"{path}: ")
+        raise RecordingError(announced.name, f"no recording of {announced.arm} can be read from it: {words}") from None
+
+
 def known_upload(state: Path, upload: str) -> Upload:
     """Return the upload of this id, with the bytes received so far.
 
@@ -317,7 +342,8 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
     Raises:
         UnknownId: no such upload, or its arm is gone.
         AlreadyThere: it is not whole, or a piece is being written.
-        RecordingError: its content has another hash than was announced; what had arrived is deleted.
+        RecordingError: its content has another hash than was announced, or is no recording of the arm; what had
+            arrived is deleted.
     """
     seen = known_upload(state, upload)
     announced, folder = seen.announced, state / UPLOADS / upload
@@ -337,6 +363,7 @@ def complete_upload(db: Database, state: Path, upload: str, who: str) -> Upload:
             write_manifest(built)
             if named_files(built)[announced.name] != announced.sha256:
                 raise RecordingError(announced.name, "arrived with another hash than was announced; send it again")
+            require_readable(built / announced.name, announced, arm.config)
         shutil.rmtree(folder, ignore_errors=True)
     index_run(db, state, run)
     try:

@@ -54,8 +54,9 @@ from ident_service.recordings.resampling import grid
 
 _FORMAT: Final = 1
 STRETCHES: Final = 12  # kept of a recording, as few as the uncertainty of one needs
-FAN_IN: Final = 16  # factors that one task merges
-MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge in pairs beyond, so that memory does not grow with recordings
+FAN_IN: Final = 16  # factors that are merged at once
+AT_ONCE: Final = FAN_IN**2  # factors that one task merges, a whole branch of the tree: what it sends on is large
+MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge beyond, so that memory does not grow with recordings
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
 _PILOTS: Final = 3  # recordings that settle choices
@@ -385,6 +386,12 @@ def reduce_recording(part: Part, described: Described, store: Store, version: st
     return Outcome(part, row, computed=computed)
 
 
+def stored_rows(parts: Sequence[Part], described: Described, store: Store) -> list[Row | None]:
+    """Return the rows of parts that were reduced before, from files that are as they were; None for each other one."""
+    noted = [store.read(described.seen(part)) for part in parts]
+    return [None if note is None else stored_row(store, note.decode(errors="replace")) for note in noted]
+
+
 def _problem(source: Source, label: str, error: Exception) -> Problem:
     kind: Literal["storage", "recording"] = "storage" if isinstance(error, StorageError) else "recording"
     message = str(error) if isinstance(error, IdentError) else f"cannot be used: {error or type(error).__name__}"
@@ -548,7 +555,7 @@ def unpacked(content: bytes, described: Described) -> Merged:
 
 @one_blas_thread()
 def merge_stored(keys: Sequence[str], described: Described, store: Store, whole: bool) -> Merged | tuple[str, ...]:
-    """Merge stored factors, in the order given.
+    """Merge stored factors in the order given, in a tree of `FAN_IN` neighbours each.
 
     Args:
         keys: of the factors.
@@ -559,6 +566,13 @@ def merge_stored(keys: Sequence[str], described: Described, store: Store, whole:
     Returns:
         Their information; or the keys of those that are not there, or are damaged.
     """
+    level = [_merge_leaf(keys[k : k + FAN_IN], described, store, whole) for k in range(0, len(keys), FAN_IN)]
+    while len(level) > 1:
+        level = [merge(level[k : k + FAN_IN]) for k in range(0, len(level), FAN_IN)]
+    return level[0]
+
+
+def _merge_leaf(keys: Sequence[str], described: Described, store: Store, whole: bool) -> Merged | tuple[str, ...]:
     found, missing = [], []
     for key in keys:
         content = store.read(f"{FACTORS}/{key}.npz")
@@ -584,8 +598,8 @@ def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]
         return missing
     whole = [part for part in parts if isinstance(part, Merged)]
     clusters = [cluster for part in whole for cluster in part.clusters]
-    while len(clusters) > MOST_CLUSTERS:
-        clusters = [Information.sum(clusters[k : k + 2]) for k in range(0, len(clusters), 2)]
+    if (together := -(-len(clusters) // MOST_CLUSTERS)) > 1:
+        clusters = [Information.sum(clusters[k : k + together]) for k in range(0, len(clusters), together)]
     return Merged(
         Information.sum([part.moving for part in whole]),
         Information.sum([part.near for part in whole]),

@@ -40,7 +40,17 @@ from ident_service.fleet.population import (
     unlike,
     variance_shares,
 )
-from ident_service.fleet.reduction import FleetRequest, Reduced, Tell, absolute_url, connected, reduce_fleet
+from ident_service.fleet.reduction import (
+    REDUCED,
+    FleetRequest,
+    Reduced,
+    Step,
+    Tell,
+    absolute_url,
+    connected,
+    list_recordings,
+    reduce_fleet,
+)
 from ident_service.fleet.results import (
     FLEET,
     FORMAT,
@@ -71,13 +81,16 @@ from ident_service.results.manifest import (
 from ident_service.results.run_folder import write_manifest, write_results
 
 
-def identify_fleet(request: FleetRequest, folder: Path, tell: Tell = lambda _: None) -> FleetResult:
+def identify_fleet(
+    request: FleetRequest, folder: Path, tell: Tell = lambda _: None, step: Step = lambda words, share: None
+) -> FleetResult:
     """Identify a fleet and write the results.
 
     Args:
         request: what is asked for.
         folder: where results go; an earlier result there is replaced as a whole.
         tell: called with a line at each step.
+        step: called with what is being done and how much of all is done, from 0 to 1.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid, or the folder holds anything else.
@@ -87,11 +100,12 @@ def identify_fleet(request: FleetRequest, folder: Path, tell: Tell = lambda _: N
         SolverError: a solver stopped without an optimum.
     """
     _require_replaceable(folder)
+    listed = list_recordings(request)  # what cannot be is refused before workers start
+    for arm, _ in listed.whose.values():
+        _require_file_name(arm)
     with connected(request, tell) as client:
-        reduced = reduce_fleet(client, request, tell)
-        for arm in reduced.arms:
-            _require_file_name(arm)
-        result, written, splits = _analysed(client, request, reduced, folder, tell)
+        reduced = reduce_fleet(client, request, listed, tell, step)
+        result, written, splits = _analysed(client, request, reduced, folder, tell, step)
     with staging_beside(folder) as staging:
         _write(staging, result, written, splits, request)
         _require_replaceable(folder)
@@ -125,7 +139,7 @@ Files = Mapping[str, bytes]
 
 
 def _analysed(
-    client: Client, request: FleetRequest, reduced: Reduced, folder: Path, tell: Tell
+    client: Client, request: FleetRequest, reduced: Reduced, folder: Path, tell: Tell, step: Step
 ) -> tuple[FleetResult, dict[str, tuple[Files, dict[str, Any]]], dict[str, tuple[Files, Files]]]:
     described, arms = reduced.described, reduced.arms
     groups, method = described.groups, described.config.identification.method
@@ -137,6 +151,7 @@ def _analysed(
     def between(arm: str, count: int) -> Array | None:
         return None if reduced.trees[arm].by_recording else shares.recordings / count
 
+    step("fitting arms", REDUCED)
     tell(f"{len(arms)} arms: each alone, and all together")
     fitting = {
         arm: submit(arm_fit, tree.merged, method, between(arm, len(arms[arm]))) for arm, tree in reduced.trees.items()
@@ -166,6 +181,7 @@ def _analysed(
     scatter = scatter_of(arms, groups)
     changes = change_points(arms, fits, groups, scatter)
     depending = dependences(arms, groups, scatter)
+    step("estimates inside the feasible set", 0.9)
     tell("estimates inside the feasible set, with their proofs")
     files_of: dict[str, Any] = {}
     config = load_arm(request.arm).model_dump_json()

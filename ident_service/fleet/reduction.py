@@ -19,9 +19,11 @@ from typing import Any, Final, TypeVar
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from ident_service import __version__
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.errors import RecordingError, StorageError, Unavailable, UsageError
 from ident_service.fleet.factor import (
+    AT_ONCE,
     FACTORS,
     FAN_IN,
     SETTLED,
@@ -39,17 +41,22 @@ from ident_service.fleet.factor import (
     require_mergeable,
     settle,
     stored_row,
+    stored_rows,
 )
 from ident_service.fleet.storage import Source, Store, find
 
 _Result = TypeVar("_Result")
 Tell = Callable[[str], None]
+Step = Callable[[str, float], None]
+REDUCED = 0.7
+"""Share of the time of an identification of a fleet that the reduction of its recordings takes, as a rule."""
 
 PIECE_BYTES: Final = 256 * 2**20  # of a file, beyond which it is cut into pieces of time
 MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
 _ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
 _CONNECT_S: Final = 10.0
 _WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
+_LOOKED_UP: Final = 64  # recordings that one task looks up in the store
 _PILOTS_TRIED, _ARMS_TRIED = 20, 5  # recordings of an arm that choices may be settled with, and arms
 
 
@@ -239,24 +246,57 @@ def in_order(
         yield number, result
 
 
-def reduce_fleet(client: Client, request: FleetRequest, tell: Tell) -> Reduced:
+@dataclass(frozen=True)
+class Listed:
+    """Recordings that a request names, before anything is read or a worker started.
+
+    Attributes:
+        config: the description.
+        sources: the recordings.
+        whose: arm and date [s since 1970] of each, by URL; the date None where its name has none.
+    """
+
+    config: ArmConfig
+    sources: list[Source]
+    whose: dict[str, tuple[str, float | None]]
+
+
+def list_recordings(request: FleetRequest) -> Listed:
+    """Return the recordings of a request and whose they are.
+
+    Raises:
+        UsageError, ConfigError: the request or the description is not valid, or a pattern names nothing.
+        StorageError: the list cannot be reached.
+    """
+    config = load_arm(request.arm)
+    require_mergeable(config)
+    named = _naming(request.names)
+    sources = find(request.patterns)
+    return Listed(config, sources, {source.url: named(source.url) for source in sources})
+
+
+def reduce_fleet(
+    client: Client,
+    request: FleetRequest,
+    listed: Listed,
+    tell: Tell,
+    step: Step = lambda words, share: None,
+) -> Reduced:
     """Reduce recordings and merge those of each arm.
 
     Args:
         client: of the scheduler.
         request: what to reduce.
+        listed: its recordings.
         tell: called with a line at each step.
+        step: called with what is being done and how much of all is done, from 0 to 1.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid, or workers have other versions.
         RecordingError: no recording can be used.
         StorageError: the store, or the list of recordings, cannot be reached.
     """
-    config = load_arm(request.arm)
-    require_mergeable(config)
-    named = _naming(request.names)
-    sources = find(request.patterns)
-    whose = {source.url: named(source.url) for source in sources}
+    config, sources, whose = listed.config, listed.sources, listed.whose
     store = Store(absolute_url(request.store))
     arm_of = {url: arm for url, (arm, _) in whose.items()}
     described, pilot = _settled(client, sources, arm_of, config.model_dump_json(), config.sha256, store, request, tell)
@@ -267,7 +307,7 @@ def reduce_fleet(client: Client, request: FleetRequest, tell: Tell) -> Reduced:
         for number in range(count)
     ]
     reduced = Reduced(described, pilot)
-    outcomes = _mapped(client, parts, described, store, tell)
+    outcomes = _mapped(client, parts, described, store, tell, step)
     seen: dict[tuple[str, str], str] = {}
     for outcome in outcomes:
         source, row = outcome.part.source, outcome.row
@@ -363,23 +403,38 @@ def _settled(
     )
 
 
-def _mapped(client: Client, parts: Sequence[Part], described: Described, store: Store, tell: Tell) -> list[Outcome]:
+def _mapped(
+    client: Client, parts: Sequence[Part], described: Described, store: Store, tell: Tell, step: Step
+) -> list[Outcome]:
     """Return the outcome of each part, in their order."""
     outcomes: list[Outcome | None] = [None] * len(parts)
-    tasks = [(part, described, store, __version__) for part in parts]
+    groups = [range(k, min(k + _LOOKED_UP, len(parts))) for k in range(0, len(parts), _LOOKED_UP)]
+    asked = [([parts[k] for k in group], described, store) for group in groups]
+
+    def unknown(number: int) -> list[Row | None]:
+        return [None for _ in groups[number]]
+
+    for number, rows in in_order(client, stored_rows, asked, unknown):
+        for k, row in zip(groups[number], rows, strict=True):
+            outcomes[k] = None if row is None else Outcome(parts[k], row, computed=False)
+    new = [k for k, outcome in enumerate(outcomes) if outcome is None]
+    if len(new) < len(parts):
+        tell(f"{len(parts) - len(new)} of {len(parts)} recordings were reduced before")
+    tasks = [(parts[k], described, store, __version__) for k in new]
 
     def died(number: int) -> Outcome:
-        part = parts[number]
+        part = parts[new[number]]
         text = "ended every worker that read it, most likely for want of memory; give workers more with --memory"
         return Outcome(part, None, Problem(part.source.url, part.label, "worker", text))
 
-    step = max(len(parts) // 10, 1)
+    every = max(len(new) // 10, 1)
     for count, (number, outcome) in enumerate(in_order(client, reduce_recording, tasks, died), 1):
         if outcome.problem is not None and outcome.problem.kind == "version":
             raise UsageError(outcome.problem.message)
-        outcomes[number] = outcome
-        if count % step == 0 or count == len(parts):
-            tell(f"{count} of {len(parts)} recordings reduced")
+        outcomes[new[number]] = outcome
+        step("reducing recordings", REDUCED * count / len(new))
+        if count % every == 0 or count == len(new):
+            tell(f"{count} of {len(new)} recordings reduced")
     return [outcome for outcome in outcomes if outcome is not None]
 
 
@@ -422,8 +477,8 @@ def _tree(client: Client, recordings: Sequence[Recorded], described: Described, 
 
     def branch(of: Sequence[str]) -> Any:
         level = [
-            client.submit(merge_stored, of[k : k + FAN_IN], described, store, whole, pure=False)
-            for k in range(0, len(of), FAN_IN)
+            client.submit(merge_stored, of[k : k + AT_ONCE], described, store, whole, pure=False)
+            for k in range(0, len(of), AT_ONCE)
         ]
         while len(level) > 1:
             level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]

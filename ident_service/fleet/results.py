@@ -179,6 +179,7 @@ def fleet_document(
             {
                 "arm": one.arm,
                 "what": group_name(one.group, described),
+                "kind": "drift" if one.drift else "step",
                 "after": _when(one.before),
                 "until": _when(one.after),
                 "first_recording": reduced.arms[one.arm][one.at].name,
@@ -300,7 +301,8 @@ def _drawing(points: Array, common: float, change: Change | None) -> dict[str, A
         "bars": [(x(at), y(value - half), y(value + half), y(value)) for at, value, half in points.tolist()],
         "line": " ".join(f"{x(at)},{y(value)}" for at, value, _ in points.tolist()),
         "common": y(common),
-        "change": None if change is None else x(0.5 * (change.before + change.after)),
+        "change": None if change is None or change.drift else x(0.5 * (change.before + change.after)),
+        "drift": change is not None and change.drift,
         "low": f"{low:.3g}",
         "high": f"{high:.3g}",
         "first": _when(first)[:10],
@@ -339,6 +341,7 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
         {
             "arm": arm,
             "name": one.name,
+            "report": _report_beside(one.url),
             "at": _when(one.at)[:16].replace("T", " "),
             "seconds": one.row.seconds,
             "rate": one.row.rate,
@@ -365,6 +368,12 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
             table=TABLE,
         )
     )
+
+
+def _report_beside(url: str) -> str | None:
+    """Return the address of the report in a local recording's folder, as ident leaves it there; None without one."""
+    page = Path(url).with_name("report.html")
+    return page.absolute().as_uri() if "://" not in url and page.is_file() else None
 
 
 @cache
@@ -402,7 +411,8 @@ def fleet_text(result: FleetResult) -> str:
     ]
     lines.append(f"changed: {', '.join(dict.fromkeys(one['arm'] for one in document['changes'])) or 'no arm'}")
     lines += [
-        f"  {one['arm']}: {one['what']} between {one['after'][:10]} and {one['until'][:10]}, {one['sigma']:.1f} sigma"
+        f"  {one['arm']}: {one['what']}{' drifts' if one['kind'] == 'drift' else ''} between {one['after'][:10]} and "
+        f"{one['until'][:10]}, {one['sigma']:.1f} sigma"
         for one in document["changes"]
     ]
     lines += [f"  alarm: {one['arm']}: {one['what']}" for one in document.get("alarms", [])]

@@ -4,14 +4,15 @@ The estimates b_t of a group from single recordings have covariances C_t, and di
 of one arm. How much is estimated for the whole fleet from the differences of neighbours, robustly, so that the few that
 a change falls between do not hide it: a variance per parameter that is added to C_t, and one factor per group.
 
-A change at a split is tested by generalised least squares with a step there, and with the conditions that all of the
-arm's recordings carry (temperature, operating hours) as further columns:
+A change is tested by generalised least squares with a step at each split, and with a straight line over time: what
+wears drifts, and a step explains a drift badly. The conditions that all of the arm's recordings carry (temperature,
+operating hours) are further columns:
 
-    T^2 = s^T Cov(s)^-1 s  ~  F(d, nu),    s the step, d parameters, nu neighbours' differences in the fleet
+    T^2 = s^T Cov(s)^-1 s  ~  F(d, nu),    s the step or the line's end, d parameters, nu neighbours' differences
 
-The smallest probability of an arm's group over its splits is multiplied by their number (Bonferroni), and those of all
-arms and groups are one family, controlled by Holm's method: one false alarm in a hundred fleets, not in a hundred
-arms. As in `change_detection.py` a change must also matter for the torque.
+The smallest probability of an arm's group over its splits and the line is multiplied by their number (Bonferroni), and
+those of all arms and groups are one family, controlled by Holm's method: one false alarm in a hundred fleets, not in a
+hundred arms. As in `change_detection.py` a change must also matter for the torque. Whichever explains most is told.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ _LEAST = 2 * _LEAST_SIDE
 _MEDIAN = 0.45493642311957275  # of chi-square with one degree of freedom
 _AT_ONCE = 64  # splits that are tested together, so that memory is bounded
 _TRIMMED = 0.9  # share of neighbours' statistics that the factor is found from
+_EXPLAINED = 1e-9  # share of a shape that is left where conditions explain it
 _NORMAL = 1.959963984540054
 
 
@@ -61,10 +63,11 @@ class Change:
     Attributes:
         arm: name.
         group: kind and number of joint or link.
-        at: index of the first recording after it, in time.
-        before: time of the last recording before [s since 1970].
-        after: time of the first recording after.
-        step: of the group's parameters [SI].
+        drift: whether it is a line over all the time, not a step at a date.
+        at: index of the first recording after it, in time; of a drift, of the first one in its second half.
+        before: time of the last recording before [s since 1970]; of a drift, of the first one.
+        after: time of the first recording after; of a drift, of the last one.
+        step: of the group's parameters [SI]; of a drift, from its first to its last recording.
         deviations: of the step [SI].
         statistic: T^2.
         p: of the change, after Bonferroni over the splits and Holm over the fleet.
@@ -76,6 +79,7 @@ class Change:
 
     arm: str
     group: Group
+    drift: bool
     at: int
     before: float
     after: float
@@ -179,7 +183,7 @@ def change_points(
             found = _most_likely(recordings, number, places, scatter[group])
             if found is None:
                 continue
-            p, statistic, at, step, deviations, times = found
+            p, statistic, drift, at, step, deviations, times = found
             only = np.zeros(len(fits[arm].fit.beta))
             only[list(places)] = step
             change, tiny = motion.change(only), np.finfo(float).tiny
@@ -187,7 +191,9 @@ def change_points(
             joint = int(np.argmax(shares[0]))
             of_joint = (float(shares[0][joint]), float(shares[1][joint]))
             every.append(
-                Change(arm, group, at, *times, step, deviations, statistic, p, joint, *of_joint, relevant(shares))
+                Change(
+                    arm, group, drift, at, *times, step, deviations, statistic, p, joint, *of_joint, relevant(shares)
+                )
             )
     corrected = holm([one.p for one in every])
     return [replace(one, p=p, changed=one.changed and p < ALPHA) for one, p in zip(every, corrected, strict=True)]
@@ -195,7 +201,7 @@ def change_points(
 
 def _most_likely(
     recordings: Sequence[Recorded], number: int, places: Sequence[int], scatter: Scatter
-) -> tuple[float, float, int, Array, Array, tuple[float, float]] | None:
+) -> tuple[float, float, bool, int, Array, Array, tuple[float, float]] | None:
     seen, values, covariances = _estimates(recordings, number, places)
     conditions = _carried([recordings[t] for t in seen])
     count, size = values.shape
@@ -212,11 +218,18 @@ def _most_likely(
     Q = np.linalg.qr(known)[0]
     rest = y - Q @ (Q.T @ y)
     splits = np.arange(_LEAST_SIDE, count - _LEAST_SIDE + 1)
+    at = np.array([recordings[t].at for t in seen])
+    span = float(at[-1] - at[0])
+    shapes = (np.arange(count) >= splits[:, None]).astype(float)
+    if span > 0.0:  # the line is last
+        shapes = np.vstack([shapes, (at - at[0]) / span])
     statistics, steps, deviations = [], [], []
-    for part in np.array_split(splits, -(-len(splits) // _AT_ONCE)):
-        after = (np.arange(count) >= part[:, None]).astype(float)
-        step = np.einsum("tij,pt->ptij", whitening, after).reshape(len(part), count * size, size)
+    for after in np.array_split(shapes, -(-len(shapes) // _AT_ONCE)):
+        step = np.einsum("tij,pt->ptij", whitening, after).reshape(len(after), count * size, size)
+        own = np.sum(step**2, axis=(1, 2))
         step = step - Q @ (Q.T @ step)
+        # What conditions explain to the last digits, hours of use for example, says nothing besides them.
+        step[np.sum(step**2, axis=(1, 2)) < _EXPLAINED * own] = 0.0
         information = np.swapaxes(step, 1, 2) @ step
         sizes = np.sqrt(np.maximum(np.einsum("pkk->pk", information), np.finfo(float).tiny))
         scale = sizes[:, :, None] * sizes[:, None, :]
@@ -228,10 +241,11 @@ def _most_likely(
         deviations.append(np.sqrt(np.maximum(np.einsum("pkk->pk", covariance), 0.0)))
     every = np.concatenate(statistics)
     best = int(np.argmax(every))
-    statistic, split = float(every[best]), int(splits[best])
-    p = min(probability(statistic, size, float(max(scatter.degrees, size))) * len(splits), 1.0)
-    times = (recordings[seen[split - 1]].at, recordings[seen[split]].at)
-    return p, statistic, seen[split], np.concatenate(steps)[best], np.concatenate(deviations)[best], times
+    statistic, drift = float(every[best]), best == len(splits)
+    split = count // 2 if drift else int(splits[best])
+    p = min(probability(statistic, size, float(max(scatter.degrees, size))) * len(shapes), 1.0)
+    times = (float(at[0]), float(at[-1])) if drift else (float(at[split - 1]), float(at[split]))
+    return p, statistic, drift, seen[split], np.concatenate(steps)[best], np.concatenate(deviations)[best], times
 
 
 def _carried(recordings: Sequence[Recorded]) -> Array:

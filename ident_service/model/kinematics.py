@@ -24,7 +24,7 @@ def frame_origins(chain: Chain, position: Array) -> Array:
     return origins
 
 
-def joint_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
+def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
     """Return orientation and origin of every joint frame in the base frame, where its link's solids stand still.
 
     Args:
@@ -35,7 +35,7 @@ def joint_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
         Joint frame to base frame, shape (postures, joints, 3, 3), and its origin in the base frame [m], shape
         (postures, joints, 3).
     """
-    poses = _joint_poses(chain, position)
+    poses = joint_poses(chain, position)
     return np.stack([R for R, _ in poses], axis=1), np.stack([p for _, p in poses], axis=1)
 
 

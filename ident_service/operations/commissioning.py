@@ -33,7 +33,7 @@ from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.run_plan import ExcitationPlan
 from ident_service.motion.state_machine import State
-from ident_service.operations.identification import unusable_because
+from ident_service.operations.identification import Step, unusable_because
 from ident_service.operations.recordings import recording_quality
 from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.open import open_recording
@@ -45,6 +45,7 @@ from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm
 
 _BLOCK = 4096
+_MOTIONS = 0.75  # share of a commissioning's time that its motions take, as a rule
 
 
 @dataclass(frozen=True)
@@ -197,6 +198,32 @@ def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
     plan.legs(model, limits.home, limits)
 
 
+def _counted(
+    stop_requested: Callable[[], bool], rate: float, planned: Excitation, before: float, each: float, step: Step
+) -> Callable[[], bool]:
+    """Return `stop_requested`, which is asked every cycle, with a step told every quarter of a second of the motion.
+
+    Args:
+        stop_requested: as it is.
+        rate: cycles per second.
+        planned: the motion.
+        before: share of all motions that is over before this one.
+        each: share of all that one second of motion is.
+        step: told.
+    """
+    cycles, every = 0, max(round(0.25 * rate), 1)
+
+    def asked() -> bool:
+        nonlocal cycles
+        cycles += 1
+        if cycles % every == 0:
+            seconds = min(cycles / rate, planned.duration)
+            step(f"{planned.name} motion", _MOTIONS * before + each * seconds)
+        return stop_requested()
+
+    return asked
+
+
 def simulate(
     config: ArmConfig,
     folder: Path,
@@ -207,6 +234,7 @@ def simulate(
     custom: CustomFunction | None = None,
     clock: Clock | None = None,
     tell: Tell = lambda _: None,
+    step: Step = lambda words, share: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Commissioning:
     """Commission the simulated arm of a configuration, and score the result against its true parameters.
@@ -220,6 +248,7 @@ def simulate(
         custom: the function that its `constraints.custom` names.
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
+        step: called with what is being done and how much of all is done, from 0 to 1.
         stop_requested: asked every cycle.
 
     Raises:
@@ -237,7 +266,8 @@ def simulate(
     motions = [first, excitation(model, "validation")]
     for planned in motions[1:]:  # the first is checked when it begins; a later refusal would waste it
         require_clear_from_home(model, planned)
-    reports, observed = [], list[Truth]()
+    reports, observed = list[RunReport](), list[Truth]()
+    whole = sum(planned.duration for planned in motions)
     with atomic_folder(folder) as staging:
         paths = [staging / f"{planned.name}.mcap" for planned in motions]
         for planned, path in zip(motions, paths, strict=True):
@@ -246,15 +276,24 @@ def simulate(
             arm = make_arm(config, clock)
             if isinstance(arm, SimulatedArm | RemoteArm):
                 arm.observer = observed.append
-            report = record_motion(arm, model, planned, path, stop_requested)
+            driven = sum(one.duration for one in motions[: len(reports)])
+            asked = _counted(stop_requested, config.control.rate, planned, driven / whole, _MOTIONS / whole, step)
+            report = record_motion(arm, model, planned, path, asked)
             if report.state is not State.DONE:
                 # After a requested stop the arm must not move again.
                 raise ArmError(f"{planned.name} motion: stopped on request; nothing was kept")
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
+        step("identifying", _MOTIONS)
         recordings = [CachedRecording(open_recording(path, model.chain.names)) for path in paths]
-        estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name, custom=custom)
+        estimate = identify(
+            *(model, recordings[:1], recordings[1:]),
+            set_name=set_name,
+            custom=custom,
+            step=lambda words, share: step(words, _MOTIONS + 0.6 * share * (1.0 - _MOTIONS)),
+        )
+        step("scoring, and writing the report", _MOTIONS + 0.6 * (1.0 - _MOTIONS))
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         unusable = unusable_because(estimate, found)

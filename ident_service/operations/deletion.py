@@ -1,7 +1,8 @@
 """Delete runs, motions and arms; entries that refer to one are listed first, and nothing in use is deleted.
 
-A folder is renamed to a hidden name before its row is deleted: a kill in between leaves a row without a folder, and
-deleting again completes it. Renamed folders are also removed at the next start. The audit trail stays.
+A folder is renamed to a hidden name before its row is deleted, and back where that fails. A kill in between leaves a
+row without a folder, and deleting again completes it. Renamed folders are also removed at the next start. The audit
+trail stays.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterable
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final, Literal
@@ -104,18 +105,17 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         for one in motions:
             _delete_motion(db, state, one, who)
         place, own = state / DESCRIPTIONS, re.compile(re.escape(arm) + r"-[0-9a-f]{16}")
-        with db.transaction():
+        with ExitStack() as hiding, db.transaction():
             if db.row("SELECT id FROM runs WHERE arm = ?", arm):
                 raise InUse(f"a run of the arm {arm} came meanwhile; delete the arm again")
             # Within the transaction, so that adding the arm again sees its description either complete or gone.
-            gone = [_hide(arm_folder(state, arm))]
-            gone += [_hide(path) for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
+            described = [path for path in (place.iterdir() if place.is_dir() else ()) if own.fullmatch(path.name)]
+            hiding.enter_context(_hidden([arm_folder(state, arm), *described]))
             for table in ("schedules", "dues", "alarms", "acceptances", "reidentifications", "maintenance_events"):
                 db.write(f"DELETE FROM {table} WHERE arm = ?", arm)  # noqa: S608 - ours
             db.write("DELETE FROM arms WHERE name = ?", arm)
             note(db, who, "arm deleted", arm, with_it=[asdict(one) for one in found[:100]])
             know_shipped(db)
-    _remove(gone)
     return found
 
 
@@ -186,32 +186,41 @@ def _require_no_dependents(what: str, found: list[Dependent], *, anyway: bool) -
 def forget_run(db: Database, state: Path, run: str, who: str) -> None:
     """Delete a run even if something refers to it: its folder first, then its row; raises UnknownId."""
     row = known_run(db, run)
-    gone = _hide(state / RUNS / run)
-    with db.transaction():
+    with _hidden([state / RUNS / run]), db.transaction():
         # The operating hours of the run still count for the arm's schedules.
         db.write("UPDATE schedules SET counted = counted - ? WHERE arm = ?", row["seconds"] or 0.0, row["arm"])
         db.write("DELETE FROM runs WHERE id = ?", run)
         note(db, who, "run deleted", run, arm=row["arm"], manifest_sha256=row["manifest_sha256"])
     (state / REPORTS / f"{run}.html").unlink(missing_ok=True)
-    _remove([gone])
 
 
 def _delete_motion(db: Database, state: Path, row: Row, who: str) -> None:
-    motion, gone = row["id"], _hide(state / MOTIONS / row["id"])
-    with db.transaction():
+    motion = row["id"]
+    with _hidden([state / MOTIONS / motion]), db.transaction():
         for schedule in _schedules_of(db, row):
             remove_schedule(db, schedule, who)
         db.write("DELETE FROM motions WHERE id = ?", motion)
         note(db, who, "motion deleted", motion, arm=row["arm"], sha256=row["sha256"])
-    _remove([gone])
 
 
-def _hide(folder: Path) -> Path:
-    hidden = folder.with_name(f".{folder.name}{_GONE}")
-    if folder.exists():
-        shutil.rmtree(hidden, ignore_errors=True)
-        folder.rename(hidden)
-    return hidden
+@contextmanager
+def _hidden(folders: Iterable[Path]) -> Iterator[None]:
+    """Hide folders for the block and remove them after it; put them back where it raises, as on a full disk."""
+    moved: list[tuple[Path, Path]] = []
+    try:
+        for folder in folders:
+            hidden = folder.with_name(f".{folder.name}{_GONE}")
+            if folder.exists():
+                shutil.rmtree(hidden, ignore_errors=True)
+                folder.rename(hidden)
+                moved.append((folder, hidden))
+        yield
+    except BaseException:
+        for folder, hidden in reversed(moved):
+            with suppress(OSError):
+                hidden.rename(folder)
+        raise
+    _remove(hidden for _, hidden in moved)
 
 
 def _remove(folders: Iterable[Path]) -> None:

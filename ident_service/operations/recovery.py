@@ -29,6 +29,7 @@ from ident_service.motion.control_loop import REST_SPEED
 from ident_service.motion.fault_store import StoredFault
 from ident_service.motion.last_position import PositionFile
 from ident_service.motion.read_only_monitor import Watched, watch
+from ident_service.operations.moving_arms import held_arm
 from ident_service.recordings.files import require_writable
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 
@@ -88,12 +89,14 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     faults = fault_file(state, config.name).remembered()
     pid = controlling_pid(control_path(state, config.name))
     if pid is not None:
-        stop_first = (
+        first: tuple[str, ...] = (
             f"`ident stop {called}` stops it; process {pid} moves it, or holds it after a stop.",
             f"`ident supported {called}`, if it is held: once it is supported, or at home.",
-            f"`ident recover {called}` again, when it is at rest.",
         )
-        return Recovery(config.name, faults, pid, None, "", "", (), {}, (), stop_first, False)
+        if held_arm(state, config.name):
+            first = (f"Support the arm, then `ident supported {called}`: process {pid} holds it until then.",)
+        steps = (*first, f"`ident recover {called}` again, when it is at rest.")
+        return Recovery(config.name, faults, pid, None, "", "", (), {}, (), steps, False)
     arm = make_arm(config) if arm is None else arm
     seen, unreachable, zero_lost, refusal = None, "", "", ""
     reset: tuple[str, ...] = ()
@@ -140,7 +143,7 @@ def release_held_drives(config: ArmConfig, state: Path, arm: Arm | None = None) 
         names = arm.describe().joint_names
         held = tuple(name for name, word in zip(names, status, strict=True) if word & AxisStatus.IDLE)
         if not held:
-            raise UsageError(f"{config.name}: the arm is not moving, and its drives do not hold it")
+            raise UsageError(f"{config.name}: not held: no process has the arm, and its drives do not hold it")
         arm.stop(StopKind.TORQUE_OFF)
     return held
 

@@ -34,7 +34,7 @@ from ident_service.model.appearance import Mesh, visible_bodies, visual_meshes
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import WORLD, Array
 from ident_service.model.collision import surroundings
-from ident_service.model.kinematics import joint_poses
+from ident_service.model.kinematics import joint_frames
 from ident_service.model.solids import Body, Capsule, Cylinder, HalfSpace
 from ident_service.model.urdf import rotation_to
 from ident_service.recordings.files import sha256
@@ -232,7 +232,7 @@ def _send_poses(stream: Any, name: str, model: ArmModel, time: Array, position: 
     rr = _rerun()
     length = max(float(time[-1]), 1e-9)
     chosen = np.unique(np.searchsorted(time, np.arange(0.0, length, 1.0 / _POSES_HZ)))
-    turns, places = joint_poses(model.chain, position[chosen])
+    turns, places = joint_frames(model.chain, position[chosen])
     for k, joint in enumerate(model.chain.names):
         stream.send_columns(
             _path(name, "arm", joint),

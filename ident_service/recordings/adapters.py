@@ -17,11 +17,12 @@ import numpy as np
 
 from ident_service.config.recording import Transmission
 from ident_service.errors import RecordingError
-from ident_service.recordings.cached_recording import Memory, memory_of
+from ident_service.recordings.cached_recording import Memory, memory_of, payload_of
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.quality import STANDSTILL
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Recording, cut
 
+_BEYOND: Final = 1.0  # s by which the end of a range may be after the last sample, as rounded ends are
 _BIN: Final = 0.1  # s; positions are averaged over it, so that noise does not pass for motion
 
 
@@ -45,7 +46,8 @@ class RangeRecording:
             whole: a file, or a range of one.
             start: [s] after the first sample of the file.
             end: likewise; may be infinite.
-            label: suffix of the name, to tell ranges of one file apart.
+            label: suffix of the name, to tell ranges of one file apart; a range that was asked for by name may not
+                end more than a second after its file.
         """
         self.path: Path = whole.path.with_name(whole.path.name + label)
         self.sha256 = whole.sha256
@@ -55,11 +57,13 @@ class RangeRecording:
         self.torn = whole.torn
         before, after = time_range(whole)
         self.start, self.end = max(start, before), min(end, after)
+        self._asked = end if label else -np.inf
         self.standstill = (0.0, 0.0)
         self.ended: float | None = whole.ended if isinstance(whole, RangeRecording) else None
         self.whole: Recording = whole.whole if isinstance(whole, RangeRecording) else whole
         kept = memory_of(self.whole)
         self.memory = None if kept is None else Memory(kept.max_bytes)
+        self.payload = payload_of(self.whole)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order; see `Recording.blocks`. Blocks at the ends are shorter.
@@ -82,6 +86,11 @@ class RangeRecording:
             if self.ended is not None:
                 lasts = f"the motion was stopped {self.ended:.6g} s after the first sample"
             raise RecordingError(self.path, f"no sample from {self.start:g} s to {self.end:g} s; {lasts}")
+        seconds = (last - (first or 0)) * 1e-9
+        if np.isfinite(self._asked) and self._asked > seconds + _BEYOND:
+            raise RecordingError(
+                self.path, f"ends at {self._asked:g} s, the recording at {seconds:.6g} s; leave the end out to read all"
+            )
 
 
 def _stamp(first_ns: int, seconds: float) -> np.int64:

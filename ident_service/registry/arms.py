@@ -21,7 +21,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.config.yaml_source import shipped_arms
 from ident_service.errors import AlreadyThere, ConfigError, Problem, UnknownId, UsageError
-from ident_service.registry.database import Database, Row, note
+from ident_service.registry.database import FILE, Database, Row, note
 from ident_service.results.manifest import atomic_folder
 
 DESCRIPTIONS: Final = "descriptions"
@@ -169,6 +169,15 @@ def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:
             f"{config.name!r} is the name of an arm already, {row['source']}; ask for replacing it (`replace`), "
             "or give another name"
         )
+
+
+def uploaded_description(state: Path, name: str) -> Path | None:
+    """Return the description of an arm that was uploaded to the daemon of a state folder; None where there is none."""
+    if not _NAME.fullmatch(name) or not (state / FILE).is_file():
+        return None
+    with Database(state) as db:
+        row = db.row("SELECT folder FROM arms WHERE name = ? AND source = 'uploaded'", name)
+    return None if row is None else state / row["folder"] / ARM_FILE
 
 
 @contextmanager

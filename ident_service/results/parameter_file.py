@@ -38,7 +38,7 @@ from ident_service.model.information import Information
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
 from ident_service.results.assessment import error_document
 from ident_service.results.manifest import write_atomically
-from ident_service.results.summary import how_fitted, implausible_links
+from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
 
 def strict_json(text: str) -> Any:
@@ -317,6 +317,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "deviation": None if estimate.prepared.delay is None else estimate.prepared.delay.deviation,
         },
         "torque_scales": estimate.prepared.torque_scales.tolist(),
+        **torque_constants_document(estimate),
         **convex_document(estimate),
         "fit": {
             "samples": estimate.samples,

@@ -167,8 +167,9 @@ def _pixel(value: float) -> str:
 
 
 def points_of(x: Array, y: Array) -> str:
-    """Return the coordinates of a polyline or polygon [px]."""
-    return " ".join(f"{_pixel(a)},{_pixel(b)}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+    """Return the coordinates of a polyline or polygon [px], to a tenth of a pixel below 1000."""
+    # One call for all: thousands of points are a third of the time that a report takes.
+    return ("%.4g,%.4g " * len(x) % tuple(np.column_stack([x, y]).ravel().tolist())).rstrip()
 
 
 def _hinted(tag: str, attributes: str, hint: str) -> str:

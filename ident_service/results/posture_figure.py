@@ -17,6 +17,8 @@ from itertools import chain
 import numpy as np
 
 from ident_service.errors import UsageError
+from ident_service.model.chain import Chain
+from ident_service.model.kinematics import branches, frame_origins
 from ident_service.results.plots import STEPS, Array, Axes, Canvas, number, require_drawable, round_values
 
 
@@ -75,6 +77,7 @@ class Postures:
         workspace: lowest and highest corner of the box that the arm must stay in [m], shape (2, 3); infinite where it
             is open; or None.
         closest: the posture of smallest clearance, or None.
+        marked: points that stand out in every posture.
     """
 
     frames: Array
@@ -83,6 +86,7 @@ class Postures:
     obstacles: tuple[Box | Plane | Rod, ...] = ()
     workspace: Array | None = None
     closest: Closest | None = None
+    marked: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse postures that cannot be drawn.
@@ -100,8 +104,9 @@ class Postures:
             raise UsageError("cannot draw postures: their times must increase")
         if not self.branches or any(len(branch) < 2 for branch in self.branches):
             raise UsageError(f"cannot draw postures: a branch joins two points or more, unlike one of {self.branches}")
-        if not all(0 <= point < points for point in chain(*self.branches)):
-            raise UsageError(f"cannot draw postures: the {points} points do not include all of {self.branches}")
+        if not all(0 <= point < points for point in chain(*self.branches, self.marked)):
+            named = (*self.branches, self.marked) if self.marked else self.branches
+            raise UsageError(f"cannot draw postures: the {points} points do not include all of {named}")
         for obstacle in self.obstacles:
             _require_obstacle(obstacle)
         if self.workspace is not None:
@@ -294,6 +299,25 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
     return canvas.svg(title, about + (f" {words}." if words else ""))
 
 
+def spike_figure(mechanism: Chain, joint: int, time: float, residual: float, position: Array) -> str:
+    """Draw the posture in which a joint has its largest residual, with the joint marked, from the side and from above.
+
+    Args:
+        mechanism: of the arm.
+        joint: its number.
+        time: since the recording's first sample [s].
+        residual: of the joint [N m or N].
+        position: of all joints then [rad or m], shape (joints,).
+
+    Returns:
+        A self-contained SVG.
+    """
+    name, unit = mechanism.names[joint], "N m" if mechanism.revolute[joint] else "N"
+    frames = frame_origins(mechanism, position[None])
+    posture = Postures(frames, np.array([time]), branches(mechanism), marked=(1 + 2 * joint,))
+    return stick_figure(posture, f"{name}: residual of {number(residual, 3)} {unit} at {number(time, 4)} s")
+
+
 @dataclass(frozen=True)
 class Limb:
     """Part of an arm: all points within `radius` [m] of the convex hull of `points` [m], shape (points, 3).
@@ -372,6 +396,8 @@ def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures,
         if closest.points is not None:
             (xa, xb), (ya, yb) = axes.x(closest.points[:, i]), axes.y(closest.points[:, j])
             canvas.line("closest gap", float(xa), float(ya), float(xb), float(yb))
+    for x, y in postures.frames[:, list(postures.marked)][..., [i, j]].reshape(-1, 2):
+        canvas.circle("dot", float(axes.x(x)), float(axes.y(y)), 5.0)
     for point in dict.fromkeys(branch[0] for branch in postures.branches):
         x, y = float(axes.x(postures.frames[0, point, i])), float(axes.y(postures.frames[0, point, j]))
         canvas.rectangle("base", x - 5, y - 5, 10, 10)

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
 from ident_service.config.arm import Identification
+from ident_service.estimation.equations import motors_of_torques
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
@@ -254,9 +256,48 @@ def _preliminary_findings(estimate: Estimate) -> list[str]:
         lines.append(f"Stribeck velocity [rad/s or m/s]: {velocities}")
     if (prepared.torque_scales != 1.0).any():
         lines.append("measured torques multiplied by: " + " ".join(f"{value:.4g}" for value in prepared.torque_scales))
+    lines += _torque_constants(estimate)
     if estimate.prior is not None:
         lines.append(f"regularised towards the {estimate.prior.kind} prior with weight {estimate.prior.weight:g}")
     return ["", *lines] if lines else []
+
+
+def torque_constants_document(estimate: Estimate) -> dict[str, Any]:
+    """Return the torque constants of the motors as JSON values, where they were identified."""
+    found = estimate.prepared.torque_constants
+    if found is None:
+        return {}
+    names = estimate.model.chain.names
+    motors = enumerate(motors_of_torques(estimate.model))
+    return {
+        "torque_constants": [
+            {
+                "motor": number + 1,
+                "joints": [names[joint] for joint in np.flatnonzero(row)],
+                "factor": float(found.factors[number]),
+                "standard_deviation": None if np.isinf(found.deviations[number]) else float(found.deviations[number]),
+                "verdict": found.verdicts[number],
+            }
+            for number, row in motors
+        ]
+    }
+
+
+def _torque_constants(estimate: Estimate) -> list[str]:
+    found = estimate.prepared.torque_constants
+    if found is None:
+        return []
+    lines = ["torque that each motor gives for one by its description (multiply the torque_scale of its drive by it):"]
+    for one in torque_constants_document(estimate)["torque_constants"]:
+        whose = f"  motor {one['motor']} ({', '.join(one['joints'])}): "
+        if one["verdict"] == "unidentified":
+            lines.append(f"{whose}not shown by these recordings, taken as described")
+        else:
+            lines.append(f"{whose}{one['factor']:.4f} +- {one['standard_deviation']:.4f}  {one['verdict']}")
+    lines.append(
+        f"  error of the motors' torques with them {found.error_percent:.2f} %, without {found.error_before:.2f} %"
+    )
+    return lines
 
 
 def parameter_table(estimate: Estimate) -> str:

@@ -8,10 +8,11 @@ import subprocess
 import sys
 from argparse import Namespace
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from ident_service.cli.output import StopOnSignal, interrupting, print_answer, tell
+from ident_service.cli.output import StopOnSignal, interrupting, print_answer, print_error, print_to_person, tell
 
 TALK = """
 import sys
@@ -50,6 +51,27 @@ def test_a_full_disk_loses_no_answer_in_silence(monkeypatch: pytest.MonkeyPatch)
         with pytest.raises(OSError, match="No space left"):
             print_answer(Namespace(json=False), 0, "figures", {})
         os.dup2(os.open(os.devnull, os.O_WRONLY), full.fileno())
+
+
+def test_what_a_full_disk_has_not_taken_fails_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job writes both of its streams to a disk: its lines count again as soon as there is room."""
+    room = tmp_path / "log"
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        monkeypatch.setattr(sys, "stderr", full)
+        monkeypatch.setattr(sys, "stdout", full)
+        tell(Namespace(json=True), "exciting")
+        print_to_person("ident: why\n")
+        print_error("ArmFault", "why", 4)
+        os.dup2(os.open(room, os.O_WRONLY | os.O_CREAT), full.fileno())
+        tell(Namespace(json=True), "stopped")
+    assert room.read_text() == "stopped\n"
+
+
+@pytest.mark.slow
+def test_an_error_that_cannot_be_written_keeps_its_exit_code() -> None:
+    words = [sys.executable, "-m", "ident_service", "verify", "nowhere", "--json"]
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        assert subprocess.run(words, stdout=full, stderr=full, check=False).returncode == 2
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

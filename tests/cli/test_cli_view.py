@@ -18,7 +18,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import UsageError
 from ident_service.model.appearance import visual_meshes
 from ident_service.model.arm_model import arm_model
-from ident_service.model.kinematics import joint_poses
+from ident_service.model.kinematics import joint_frames
 from ident_service.model.pinocchio_models import read_urdf
 from ident_service.recordings.open import open_recording
 from ident_service.results.evidence.file import read_evidence
@@ -82,7 +82,7 @@ def test_the_arm_stands_where_its_joints_were_measured(quick: Commissioned, save
         pose = saved[f"/validation/arm/{joint}"]
         rows = np.searchsorted((stamps - stamps[0]) * 1e-9, pose["time"] - 1e-9)
         assert len(rows) > 10
-        turns, places = joint_poses(model.chain, position[rows])
+        turns, places = joint_frames(model.chain, position[rows])
         np.testing.assert_allclose(np.array(pose["translation"])[:, 0], places[:, k], atol=1e-6)
         read = Rotation.from_quat(np.array(pose["quaternion"])[:, 0]).as_matrix()
         np.testing.assert_allclose(read, turns[:, k], atol=1e-6)

@@ -98,6 +98,15 @@ def test_errors_are_of_one_tree(
     )
     assert "`ident tokens add NAME --role operator`" in said
     assert "Bearer" not in said
+    for token in (None, "ident_no"):  # in words that are no HTTP, either
+        with (
+            IdentClient(client.url, token) as nobody,
+            pytest.raises(AccessRefused, match="or none was given") as caught,
+        ):
+            nobody.arms()
+        assert "Bearer" not in str(caught.value)
+    with pytest.raises(UsageError, match="the token is empty"):
+        IdentClient(client.url, "")
     with pytest.raises(UsageError, match="https only"):
         IdentClient("http://robot.example:8470", "x")
     with socket.socket() as closed:
@@ -206,7 +215,7 @@ def test_a_daemon_that_ends_says_what_becomes_of_the_motion(tmp_path: Path) -> N
     with daemon_process(state) as (process, client):
         client.add_arm(patient_text())
         with (  # noqa: PT012 - it is raised at the end of the block of the motion
-            pytest.raises(ArmError, match=r"A daemon that ends brings its arms to rest first.*job \S+-run-"),
+            pytest.raises(ArmError, match=r"quick stops by itself: .*`ident jobs show \S+-run-"),
             client.arm("quick").run(confirm="quick") as job,
         ):
             next(job.live())

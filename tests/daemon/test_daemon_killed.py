@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 import random
 import signal
+import threading
 import time
 from pathlib import Path
 
 import pytest
 from daemon.conftest import checked_before, patient_text, quick_text, serving
 from daemon.served import daemon_process
+from daemon.test_full_disk import held_text, wait_for
 
+from ident_service.cli import main
 from ident_service.client import IdentClient
-from ident_service.errors import MotionRefused
-from ident_service.motion.command_channel import in_use
+from ident_service.errors import ArmError, MotionRefused
+from ident_service.motion.command_channel import controlling_pid, in_use
+from ident_service.operations.moving_arms import held_arm
 from ident_service.recordings.open import open_recording
 from ident_service.registry.database import Database
 from ident_service.registry.state_folder import control_path
@@ -132,6 +136,68 @@ def test_a_daemon_that_is_killed(state: Path, seed: int) -> None:
 def test_thirty_kills(state: Path) -> None:
     told = [kill_once(state.with_name(f"state{seed}"), seed) for seed in range(100, 130)]
     assert sum(line.startswith("run: interrupted") for line in told) >= 5, told
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_an_arm_that_is_held_when_the_daemon_is_killed_is_told_of_and_let_down_by_the_next(
+    state: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing of the next daemon waits for the process that holds the arm, but what needs the arm, and that says so."""
+    checked_before(state, held_text())
+    with daemon_process(state) as (process, client):
+        client.add_arm(held_text())
+        with (  # noqa: PT012 - it is raised in the block of the motion
+            pytest.raises(ArmError, match=r"quick stops by itself: .*`ident recover quick` at the daemon's") as caught,
+            client.arm("quick").run(confirm="quick") as motion,
+        ):
+            next(motion.live())
+            process.kill()
+            process.wait()
+            client.job(motion.id)
+        assert f"`ident jobs show {motion.id}` tells how the motion ended" in str(caught.value)
+        begun = motion.id
+    wait_for(lambda: held_arm(state, ARM))
+    # At the terminal the name is known without a daemon.
+    assert main(["recover", ARM, "--state", str(state)]) == 3
+    assert "Support the arm, then `ident supported quick`: process " in capsys.readouterr().out
+    with daemon_process(state) as (process, client):
+        seen = client.job(begun)
+        assert (seen.state, seen.held) == ("interrupted", True)
+        holder = controlling_pid(control_path(state, ARM))
+        wait_for(lambda: f"process {holder} holds the arm quick until" in client.job(begun).detail)
+        # A second kill changes nothing, and the command says of the arm what the client does.
+        capsys.readouterr()
+        threading.Timer(2.0, process.kill).start()
+        assert main(["preflight", ARM, "--confirm", ARM, "--server", client.url, "--state", str(state)]) == 1
+        told = capsys.readouterr()
+        assert f"queued, waits for {begun}, which holds the arm quick" in told.out
+        assert "quick stops by itself: " in told.err
+        process.wait()
+    with daemon_process(state) as (process, client):
+        assert controlling_pid(control_path(state, ARM)) == holder
+        started = time.monotonic()
+        assert client.compute("base", arm="planar2").state == "done"
+        asked = client.begin("recover", arm=ARM)
+        words = wait_for(lambda: client.job(asked.id).detail)
+        assert words.startswith(f"waits for {begun}, which holds the arm quick until a person confirms")
+        assert time.monotonic() - started < 30.0  # and not the 40 s for which processes were looked for
+        assert client.arm(ARM).stop()["arms"] == [ARM]
+        assert held_arm(state, ARM)
+        words = ["--server", client.url, "--state", str(state)]
+        assert main(["supported", ARM, "--confirm", ARM, *words]) == 0
+        told = wait_for(lambda: "the motion ended: stopped" in client.job(begun).detail and client.job(begun))
+        assert (told.state, told.held) == ("interrupted", False)
+        assert client.wait(asked.id).state == "done"
+        assert not in_use(control_path(state, ARM))
+        # Nothing holds it any more, and both commands say the same of it.
+        capsys.readouterr()
+        assert main(["supported", ARM, "--confirm", ARM, *words]) == 2
+        assert "no process of the daemon's machine holds it" in capsys.readouterr().err
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20) == 0
+    assert main(["supported", ARM, "--confirm", ARM, "--state", str(state)]) == 2
+    assert "not held: no process has the arm" in capsys.readouterr().err
 
 
 @pytest.mark.slow

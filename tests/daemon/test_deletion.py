@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +196,32 @@ def test_a_deletion_that_broke_off_is_completed(state: Path, commissioned: Path)
         assert [path.name for path in (state / "runs").iterdir()] == [SECOND]
         assert delete(daemon, f"runs/{FIRST}")[0] == 200
         assert [run["id"] for run in daemon.get("/api/v1/runs").json()] == [SECOND]
+
+
+def test_a_deletion_that_the_registry_has_no_room_for_changes_nothing(
+    filled: Asked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = filled.service.state
+    assert filled.post("/api/v1/arms", {"description": quick_text("other")}).status_code == 201
+    described = [path.name for path in (state / "descriptions").iterdir()]
+    (state / "arms" / "other").mkdir(parents=True)
+
+    def full(*_: object, **__: object) -> None:
+        error = sqlite3.OperationalError("database or disk is full")
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+        raise error
+
+    with monkeypatch.context() as patched:
+        patched.setattr(deletion, "note", full)
+        for path in (f"runs/{FIRST}?anyway=true", "arms/other"):
+            status, answer = delete(filled, path)
+            assert (status, answer["error"]["kind"]) == (507, "DiskFull")
+    assert (state / "runs" / FIRST / "manifest.json").is_file()
+    assert (state / "arms" / "other").is_dir()
+    assert [path.name for path in (state / "descriptions").iterdir()] == described
+    assert filled.get(f"/api/v1/runs/{FIRST}").status_code == 200
+    assert delete(filled, f"runs/{FIRST}?anyway=true")[0] == 200
+    assert not list((state / "runs").glob(f"*{FIRST}*"))
 
 
 def test_the_command_deletes_and_names(state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]) -> None:

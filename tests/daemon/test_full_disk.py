@@ -22,7 +22,7 @@ from daemon.served import daemon_process
 
 from ident_service.cli import main
 from ident_service.errors import ArmError, ArmFault, UsageError
-from ident_service.motion.command_channel import ControlFile
+from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import FILE, Database, audit_log, note
@@ -30,7 +30,9 @@ from ident_service.registry.state_folder import control_path
 
 
 @pytest.mark.slow
-def test_the_end_of_a_job_waits_for_room(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_a_job_waits_for_room(
+    daemon: Asked, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     ended, full = rows.ended, [True]
 
     def without_room(*arguments: Any) -> bool:
@@ -52,6 +54,18 @@ def test_the_end_of_a_job_waits_for_room(daemon: Asked, monkeypatch: pytest.Monk
     while daemon.get("/healthz").status_code != 200 and time.monotonic() < until:
         time.sleep(0.05)
     assert daemon.get("/healthz").status_code == 200
+    # The end of the service does not wait for room: the next one enters what became of the job.
+    full[0] = True
+    caplog.clear()
+    daemon.begin({"kind": "base", "arm": "planar2"})
+    wait_for(lambda: daemon.get("/healthz").status_code == 503)
+    time.sleep(0.5)
+    began = time.monotonic()
+    daemon.service.engine.close()
+    assert time.monotonic() - began < 20.0
+    assert [one.getMessage() for one in caplog.records if "entered yet" in one.getMessage()] == [
+        "the end of a job cannot be entered yet: database or disk is full"
+    ]
 
 
 MAINTENANCE: tuple[str, dict[str, str]] = ("/api/v1/arms/planar2/maintenance", {"what": "oil"})
@@ -226,6 +240,11 @@ def held_text() -> str:
     return text
 
 
+def log_of(state: Path) -> str:
+    """Return the log of the daemon."""
+    return (state.parent / "serve.log").read_text()
+
+
 def wait_for(found: Callable[[], Any]) -> Any:
     until = time.monotonic() + 60.0
     while not (value := found()):
@@ -237,7 +256,7 @@ def wait_for(found: Callable[[], Any]) -> Any:
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is_held(small: Path) -> None:
-    state = small / "state"
+    state = small  # the log of the daemon lies beside it, on another disk
     checked_before(state, held_text())
     with daemon_process(state) as (_, client):
         client.add_arm(held_text())
@@ -252,11 +271,20 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is
         assert job.ended.held
         assert client.job(job.id).state == "running"
         assert held_arm(state, "quick")
-        filled[0].unlink()
+        # The disk is still full when the motion ends: its end waits for room, and is told of once.
         client.arm("quick").supported(confirm="quick")
+        wait_for(lambda: not in_use(control_path(state, "quick")))
+        wait_for(lambda: "cannot be entered yet" in log_of(state))
+        time.sleep(2.5)
+        assert log_of(state).count("cannot be entered yet") == 1
+        assert client.job(job.id).state == "running"
+        filled[0].unlink()
         wait_for(lambda: not client.job(job.id).live)
         assert client.job(job.id).state == "faulted"
         assert [fault["code"] for fault in client.arm("quick").faults()] == ["recorder_behind"]
+    for text in (log_of(state), (state / "jobs" / job.id / "log").read_text()):
+        assert "Traceback" not in text
+        assert "OSError" not in text
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import re
 import socket
 import threading
 import time
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -18,7 +18,7 @@ import pytest
 from daemon.conftest import URL, Asked, quick_text, serving
 from daemon.served import daemon_process
 from daemon.test_connections import FAR, NEAR, Book
-from daemon.test_uploads import announced, sent
+from daemon.test_uploads import TABLE, announced, sent
 from fastapi.dependencies.models import Dependant
 from fastapi.responses import StreamingResponse
 from fastapi.routing import APIRoute
@@ -202,8 +202,8 @@ def test_an_upload_that_is_deleted_in_this_moment_is_unknown(daemon: Asked, monk
         return seen
 
     for act in ("piece", "complete"):
-        upload = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"]
-        assert sent(daemon, upload, 0, b"mine").status_code == 200
+        upload = daemon.post("/api/v1/uploads", announced(TABLE)).json()["id"]
+        assert sent(daemon, upload, 0, TABLE).status_code == 200
         with monkeypatch.context() as patched:
             patched.setattr(uploads, "known_upload", gone_at_once)
             path = f"/api/v1/uploads/{upload}"
@@ -215,8 +215,8 @@ def test_an_upload_that_is_deleted_in_this_moment_is_unknown(daemon: Asked, monk
 def test_a_recording_that_is_deleted_while_it_is_completed_is_unknown(
     daemon: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    upload, state = daemon.post("/api/v1/uploads", announced(b"mine")).json()["id"], daemon.service.state
-    assert sent(daemon, upload, 0, b"mine").status_code == 200
+    upload, state = daemon.post("/api/v1/uploads", announced(TABLE)).json()["id"], daemon.service.state
+    assert sent(daemon, upload, 0, TABLE).status_code == 200
     make = uploads.new_id
 
     def meanwhile(arm: str) -> str:
@@ -239,15 +239,15 @@ def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkey
         adding[0].start()
         time.sleep(2.0)
 
-    hide = deletion._hide
+    hide = deletion._hidden
 
-    def slowly(folder: Path) -> Path:
+    def slowly(folders: list[Path]) -> AbstractContextManager[None]:
         if adding:
             adding[0].join(30)
-        return hide(folder)
+        return hide(folders)
 
     monkeypatch.setattr(deletion, "know_shipped", meanwhile)
-    monkeypatch.setattr(deletion, "_hide", slowly)
+    monkeypatch.setattr(deletion, "_hidden", slowly)
     assert daemon.ask("DELETE", "/api/v1/arms/quick").status_code == 200
     adding[0].join(60)
     assert daemon.get("/api/v1/arms/quick").status_code == 200

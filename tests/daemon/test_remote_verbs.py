@@ -56,6 +56,7 @@ def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     assert not set(done) & set(LOCAL_ONLY)
     assert set(LOCAL_ONLY) == {
         *("serve", "backup", "doctor", "driver test", "emulate", "import", "new", "restore", "tokens add", "view"),
+        *("completion", "schema"),
         *("bus import", "bus store", "bus restore", "bus report", "fleet identify", "fleet status"),
     }
     assert all(len(why) > 10 for why in LOCAL_ONLY.values())
@@ -251,7 +252,7 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
 ) -> None:
     body = on_a_bus()
     (tmp_path / "arm.yaml").write_text(body["description"])
-    (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+    (tmp_path / "emulated_drive.eds").write_text(body["files"]["emulated_drive.eds"])
     words = ["home", str(tmp_path / "arm.yaml"), "--zero", "--confirm", ON_A_BUS, "--lease-from-stdin"]
     reading, writing = os.pipe()
     os.write(writing, b"\n" if said is None else said)
@@ -358,7 +359,7 @@ def test_what_is_no_file_here_is_told_so_and_files_of_a_description_are_sent(
             assert re.search(r"monday.\w+: no such file here, and the daemon at http", capsys.readouterr().err)
         body = on_a_bus()
         (tmp_path / "arm.yaml").write_text(body["description"])
-        (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+        (tmp_path / "emulated_drive.eds").write_text(body["files"]["emulated_drive.eds"])
         assert main(["config", "check", str(tmp_path / "arm.yaml"), *server]) == 0
         broken = "format: ident-arm\nversion: 1\nname: broken\nkinematics: {urdf: broken.urdf}\n"
         (tmp_path / "arm.yaml").write_text(broken)

@@ -65,6 +65,27 @@ def test_a_stop_and_what_is_read_do_not_wait_for_who_writes(daemon: Asked, state
     assert max(line["at"] for line in lines) - min(line["at"] for line in lines) < SOON
 
 
+def test_a_stop_of_no_arm_is_told_so_and_no_look_up_refuses_one(
+    daemon: Asked, state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = daemon.post("/api/v1/arms/none/stop")
+    assert (answer.status_code, answer.json()["error"]["kind"]) == (404, "UnknownId")
+    assert daemon.post("/api/v1/arms/planar2/stop").json() == {"arms": [], "jobs": []}
+    # An arm that the registry does not know, but a process at a terminal moves.
+    with ControlFile.take(control_path(state, "own"), None) as mover:
+        assert daemon.post("/api/v1/arms/own/stop").json() == {"arms": ["own"], "jobs": []}
+        assert mover.stop
+    assert daemon.post("/api/v1/arms/own/stop").json() == {"arms": [], "jobs": []}
+    # A registry that cannot be read, or not soon, refuses nobody.
+    answering = threading.Event()
+    for names in (lambda _: answering.wait(30.0), lambda db: db.rows("SELECT nothing")):
+        monkeypatch.setattr("ident_service.daemon.routes.jobs.arm_names", names)
+        began = time.monotonic()
+        assert daemon.post("/api/v1/arms/none/stop").status_code == 200
+        assert time.monotonic() - began < SOON
+    answering.set()
+
+
 @pytest.mark.slow
 def test_a_stop_needs_no_thread_that_others_may_keep(daemon: Asked, state: Path) -> None:
     with (

@@ -103,6 +103,11 @@ def test_a_range_beyond_the_end_says_how_long_the_recording_is(tmp_path: Path) -
     recording = open_for_arm(Path(f"{written(tmp_path / 'run.csv')}@41:60"), arm_model(planar()))
     with pytest.raises(RecordingError, match=r"run\.csv@41:60: no sample from 41 s to 60 s; it lasts 14\.995 s"):
         list(recording.blocks())
+    # A rounded end is no mistake, seconds that are milliseconds are.
+    list(open_for_arm(Path(f"{tmp_path / 'run.csv'}@2:15"), arm_model(planar())).blocks())
+    late = open_for_arm(Path(f"{tmp_path / 'run.csv'}@2:15000"), arm_model(planar()))
+    with pytest.raises(RecordingError, match=r"ends at 15000 s, the recording at 14\.995 s; leave the end out"):
+        list(late.blocks())
 
 
 def test_one_file_to_fit_and_to_validate(tmp_path: Path) -> None:

@@ -62,6 +62,23 @@ def test_recordings_and_store_in_memory(
     assert len(memory.find("/store/factors")) == COUNT
 
 
+def test_a_pattern_that_names_nothing_is_refused_before_workers_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(reduction, "LocalCluster", None)
+    (tmp_path / "odd").mkdir()
+    (tmp_path / "odd" / "1.mcap").write_bytes(b"x")
+    words = ["--arm", "planar2", "--store", str(tmp_path / "store"), "--out", str(tmp_path / "out")]
+    for pattern, more, said in (
+        (f"{tmp_path}/nothing/*.mcap", [], "names no recording"),
+        (f"{tmp_path}/odd/*.mcap", ["--names", "(?P<arm>Q)"], "finds no arm in it"),
+        (f"{tmp_path}/odd/*.mcap", ["--names", "(?P<arm>/odd)"], "an arm cannot be called '/odd'"),
+    ):
+        assert main(["fleet", "identify", pattern, *words, *more]) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reduction, "_CONNECT_S", 0.5)
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler="tcp://127.0.0.1:9")

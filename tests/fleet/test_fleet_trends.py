@@ -118,6 +118,38 @@ def test_a_change_that_makes_no_torque_is_no_alarm() -> None:
     assert not found.changed
 
 
+def test_a_slow_drift_is_found_and_told_from_a_step() -> None:
+    """Of an effect that no single date shows: from week to week it is less than the noise."""
+    values = fleet(5)
+    for week in range(COUNT):
+        values["07"][week][[2, 3]] += 0.012 * week
+    found = [one for one in changes_of(values) if one.changed]
+    assert [(one.arm, one.group, one.drift) for one in found] == [("07", ("friction", 2), True)]
+    (change,) = found
+    assert (change.before, change.after) == (0.0, (COUNT - 1) * WEEK)
+    assert np.all(np.abs(change.step - 0.012 * (COUNT - 1)) < 4.0 * change.deviations)
+    assert not next(one for one in changes_of(stepped()) if one.changed).drift
+
+
+def stepped() -> dict[str, list[np.ndarray]]:
+    values = fleet(5)
+    for week in range(6, COUNT):
+        values["07"][week][[2, 3]] += 0.15
+    return values
+
+
+def test_a_drift_with_the_hours_of_use_is_what_they_explain() -> None:
+    values = fleet(5)
+    for week in range(COUNT):
+        values["07"][week][[2, 3]] += 0.012 * week
+    arms = {
+        arm: [recorded(one, week, operating_hours=3.7 * week) for week, one in enumerate(of_arm)]
+        for arm, of_arm in values.items()
+    }
+    found = change_points(arms, dict.fromkeys(arms, FIT), GROUPS, scatter_of(arms, GROUPS))
+    assert not any(one.changed or one.drift for one in found)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_recordings_are_no_trend(count: int) -> None:
     assert changes_of(fleet(5, count=count)) == []

@@ -92,6 +92,7 @@ def test_from_the_first_page_to_the_urdf_and_back(browser: Browser, reached: Rea
         seen.add(page.locator("#values").inner_text())
         page.wait_for_timeout(100)
     assert len(seen) >= 4  # values that move
+    expect(page.locator("#viewer-status")).to_contain_text("As measured, ")
     # Position, torque and following error of each joint, drawn with commanded beside measured values.
     expect(page.locator("#plots .joint h3")).to_have_text(["shoulder", "elbow"])
     expect(page.locator("#plots .uplot canvas")).to_have_count(6)

@@ -15,7 +15,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Protocol
@@ -197,14 +196,8 @@ def alive(process: str) -> bool:
     return status.rpartition(")")[2].split()[0] != "Z"
 
 
-def end_orphan(process: str, seconds: float) -> bool:
-    """End a process of a service that died, by SIGTERM; return whether it has ended within `seconds` [s]."""
-    if not alive(process):
-        return True
-    pid = int(process.split()[0])
-    with suppress(ProcessLookupError, PermissionError):
-        os.kill(pid, signal.SIGTERM)
-    until = time.monotonic() + seconds
-    while alive(process) and time.monotonic() < until:
-        time.sleep(0.05)
-    return not alive(process)
+def ask_to_end(process: str) -> None:
+    """Send SIGTERM to the process of this name, if it lives and may be signalled."""
+    if alive(process):
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(int(process.split()[0]), signal.SIGTERM)

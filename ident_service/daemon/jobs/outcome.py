@@ -6,18 +6,20 @@ A restart begins no motion: a person asked for it at another moment. Queued comp
 from __future__ import annotations
 
 import json
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, alive, end_orphan
+from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, alive, ask_to_end
 from ident_service.daemon.jobs.commands import FOLDERS, JOBS
 from ident_service.errors import IdentError
-from ident_service.motion.command_channel import in_use
+from ident_service.motion.command_channel import controlling_pid
 from ident_service.motion.ending import ENDED
+from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database, Row, note
 from ident_service.registry.motions import MOTION_FILE, MOTIONS, index_motion
@@ -95,7 +97,9 @@ def outcome(heard: ProcessOutput, exit_code: int | None, asked_to_end: str) -> O
         how = "" if exit_code is None else f" (signal {-exit_code})" if exit_code < 0 else f" (exit code {exit_code})"
         last = heard.log.strip().splitlines()[-1:]
         words = "; ".join([f"its process ended without a result{how}", *last])
-        return Outcome("cancelled", asked_to_end, exit_code) if asked_to_end else Outcome("failed", words, exit_code)
+        # A full disk takes the answer, and leaves the exit code.
+        state = "faulted" if exit_code == 4 else "cancelled" if asked_to_end else "failed"
+        return Outcome(state, asked_to_end if state == "cancelled" else words, exit_code)
     message = _message(heard.answer)
     if _report(heard.answer).get("state") == STOPPED:
         return Outcome("cancelled", asked_to_end or "the arm was stopped: a stop was requested", code)
@@ -215,59 +219,133 @@ def forget_unmade(db: Database, state: Path, row: Row) -> None:
         rows.made_nothing(db, row["id"])
 
 
-UNTOLD = "the service died while it ran; its process is being looked for"
-_WAIT = 40.0  # s for a process of the previous service: a controlled stop and its recording take less
+UNTOLD: Final = "the service died while it ran, and its process"
+"""Beginning of the detail of an interrupted job whose process has not been seen to end."""
+_LOOK = 0.1  # s between looks at processes of the previous service
+_WAIT = 40.0  # s for one of them to end; a controlled stop and its recording take less
+
+
+def untold(row: Row) -> bool:
+    """Return whether a job was interrupted and its process has not been seen to end."""
+    return row["state"] == "interrupted" and str(row["detail"]).startswith(UNTOLD)
 
 
 def mark_interrupted(db: Database, state: Path) -> None:
     """Mark running jobs and waiting motions as interrupted; quick, before any request is answered."""
     with db.transaction():
         for row in rows.jobs(db, states=rows.LIVE, most=1_000_000):
-            if row["state"] == "running":
-                detail = UNTOLD
+            running = row["state"] == "running"
+            if running:
+                detail = f"{UNTOLD} is being looked for"
             elif row["motion"]:
                 detail = "the service ended before it began; nothing has moved, request it again"
             else:
                 continue
             rows.ended(db, row["id"], "interrupted", detail)
-            if detail is not UNTOLD:
+            if not running:
                 forget_unmade(db, state, row)
             note(db, "service", "job interrupted", row["id"])
 
 
-def explain_interrupted(db: Database, state: Path, cut_short: Callable[[], bool] = lambda: False) -> None:
-    """Wait until processes of the previous service have ended, and enter what their files show."""
-    for row in rows.jobs(db, states=("interrupted",), most=1_000_000):
-        if row["detail"] != UNTOLD or cut_short():
-            continue
-        process = _process(state, row)
-        # A motion has seen the end of its input and stops its arm; a computation is of no use to anybody.
-        if not end_orphan(process, _WAIT):
-            rows.explain(db, row["id"], f"the service died while it ran; its process lives on ({process.split()[0]})")
-            continue
-        if row["motion"]:
-            _wait_for_motion_process(control_path(state, row["arm"]))
-        folder = folder_of(state, row)
-        detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
-        try:
-            register_outputs(db, state, row, row["created_by"])
-        except (IdentError, OSError) as error:
-            detail = f"{detail}; its folder could not be entered: {error}"
-        forget_unmade(db, state, row)
-        rows.explain(db, row["id"], detail)
+@dataclass
+class Orphan:
+    """Process of the previous service, and the motion process that it has started.
+
+    Attributes:
+        row: of its job.
+        process: its name, as `child_process.alive` takes it.
+        mover: id of the process that has the arm; None before one was seen.
+        since: when it was seen first [s].
+    """
+
+    row: Row
+    process: str
+    mover: int | None
+    since: float
+
+    def standing(self, state: Path) -> str:
+        """Return how it stands, in words that follow `UNTOLD`; empty once it has ended."""
+        row, moves = self.row, bool(self.row["motion"])
+        lives = alive(self.process)
+        has = controlling_pid(control_path(state, row["arm"])) if moves else None
+        if lives and self.mover is None:
+            self.mover = has
+        if not lives and (has is None or has != self.mover):
+            return ""
+        if has is not None and held_arm(state, row["arm"]):
+            return f" {has} holds {held_until(row['arm'])}"
+        if time.monotonic() - self.since < _WAIT:
+            return " is being looked for"
+        return f" {self.process.split()[0] if lives else has} has not ended yet"
 
 
-def orphans(db: Database, state: Path) -> list[str]:
-    """Return the ids of interrupted jobs whose process is still alive."""
-    found = rows.jobs(db, states=("interrupted",), most=1000)
-    return [row["id"] for row in found if alive(_process(state, row))]
+def held_until(arm: str) -> str:
+    """Return the words that say how long an arm without brakes is held, and what lets it down."""
+    return f"the arm {arm} until a person confirms that it is supported: `ident supported {arm}`"
 
 
-def _wait_for_motion_process(controls: Path) -> None:
-    """Wait for the motion process, which may outlive its parent for as long as its stop takes."""
-    until = time.monotonic() + _WAIT
-    while in_use(controls) and time.monotonic() < until:
-        time.sleep(0.05)
+def orphans(db: Database, state: Path) -> list[Orphan]:
+    """Return the processes of the previous service that were not seen to end, whether or not they live."""
+    return [
+        Orphan(
+            row,
+            _process(state, row),
+            controlling_pid(control_path(state, row["arm"])) if row["motion"] else None,
+            time.monotonic(),
+        )
+        for row in rows.jobs(db, states=("interrupted",), most=1_000_000)
+        if untold(row)
+    ]
+
+
+def explain_interrupted(
+    db: Database,
+    state: Path,
+    found: Sequence[Orphan] | None = None,
+    over: Callable[[str], None] = lambda _: None,
+    closing: threading.Event | None = None,
+) -> None:
+    """Follow processes of the previous service until they have ended, and enter what their files show.
+
+    One that holds an arm without brakes may live for hours; its job says so meanwhile.
+
+    Args:
+        db: the registry.
+        state: the state folder.
+        found: them, as `orphans` returned them; looked for here if None.
+        over: called with the id of each job whose process has ended.
+        closing: ends this early; the next service goes on.
+    """
+    left = list(orphans(db, state) if found is None else found)
+    closing = threading.Event() if closing is None else closing
+    told: dict[str, str] = {}
+    for one in left:
+        # A motion has seen the end of its input and stops its arm; a second word would end what holds it.
+        if not (one.row["motion"] and held_arm(state, one.row["arm"])):
+            ask_to_end(one.process)
+    while left and not closing.is_set():
+        for one in tuple(left):
+            job, words = one.row["id"], one.standing(state)
+            if not words:
+                left.remove(one)
+                _explain(db, state, one.row)
+                over(job)
+            elif words != told.setdefault(job, " is being looked for"):
+                told[job] = words
+                rows.explain(db, job, f"{UNTOLD}{words}")
+        if left:
+            closing.wait(_LOOK)
+
+
+def _explain(db: Database, state: Path, row: Row) -> None:
+    folder = folder_of(state, row)
+    detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
+    try:
+        register_outputs(db, state, row, row["created_by"])
+    except (IdentError, OSError) as error:
+        detail = f"{detail}; its folder could not be entered: {error}"
+    forget_unmade(db, state, row)
+    rows.explain(db, row["id"], detail)
 
 
 def _process(state: Path, row: Row) -> str:

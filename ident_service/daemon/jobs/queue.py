@@ -13,6 +13,7 @@ of either asks for the controlled stop. A scheduled motion's lease is our own.
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import signal
@@ -20,7 +21,7 @@ import sqlite3
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,21 +30,23 @@ from typing import Any, Final
 from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, SubprocessJob, UnitChild
 from ident_service.daemon.jobs.commands import JOBS, Command, command
 from ident_service.daemon.jobs.outcome import (
+    Orphan,
     explain_interrupted,
     forget_unmade,
     lateness_of,
     mark_interrupted,
+    orphans,
     outcome,
     register_outputs,
     said,
 )
 from ident_service.daemon.jobs.requests import Asked
 from ident_service.daemon.metrics import Metrics
-from ident_service.errors import IdentError, MotionRefused, UsageError
+from ident_service.errors import DiskFull, IdentError, MotionRefused, UsageError
 from ident_service.motion.command_channel import stop_requested_ns
 from ident_service.operations.moving_arms import confirm_support, finish_arm, moving_arms, pause_arm, stop_arms
 from ident_service.registry import jobs as rows
-from ident_service.registry.database import AuditQueue, Database, Row, note
+from ident_service.registry.database import FILE, AuditQueue, Database, Row, note, shortage
 from ident_service.registry.motions import new_id
 from ident_service.registry.runs import RUNS
 from ident_service.registry.state_folder import control_path
@@ -147,6 +150,7 @@ class LiveJobs:
         self._renewed = renewed
         self.changed = threading.Event()
         self._jobs: dict[str, LiveJob] = {}
+        self._orphans: dict[str, frozenset[str]] = {}
         self._stops = Counter[str | None]()
         self._lock = threading.Lock()
         self.lease_factor, self._now = lease_factor, now
@@ -182,8 +186,7 @@ class LiveJobs:
                 raise MotionRefused("the service is shutting down and starts no jobs")
             if stops is not None and stops != self.stops(live.order.arm):
                 raise MotionRefused("a stop was requested meanwhile; no job is started")
-            needed = set(live.order.resources)
-            before = next((one.job for one in self._jobs.values() if needed & set(one.order.resources)), "")
+            before = self._before(live)
             if before and not live.order.waits:
                 raise MotionRefused(
                     f"{live.order.arm}: {before} uses it or waits for it; try again when that has ended"
@@ -195,6 +198,41 @@ class LiveJobs:
         with self._lock:
             live.renewed, live.entered = self._now(), True
         self.changed.set()
+
+    def keep_from(self, orphans: Mapping[str, frozenset[str]]) -> None:
+        """Let no job begin that needs a resource which a process of the previous service has, by job."""
+        with self._lock:
+            self._orphans = dict(orphans)
+
+    def orphan_ended(self, job: str) -> None:
+        """Free the resources of a job's process that the previous service had started."""
+        with self._lock:
+            self._orphans.pop(job, None)
+        self.changed.set()
+
+    def waits_for(self, job: str) -> str | None:
+        """Return the id of the job that one which has not begun waits for; None for one that could begin, or has."""
+        with self._lock:
+            live = self._jobs.get(job)
+            if live is None or live.child is not None:
+                return None
+            if not live.order.resources:
+                return next((one.job for one in self._jobs.values() if one.child and not one.order.resources), None)
+            return self._before(live) or None
+
+    def _before(self, live: LiveJob) -> str:
+        """Return the id of a job that has, or will have before this one, what it needs; empty where there is none."""
+        needed = set(live.order.resources)
+        for job, taken in self._orphans.items():
+            if needed & taken:
+                return job
+        earlier = True
+        for other in self._jobs.values():
+            if other is live:
+                earlier = False
+            elif (earlier or other.child is not None) and needed & set(other.order.resources):
+                return other.job
+        return ""
 
     def remove(self, live: LiveJob) -> None:
         """Remove a job that has ended, or was not accepted."""
@@ -225,13 +263,7 @@ class LiveJobs:
             if not live.order.resources:
                 running = [one for one in self._jobs.values() if one.child is not None and not one.order.resources]
                 return len(running) < computing
-            needed, earlier = set(live.order.resources), True
-            for other in self._jobs.values():
-                if other is live:
-                    earlier = False
-                elif (earlier or other.child is not None) and needed & set(other.order.resources):
-                    return False
-            return True
+            return not self._before(live)
 
     def began(self, live: LiveJob, child: JobProcess) -> None:
         """Store the process of a job; pass on a stop that was asked for while it was being started."""
@@ -334,6 +366,7 @@ def _send_stop(live: LiveJob) -> None:
 
 
 _POLITE = 15.0  # s for a computation that was asked to end
+_LAST = 5.0  # s for what a process of the previous service has left to be entered
 _AGAIN = 1.0  # s between attempts to write to a registry that is full or locked
 LOG = logging.getLogger("ident.jobs")
 
@@ -368,9 +401,12 @@ class Engine:
         self.db, self.state, self.audit = db, state, AuditQueue(db)
         self.live = LiveJobs(lease_factor, now, self.metrics.renewed)
         self._computing, self._door, self._now = computing, motion_door, now
-        self._unwritten: set[str] = set()  # jobs whose end waits for room in the registry
+        self._unwritten: set[str] = set()  # jobs whose end waits for room
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
+        self._following = threading.Thread(target=self._follow_orphans, name="orphans", daemon=True)
+        self._orphans: list[Orphan] = []
+        self._short = ""  # of what the queue waits for, as it was logged last
         self._first: Callable[[], Any] = lambda: None
         self.beat = now()
 
@@ -382,7 +418,10 @@ class Engine:
         """
         self._first = first
         mark_interrupted(self.db, self.state)
+        self._orphans = orphans(self.db, self.state)
+        self.live.keep_from({one.row["id"]: self._resources(one.row) for one in self._orphans})
         self._requeue()
+        self._following.start()
         self._thread.start()
         self.live.start()
 
@@ -506,27 +545,54 @@ class Engine:
         self.begin_closing()
         if self._thread.ident is not None:
             self._thread.join(seconds)
+            self._following.join(_LAST)
         self.live.close()
         self.audit.close()
 
     # --- what the thread does
 
+    def _follow_orphans(self) -> None:
+        """Enter how each process of the previous service ends; until then, what it has is nobody else's."""
+        while not self._closing.is_set():
+            try:
+                explain_interrupted(self.db, self.state, self._orphans, self.live.orphan_ended, self._closing)
+            except (sqlite3.Error, OSError) as error:
+                LOG.error("what was interrupted cannot be told yet: %s", error)
+                if self._closing.wait(_LAST):
+                    return
+                self._orphans = orphans(self.db, self.state)
+            except Exception:
+                LOG.exception("what was interrupted could not be told")
+                return
+            else:
+                return
+
+    def _resources(self, row: Row) -> frozenset[str]:
+        """Return what the process of a job has for itself."""
+        if not row["motion"] and row["kind"] not in ("watch", "recover", "bus_scan", "bus_probe"):
+            return frozenset()
+        known = self.db.row("SELECT resources FROM arms WHERE name = ?", row["arm"])
+        return frozenset((f"arm {row['arm']}", *(json.loads(known["resources"]) if known else ())))
+
     def _work(self) -> None:
         try:
-            explain_interrupted(self.db, self.state, self._closing.is_set)
             self._first()
         except Exception:
-            LOG.exception("what was interrupted could not be told")
+            LOG.exception("runs could not be entered")
         while True:
             self.beat = self._now()
             try:
                 self._look()
             except sqlite3.Error as error:
-                LOG.error("the queue waits for the registry: %s", error)
+                if (words := str(error)) != self._short:  # once, however long it lasts
+                    self._short = words
+                    LOG.error("the queue waits for the registry: %s", error)
                 time.sleep(_AGAIN)
             except Exception:  # the queue must go on, whatever one job does to it
                 LOG.exception("the queue stumbled")
                 time.sleep(_AGAIN)
+            else:
+                self._short = ""
             if self.closing and not self.live:
                 return
             self.live.changed.wait(TICK if self.live else 1.0)
@@ -600,12 +666,14 @@ class Engine:
         while True:
             try:
                 self._finish(live, ended.state, self._kept(live, ended.detail), ended.exit_code)
-            except sqlite3.Error as error:
+            except (sqlite3.Error, OSError) as error:
                 # For example a full disk; until there is room, the service must not count as healthy.
-                LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
+                if live.job not in self._unwritten:  # once, however long it lasts
+                    LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
                 self._unwritten.add(live.job)
                 if self._closing.wait(_AGAIN):
-                    return  # the next start determines the job's outcome
+                    self.live.remove(live)  # the next start determines the job's outcome
+                    return
             else:
                 self._unwritten.discard(live.job)
                 return
@@ -616,7 +684,10 @@ class Engine:
             register_outputs(self.db, self.state, rows.known_job(self.db, live.job), live.by)
         except sqlite3.Error:
             raise  # as for the end of the job itself
-        except Exception as error:  # whatever stands in its way, the job has ended
+        except Exception as error:  # whatever else stands in its way, the job has ended
+            for cause in (error, error.__context__):
+                if cause is not None and isinstance(short := shortage(self.state / FILE, cause), DiskFull):
+                    raise short from None
             LOG.exception("what a job made could not be entered")
             return "; ".join(filter(None, (detail, f"its folder could not be entered: {error}")))
         return detail

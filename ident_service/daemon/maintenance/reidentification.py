@@ -22,7 +22,7 @@ from typing import Final
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import JOBS, accepted_description
-from ident_service.daemon.jobs.outcome import UNTOLD, said
+from ident_service.daemon.jobs.outcome import said, untold
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.jobs.requests import Asked, Check, Identify, Judge, RecordingReference, Run
 from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
@@ -217,7 +217,7 @@ class Reidentifications:
 
     def _advance(self, row: Row) -> None:
         job = known_job(self._db, row["job"])
-        if job["state"] in LIVE or job["detail"] == UNTOLD or self._engine.closing:
+        if job["state"] in LIVE or untold(job) or self._engine.closing:
             return
         judged = row["step"] == "judge" and job["state"] in ("done", "refused")
         answer = said(self._state / JOBS / job["id"]).answer if judged else {}

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, failures_of_files
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import said
+from ident_service.daemon.jobs.outcome import held_until, said, untold
 from ident_service.daemon.jobs.requests import MOVES, ArmName, Asked, Id
 from ident_service.daemon.responses import (
     PAGES,
@@ -32,10 +32,12 @@ from ident_service.daemon.responses import (
     Page,
     StopAnswer,
 )
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import MotionRefused, UnknownId, UsageError
 from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
+from ident_service.registry.arms import arm_names
 from ident_service.registry.database import Row
+from ident_service.registry.state_folder import arm_folder
 from ident_service.registry.tokens import Access
 
 router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
@@ -43,6 +45,7 @@ MOST_LOG: Final = 2**20
 NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 _EVENTS = 0.2  # s between looks at a job that is watched
 _BREATH = 10.0  # s without news, after which a comment shows that the line is up
+_KNOWN: Final = 0.5  # s for the registry to say whether an arm that nobody moves exists
 # Its own threads: whatever else is busy, a stop is not.
 _STOPS = ThreadPoolExecutor(4, thread_name_prefix="stop")
 _STREAM: dict[int | str, dict[str, Any]] = {
@@ -212,13 +215,28 @@ async def stop_all(service: Serving, who: Near) -> StopAnswer:
 
 @router.post("/arms/{arm}/stop")
 async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
-    """Stop an arm, under control; as for all arms; it is no error if no process moves it."""
+    """Stop an arm, under control; as for all arms; it is no error if no process moves it, but 404 for no arm at all."""
     return await _stop(service, arm, who)
 
 
 async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
     done = await asyncio.get_running_loop().run_in_executor(_STOPS, service.engine.stop, arm, who)
+    if arm is not None and not any(done.values()) and not await _may_be_known(service, arm):
+        raise UnknownId(f"no arm {arm!r} is known; nothing was stopped. POST /api/v1/stop stops all arms")
     return StopAnswer(**done)
+
+
+async def _may_be_known(service: Service, arm: str) -> bool:
+    """Return whether there is an arm of this name, or that cannot be told soon: the stop has been sent already."""
+
+    def known() -> bool:
+        # One that moved once has a folder, an uploaded one of another machine's command too.
+        return arm_folder(service.state, arm).exists() or arm in (row["name"] for row in arm_names(service.db))
+
+    try:
+        return await asyncio.wait_for(asyncio.to_thread(known), _KNOWN)
+    except (TimeoutError, sqlite3.Error, OSError):
+        return True
 
 
 def job_answer_document(service: Service, row: Row) -> JobAnswer:
@@ -227,7 +245,15 @@ def job_answer_document(service: Service, row: Row) -> JobAnswer:
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
-    held = bool(row["motion"]) and row["state"] == "running" and held_arm(service.state, str(row["arm"]))
+    moves = bool(row["motion"]) and (row["state"] == "running" or untold(row))
+    held = moves and held_arm(service.state, str(row["arm"]))
+    if held and progress is not None:  # it ends when a person says so
+        progress |= {"fraction": None, "remaining": None}
+    if row["state"] == "queued" and (before := service.engine.live.waits_for(row["id"])) is not None:
+        other = service.db.row("SELECT arm FROM jobs WHERE id = ? AND motion", before)
+        shown["detail"] = f"waits for {before}"
+        if other is not None and held_arm(service.state, str(other["arm"])):
+            shown["detail"] += f", which holds {held_until(other['arm'])}"
     return JobAnswer(**{**shown, "progress": progress, "held": held})
 
 

@@ -143,7 +143,8 @@ def extent(service: Service, arm: str, motion: str, speed: float) -> Any:
     from ident_service.operations.arm_pictures import motion_extent
 
     try:
-        return motion_extent(*_motion(service, arm, motion), speed)
+        model, planned = _motion(service, arm, motion)
+        return motion_extent(model, planned, speed)
     except IdentError:
         return None  # preflight says why
 

@@ -23,14 +23,19 @@ from ident_service import __version__
 from ident_service.registry.tokens import Access
 from ident_service.results.plots import number
 
-_SCRIPTS: Final = ("page", "plots", "live", "again", "upload", "news", "series", "table", "trends", "new")
+_SCRIPTS: Final = ("page", "plots", "live", "again", "upload", "news", "series", "table", "trends", "new", "viewer")
 STATIC: Final = {
     "page.css": "text/css",
     "icon.svg": "image/svg+xml",
     **{f"{name}.js": "text/javascript" for name in _SCRIPTS},
 }
-PLOTS: Final = {"uPlot.iife.min.js": "text/javascript", "uPlot.min.css": "text/css"}
-"""Vendored files that pages with plots load, beside those of `STATIC`."""
+VENDORED: Final = {
+    "uPlot.iife.min.js": "text/javascript",
+    "uPlot.min.css": "text/css",
+    "three.module.min.js": "text/javascript",
+    "three.core.min.js": "text/javascript",
+}
+"""Files of others that pages load beside those of `STATIC`: plots, and the arm in three dimensions."""
 _LONGEST: Final = 90  # characters of a sentence in a list
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -97,7 +102,7 @@ def static() -> dict[str, bytes]:
     own, others = files(__package__).joinpath("static"), _vendored()
     return {
         **{name: own.joinpath(name).read_bytes() for name in STATIC},
-        **{name: others.joinpath(name).read_bytes() for name in PLOTS},
+        **{name: others.joinpath(name).read_bytes() for name in VENDORED},
     }
 
 

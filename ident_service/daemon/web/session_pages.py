@@ -12,8 +12,8 @@ from ident_service.daemon.routes import about
 from ident_service.daemon.routes.jobs import stop_all
 from ident_service.daemon.web.forms import Form, PageRoute, inside, seen
 from ident_service.daemon.web.render import (
-    PLOTS,
     STATIC,
+    VENDORED,
     VIEWER,
     mark,
     page,
@@ -66,7 +66,7 @@ def load(version: str, name: str) -> Response:
     """Return a style sheet or script."""
     if (version, name) == (viewer_version(), VIEWER):
         return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
-    kind = {**STATIC, **PLOTS}.get(name)
+    kind = {**STATIC, **VENDORED}.get(name)
     if kind is None or version != mark():
         raise HTTPException(404, "no such file; load the page again")
     return Response(static()[name], media_type=kind, headers=_KEPT)

@@ -68,22 +68,22 @@ class Figure:
 
 
 GOOD = {
-    "torque": "Good: measured and predicted torque lie on each other, and the residual (measured less predicted) is noise "
-    "about zero, but for spikes where a joint turns round. Bad: a residual that follows the motion.",
+    "torque": "Good: measured and predicted torque lie on each other, and the residual (measured less predicted) is "
+    "noise about zero, but for spikes where a joint turns round. Bad: a residual that follows the motion.",
     "residual": "Good: a spectrum that is flat up to where a filter cuts it off, and an autocorrelation that falls at "
     "once and stays about the dashed lines. Bad: peaks at frequencies of the motion or of a gear, and one that swings "
     "slowly.",
     "friction": "Good: the points lie about the curve in a band of noise. Bad: a bow or a hook that the curve does not "
     "have, which asks for another friction term, or points in loops, which are elasticity or pre-sliding.",
     "doubt": f"Good: round dots below the lower line, at {100 * IDENTIFIED_BELOW:g} % of the parameter or of a "
-    "negligible size, and a matrix with little but specks. Bad: squares above the upper line, whose values mean nothing, "
-    "and marks that fill their place (beyond 0.9), parameters that this motion cannot separate.",
+    "negligible size, and a matrix with little but specks. Bad: squares above the upper line, whose values mean "
+    "nothing, and marks that fill their place (beyond 0.9), parameters that this motion cannot separate.",
     "bodies": "Motion determines base parameters only: the bodies are one choice of many with the same dynamics. Each "
-    "ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on, and large "
-    "margins. Bad: flat, huge or far from their link; no margin, where a constraint is active.",
+    "ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on, and "
+    "large margins. Bad: flat, huge or far from their link; no margin, where a constraint is active.",
     "timing": "Good: one narrow peak at the left, within a few percent of the period, or, from stamps alone, within "
-    f"{100 * MUCH_JITTER:g} % (standard deviation; beyond, the warnings name it). Bad: a tail as long as the period, or "
-    "a second peak.",
+    f"{100 * MUCH_JITTER:g} % (standard deviation; beyond, the warnings name it). Bad: a tail as long as the period, "
+    "or a second peak.",
 }
 
 _TORQUE_TOP, _TORQUE, _RESIDUAL, _TORQUE_BETWEEN, _TORQUE_BOTTOM = 42.0, 150.0, 74.0, 26.0, 40.0

@@ -30,7 +30,7 @@ from ident_service.results.report.figures import (
     relative_deviations,
 )
 from ident_service.results.report.rendering import WORST, Cell, Table, asset, render, vendored
-from ident_service.results.report.verdict import SIMULATED, verdict
+from ident_service.results.report.verdict import SIMULATED, next_steps, verdict
 from ident_service.results.summary import WHAT_THEN, noise_and_model, rows_and_filter
 
 _NOTHING = Cell("\u2014")
@@ -63,8 +63,8 @@ def _quantity(value: float | None, unit: str) -> Cell:
 def joint_rule() -> str:
     """Return the meaning of the columns and words of the table on top."""
     return (
-        f"Use: below {POOR:g} %; use with care: above, near standstill or in motion; do not use: above {USELESS:g} % in "
-        "motion. Fitted: recordings fitted to; unseen: the worst recording that was not; moving: without rows near "
+        f"Use: below {POOR:g} %; use with care: above, near standstill or in motion; do not use: above {USELESS:g} % "
+        "in motion. Fitted: recordings fitted to; unseen: the worst recording that was not; moving: without rows near "
         "standstill. Root mean squares are of the recording that decides."
     )
 
@@ -88,32 +88,31 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> Table:
         "verdict",
     ]
     intervals = content.get("constrained_intervals")
-    heads += [*(name for name, _ in others), *(["95 % inside the set"] if intervals else []), "bound"]
+    heads += [*(name for name, _ in others), *(["95 % inside the set"] if intervals else [])]
+    heads += ["bound"] if any(evidence.bounds) else []
     rows = []
     for k, expression in enumerate(content["expressions"]):
         cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
         cells.append(_number(float(parameters.values[k])))
         cells.append(Cell("not excited", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
         cells.append(Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")))
-        cells += [_NOTHING if values is None else _number(float(values[k])) for _, values in others]
+        cells += [_number(float(values[k])) for _, values in others]
         if intervals:
             ends = [end for end in intervals[k] if end is not None]
             cells.append(Cell(f"{number(ends[0], 3)} to {number(ends[1], 3)}") if len(ends) == 2 else _NOTHING)
-        bounds = "; ".join(evidence.bounds[k])
-        cells.append(Cell(bounds) if bounds else _NOTHING)
+        if any(evidence.bounds):
+            cells.append(Cell("; ".join(evidence.bounds[k]) or "\u2014"))
         rows.append(cells)
     caption = "Base parameters, the least known first; \u03c3 is the standard deviation of the unconstrained fit"
     worst = np.argsort(-np.nan_to_num(relative_deviations(parameters), nan=np.inf), kind="stable")
     return Table(caption, heads, [rows[k] for k in worst], kind="parameters", shown=WORST)
 
 
-def _others(evidence: Evidence) -> list[tuple[str, Array | None]]:
-    """Return name and values of the estimates to compare the chosen one with; CAD without values where unknown."""
-    first = evidence.estimates[0]
-    found: list[tuple[str, Array | None]] = [(CAD, first.values if first.name == CAD else None)]
+def _others(evidence: Evidence) -> list[tuple[str, Array]]:
+    """Return name and values of the estimates to compare the chosen one with, the CAD values where they are known."""
     places = sorted({evidence.unconstrained, evidence.constrained} - {evidence.chosen})
-    found += [(evidence.estimates[place].name, evidence.estimates[place].values) for place in places]
-    return found
+    first = [0] if evidence.estimates[0].name == CAD else []
+    return [(evidence.estimates[place].name, evidence.estimates[place].values) for place in (*first, *places)]
 
 
 def verdict_rule() -> str:
@@ -252,7 +251,8 @@ def _number(value: float | None, digits: int = 5) -> Cell:
 
 _NO_WARNING = (
     "No warnings of the recordings: gaps, saturation and standstill are as they should be, and the standard deviation "
-    f"of the steps between stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands under Timing."
+    f"of the steps between stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands "
+    "under Timing."
 )
 _ARRIVAL = (
     "The arm's description takes stamps for times of arrival: between gaps samples count as evenly spaced, so uneven "
@@ -277,7 +277,6 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     order = [one.place for one in found.joints] or list(range(len(evidence.joints)))
     drawn = figures(evidence, parameters)
     simulated = isinstance(config.driver, SimulatedDriver)
-    *sentences, next_step = verdict(evidence, parameters)
     link_values = content.get("link_parameters", {})
     return render(
         "report.html",
@@ -289,8 +288,8 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
         assessment=found,
         joints=assessment_table(found),
         joint_rule=joint_rule(),
-        sentences=sentences,
-        next_step=next_step,
+        sentences=verdict(evidence, parameters),
+        steps=next_steps(evidence, parameters),
         warnings=evidence.warnings,
         no_warning=_NO_WARNING,
         contents=_TITLES,
@@ -317,7 +316,6 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
         unseen=any(one.role == "validation" for one in evidence.recordings),
         errors=error_table(evidence),
         every_recording=joint_table(found.joints, parameters),
-        no_prior=evidence.estimates[0].name != CAD,
         verdict_rule=verdict_rule(),
         parameters=parameter_table(evidence, parameters),
         friction=friction_table(evidence, parameters, order) if evidence.friction else None,
@@ -401,10 +399,13 @@ def _run(parameters: ParameterFile) -> list[str]:
     scales = parameters.content.get("torque_scales", [])
     if any(scale != 1.0 for scale in scales):
         rows.append("Measured torques multiplied by " + ", ".join(number(scale, 4) for scale in scales) + ".")
+    for one in parameters.content.get("torque_constants", []):
+        doubt = one["standard_deviation"]
+        told = "not shown" if doubt is None else f"{number(one['factor'], 4)} \u00b1 {number(doubt)}"
+        rows.append(f"Torque of motor {one['motor']} ({', '.join(one['joints'])}) for one by its description: {told}.")
     rows.append(f"Made {origin.get('created', 'at an unknown time')} by {origin.get('software', 'unknown software')}")
     rows[-1] += f", commit {origin['git']}." if origin.get("git") else "."
-    rows += [sentence for sentence in (fit or {}).get("rows_and_filter", []) if sentence.startswith("Chosen: ")]
-    return rows
+    return [*rows, *(fit or {}).get("rows_and_filter", [])]
 
 
 def _data(traced: PredictionTrace) -> dict[str, Any]:

@@ -118,9 +118,11 @@ _UNITS = re.compile(r"(?<=\d) (N m|N|%|ms|s|Hz|kg|MB)(?=[\s.,;:)]|$)")
 
 def _readable(value: Any) -> Any:
     """Return text without characters that a page cannot have, in which no line ends between a number and its unit."""
-    if not isinstance(value, str) or isinstance(value, Markup):
+    if not isinstance(value, str) or isinstance(value, Markup) or (value.isascii() and value.isalnum()):
         return value
-    return printable(_UNITS.sub(lambda unit: unit[0].replace(" ", "\u00a0"), value))
+    if " " in value:
+        value = _UNITS.sub(lambda unit: unit[0].replace(" ", "\u00a0"), value)
+    return value if value.isprintable() else printable(value)
 
 
 @cache

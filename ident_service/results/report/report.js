@@ -3,7 +3,7 @@
 // together. Names the pair of parameters under the pointer in the correlation matrix. Without this script the page shows all.
 (() => {
   const LEAST = 8; // stretches that can be seen at least
-  const HEIGHTS = { torque: 210, residual: 150 };
+  const HEIGHTS = { torque: 210, residual: 160 };
 
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -112,15 +112,15 @@
       this.show(this.now[0] + by, this.now[1] + by);
     }
 
-    options(figure, label, height, series, stretches) {
+    options(figure, label, height, series, stretches, last) {
       const axis = (more) => ({ stroke: () => css("soft"), grid: { stroke: () => css("line"), width: 1 }, ticks: { show: false }, ...more });
       return {
         width: figure.clientWidth, height,
         legend: { markers: { width: 3 } },
         cursor: { sync: { key: this.key, scales: ["x", null] }, drag: { x: true, y: false }, points: { show: false } },
         scales: { x: { time: false, range: (_, from, to) => [from ?? this.now[0], to ?? this.now[1]] } },
-        axes: [axis({ size: 34 }), axis({ label, size: 58, labelSize: 18, values: (_, ticks) => ticks.map(words) })],
-        series: [{ label: "time", value: (_, at) => (at === null ? "\u2014" : words(at) + " s") }, ...series],
+        axes: [axis(last ? { size: 34, label: "time [s]", labelSize: 18 } : { size: 26 }), axis({ label, size: 58, labelSize: 18, values: (_, ticks) => ticks.map(words) })],
+        series: [{ class: last ? "lowest" : null, label: "time", value: (_, at) => (at === null ? "\u2014" : words(at) + " s") }, ...series],
         bands: series.map((_, k) => k).filter((k) => k % 2).map((k) => ({ series: [k + 1, k], fill: series[k].stroke })),
         hooks: {
           drawClear: [shade(stretches)],
@@ -148,7 +148,7 @@
           this.options(figure, "torque [" + about.unit + "]", HEIGHTS.torque, both, stretches),
           [this.of.time, ...band(this.of, joint.torque), ...band(this.of, joint.predicted)], place),
         new uPlot(
-          this.options(figure, "residual [" + about.unit + "]", HEIGHTS.residual, pair("residual", "residual", 1), stretches),
+          this.options(figure, "residual [" + about.unit + "]", HEIGHTS.residual, pair("residual", "residual", 1), stretches, true),
           [this.of.time, ...band(this.of, joint.residual)], place),
       ];
       this.plots.push(...made);

@@ -61,21 +61,18 @@ SIMULATED = "The arm is simulated: this is no commissioning of a real arm."
 _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` checks it in exact arithmetic."
 
 
-def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = False) -> list[str]:
-    """Return the verdict in sentences, the last of them the next step.
+def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
+    """Return the verdict in sentences.
 
     Args:
         evidence: what was gathered while the estimate was at hand.
         parameters: the parameter file that it belongs to.
-        simulated: whether the arm's driver is a simulated one.
     """
     return [
-        *([SIMULATED] if simulated else []),
         *_feasibility(evidence, parameters),
         _prediction(evidence, parameters),
         _knowledge(parameters),
         *_condition(parameters),
-        _next(evidence, parameters),
     ]
 
 
@@ -164,16 +161,14 @@ def _condition(parameters: ParameterFile) -> list[str]:
     ]
 
 
-def _next(evidence: Evidence, parameters: ParameterFile) -> str:
+def next_steps(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """Return what a person should do now, the most urgent thing first."""
     if parameters.content.get("unusable"):
-        return "Next: correct what forbids their use, and identify again."
+        return ["correct what forbids their use, and identify again"]
     steps = []
     found = parameters.content.get("feasibility")
     if found is not None and found["margin"] <= 0.0:
         steps.append("identify within a feasible set, and look first for wrong signs, units or joint directions")
-    if evidence.warnings:
-        steps.append("correct what the recordings' warnings name and record again")
     own = evidence.estimates[evidence.chosen]
     if not own.validation:
         steps.append("record a second motion and give it with --validate")
@@ -193,6 +188,6 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
         steps.append(
             "where the unidentified parameters matter, design a motion that excites them (ident design --after)"
         )
-    if not steps:
-        return "Next: it can be used."
-    return "Next: " + "; ".join(steps) + "."
+    if evidence.warnings:
+        steps.append("correct what the warnings name and record again")
+    return steps or ["it can be used"]

@@ -133,6 +133,7 @@ const shownWindow = () => {
 
 function addSamples(text) {
   const piece = JSON.parse(text);
+  document.dispatchEvent(new CustomEvent("samples", { detail: piece }));
   if (!series.joints.length) {
     series.joints = piece.joints;
     for (const kind of QUANTITIES) series[kind] = piece[kind] ? piece.joints.map(() => []) : null;
