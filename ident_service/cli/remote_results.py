@@ -22,7 +22,7 @@ from ident_service.cli.archive_commands import (
     runs_text,
 )
 from ident_service.cli.daemon_commands import token_line
-from ident_service.cli.identification_commands import accepted_name
+from ident_service.cli.identification_commands import accepted_name, fleet_lines
 from ident_service.cli.maintenance_commands import alarm_lines, due_line, schedule_line
 from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.recovery_commands import EXIT_CODES
@@ -82,11 +82,30 @@ def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
     return {**run, "recordings": recordings, "refit_offsets": arguments.refit_offsets}
 
 
+def _fleet(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the request of a fleet, whose recordings are those that the daemon has of the arms named."""
+    asked = {"kind": "fleet", "arm": arguments.arm, "arms": arguments.patterns}
+    return {**asked, "settle_again": True if arguments.settle_again else None}
+
+
+def _of_fleet(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """Tell what was found as at the daemon's machine, then download the page, the table and the document."""
+    code, text, document = answer
+    found = document["answer"]
+    if "arms" in found:
+        text += "\n".join([*fleet_lines(found), ""])
+    return _fetched_files(client, arguments, (code, text, document))
+
+
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """Download the files of an export, where `--out` was given."""
+    """Download the files of an export, where `--out` was given, after its answer's lines."""
+    return _fetched_files(client, arguments, with_answer_lines(client, arguments, answer))
+
+
+def _fetched_files(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     from ident_service.results.manifest import atomic_folder
 
-    code, text, document = with_answer_lines(client, arguments, answer)
+    code, text, document = answer
     if code not in (DONE, VERDICT_NO):
         return code, text, document
     if document["job"]["run"] is None:  # refused before anything was written
@@ -289,6 +308,7 @@ _DELETES = ("runs delete", "motions delete", "arms delete")
 VERBS: dict[str, Verb] = {
     "report": job_verb(_run, _reported),
     "export": job_verb(_export, _fetched),
+    "fleet identify": job_verb(_fleet, _of_fleet),
     "figures": job_verb(_figures, _fetched),
     "payload": job_verb(_payload, _fetched),
     "compare": job_verb(_compare, with_answer_lines),
@@ -321,6 +341,7 @@ _NUMBER = frozenset({"number"})
 CARRIED: dict[str, frozenset[str]] = {
     "report": frozenset({"run", "out"}),
     **dict.fromkeys(("export", "figures"), frozenset({"run", "format", "out"})),
+    "fleet identify": frozenset({"patterns", "arm", "settle_again", "out"}),
     "payload": frozenset({"run", "recordings", "refit_offsets", "out"}),
     "compare": frozenset({"reference", "others"}),
     "verify": frozenset({"file", "arm"}),
