@@ -88,9 +88,9 @@ bench-realtime: $(READY)
 bench-peers: $(READY)
 	$(BIN)/python -m benchmarks.peers
 
-# Two hundred recordings of twenty arms, on one and two processes.
+# Two hundred recordings of twenty arms, on one and two processes: make bench-fleet FLEET="--data FOLDER" keeps them.
 bench-fleet: $(READY)
-	$(BIN)/python -m benchmarks.fleet
+	$(BIN)/python -m benchmarks.fleet $(FLEET)
 
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
 campaign: test-socketcan
