@@ -341,6 +341,7 @@ def test_scripts_and_styles_are_ours_and_kept(daemon: Asked) -> None:
         answer = daemon.get(f"/static/{mark()}/{name}")
         assert (answer.status_code, answer.content) == (200, static()[name])
         assert "immutable" in answer.headers["cache-control"]
-    for content in static().values():
+    for name in STATIC:  # what others wrote is known by its checksum, and may load nothing by the pages' policy
+        content = static()[name]
         assert not re.search(rb"https?://(?!www\.w3\.org/2000/svg)", content)
         assert b"innerHTML" not in content
