@@ -201,14 +201,21 @@ def _add_configs(verbs: VerbList) -> None:
         "new",
         _new,
         "write a first description of an arm",
-        more="From its URDF, with a simulated driver.",
-        examples=("robot.urdf", "robot.urdf --tip wrist_3_link --out my_arm.yaml"),
+        more="From its URDF, MJCF or DH table, with a simulated driver.",
+        examples=(
+            "robot.urdf",
+            "robot.xml --tip wrist_3_link --out my_arm.yaml",
+            "table.csv --convention modified",
+        ),
     )
-    new.add_argument("urdf", metavar="URDF", type=Path)
+    help_source = "URDF (.urdf, .xml), MJCF (.xml), or DH table (.csv, .yaml)"
+    new.add_argument("source", metavar="FILE", type=Path, help=help_source)
     new.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: NAME.yaml here)")
-    new.add_argument("--name", help="of the arm (default: the URDF's file name)")
-    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: the root)")
+    new.add_argument("--name", help="of the arm (default: the file's)")
+    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: found)")
     new.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where the gripper begins)")
+    help_convention = "of a DH table that does not say it: standard (distal frames) or modified (Craig)"
+    new.add_argument("--convention", choices=["standard", "modified"], help=help_convention)
     config = verbs.group("config", "check arm descriptions")
     check = config.add(
         "check",
@@ -245,8 +252,8 @@ def _new(arguments: argparse.Namespace) -> Answer:
     def tell(line: str) -> None:
         print_to_person(f"{line} ...\n")
 
-    words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
-    path, guessed = new_description(*words, tell)
+    words = (arguments.source, arguments.out, arguments.name, arguments.base, arguments.tip)
+    path, guessed = new_description(*words, tell, arguments.convention)
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}

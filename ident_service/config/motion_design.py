@@ -10,7 +10,16 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field, model_validator
 
-from ident_service.config.quantities import Angle, Count, Interval, NonNegative, Positive, Section, Vector3
+from ident_service.config.quantities import (
+    Angle,
+    Count,
+    Interval,
+    NonNegative,
+    Positive,
+    Section,
+    Vector3,
+    did_you_mean,
+)
 
 BASE = "base"  # name of the fixed base among the links
 
@@ -147,13 +156,15 @@ def disagreements(
         return
     for name in geometry:
         if name not in (*joints, BASE):
-            yield ("geometry", name), f"geometry: no joint {name!r}, and not {BASE!r}"
+            near = did_you_mean(name, (*joints, BASE)) or f"; known are {', '.join((BASE, *joints))}"
+            yield ("geometry", name), f"geometry: no joint {name!r}, and not {BASE!r}{near}"
     for number, pair in enumerate(workspace.may_touch):
         for side, name in enumerate(pair):
             if name not in (*joints, BASE):
+                near = did_you_mean(name, (*joints, BASE)) or f"; known are {', '.join((BASE, *joints))}"
                 yield (
                     ("workspace", "may_touch", number, side),
-                    f"workspace.may_touch: no joint {name!r}, and not {BASE!r}",
+                    f"workspace.may_touch: no joint {name!r}, and not {BASE!r}{near}",
                 )
     if supply is not None and isinstance(supply.loss, tuple) and len(supply.loss) != len(joints):
         yield ("supply", "loss"), f"supply.loss: {len(supply.loss)} values for {len(joints)} joints"

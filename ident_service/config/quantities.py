@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -59,6 +61,13 @@ class ExtendedSection(Section):
         fields = type(self).model_fields
         document: dict[str, Any] = serialized(self)
         return {k: v for k, v in document.items() if k not in self.later or getattr(self, k) != fields[k].default}
+
+
+def did_you_mean(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return the known word that is nearest to a misspelt one, in a phrase to end a message; empty for none near."""
+    lower = {one.lower(): one for one in known}
+    near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=cutoff)
+    return f"; did you mean {lower[near[0]]!r}?" if near else ""
 
 
 def _angle(value: Any) -> Any:
@@ -131,7 +140,7 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
     except OSError:  # for example, the name is too long
         there = False
     if not there:
-        raise ValueError(f"no such file: {path}")
+        raise ValueError(f"no such file: {path}; give its path as seen from the description's folder")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path} is larger than {MAX_FILE_BYTES} bytes")
     try:

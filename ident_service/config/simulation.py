@@ -23,6 +23,7 @@ from ident_service.config.quantities import (
     Section,
     Seed,
     Vector3,
+    did_you_mean,
 )
 
 
@@ -210,4 +211,5 @@ def disagreements(
     for number, fault in enumerate(driver.faults):
         if fault.joint is not None and fault.joint not in joints:
             where = ("driver", "faults", number, "joint")
-            yield where, f"driver.faults.{number}.joint: {fault.joint!r} is none of {', '.join(joints)}"
+            near = did_you_mean(fault.joint, joints)
+            yield where, f"driver.faults.{number}.joint: {fault.joint!r} is none of {', '.join(joints)}{near}"

@@ -91,6 +91,15 @@ class ArmAnswer(ArmLine):
     accepted: AcceptanceAnswer | None
 
 
+class AddedArmAnswer(ArmAnswer):
+    """Arm that was added; `objections` say why it cannot be moved, each with line and column of the description.
+
+    They are null where the same description was known already: it is judged once (`POST /descriptions/check`).
+    """
+
+    objections: list[str] | None
+
+
 class ChallengeAnswer(BaseModel):
     """Challenge that confirms one motion, once."""
 

@@ -20,7 +20,7 @@ from ident_service.config.motion_design import BASE
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.mechanism import read_mechanism
+from ident_service.model.mechanism import parse_xml, read_mechanism
 from ident_service.model.parameter_layout import about_center, joint_drives
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, rotation_rpy
 
@@ -182,7 +182,7 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
     frames = read_mechanism(file, "urdf", kinematics).frames
     bodies = []
     # Entities were refused when the chain was read from the same text.
-    for link in ET.fromstring(file.text).iter("link"):  # noqa: S314
+    for link in parse_xml(file.text).iter("link"):
         elements = link.findall("collision")
         if not elements:
             continue

@@ -28,7 +28,7 @@ def judge_apart(path: Path) -> dict[str, Any]:
     """Judge an uploaded description in a separate process.
 
     Returns:
-        `arm`, `sha256`, `stable`, `objections` and `text`.
+        `arm`, `sha256`, `good`, `stable`, `objections` and `text`.
 
     Raises:
         ConfigError: its mistakes.
@@ -81,7 +81,8 @@ def _document(path: str) -> dict[str, Any]:
         "arm": checked.model.config.name,
         "sha256": checked.model.config.sha256,
         "stable": None if gains is None else gains.stable,
-        "objections": [] if gains is None else list(gains.objections()),
+        "good": checked.good,
+        "objections": [f"{one.line}:{one.column}: {one.message}" for one in checked.objections],
         "text": description_text(Path(path).name, checked),
     }
 

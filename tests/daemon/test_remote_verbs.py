@@ -57,7 +57,7 @@ def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     assert set(LOCAL_ONLY) == {
         *("serve", "backup", "doctor", "driver test", "emulate", "import", "new", "restore", "tokens add", "view"),
         *("completion", "schema"),
-        *("bus import", "bus store", "bus restore", "bus report", "fleet identify", "fleet status"),
+        *("bus import", "bus store", "bus restore", "bus report", "fleet status"),
     }
     assert all(len(why) > 10 for why in LOCAL_ONLY.values())
     assert set(carried) == set(done)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ident_service.config.load import load_arm
+from ident_service.errors import UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.trajectory import FourierPath
 from ident_service.model.arm_model import ArmModel, arm_model
@@ -25,11 +26,14 @@ def wam() -> ArmModel:
 
 @pytest.mark.parametrize("speed", [1.0, 0.25])
 @pytest.mark.parametrize("ramp", [0.0, 2.0])
-def test_a_motion_begins_and_ends_at_home_and_never_jumps(wam: ArmModel, ramp: float, speed: float) -> None:
+def test_a_motion_begins_and_ends_at_home_and_never_jumps(
+    wam: ArmModel, ramp: float, speed: float, tmp_path: Path
+) -> None:
     motion = excitation(wam, "identification")
     assert isinstance(motion.path, FourierPath)
     motion = replace(motion, path=FourierPath(motion.path.series, 3, ramp))
-    view = view_of_motion(wam, motion, speed)
+    (tmp_path / "motion.json").write_text(motion.to_json())
+    view = view_of_motion(wam.config, tmp_path / "motion.json", speed)
     time, position = np.array(view["time"]), np.array(view["position"]).T
     assert position.shape == (len(time), 7)
     assert len(time) <= MOST_SAMPLES
@@ -49,7 +53,7 @@ def test_a_motion_begins_and_ends_at_home_and_never_jumps(wam: ArmModel, ramp: f
 
 
 def test_distances_are_those_of_the_collision_check(wam: ArmModel) -> None:
-    view = view_of_motion(wam, excitation(wam, "identification"))
+    view = view_of_motion(wam.config, None)
     collision, told = CollisionModel(wam), view["clearance"]
     position = np.array(view["position"]).T[told["samples"]]
     distances = collision.distances(position)
@@ -63,11 +67,17 @@ def test_distances_are_those_of_the_collision_check(wam: ArmModel) -> None:
 def test_an_arm_without_bodies_has_sticks_and_says_why_there_are_no_distances() -> None:
     config = load_arm("planar2")
     bare = arm_model(config.model_copy(update={"geometry": {}, "workspace": type(config.workspace)()}))
-    view = view_of_motion(bare, excitation(bare, "identification"))
+    view = view_of_motion(bare.config, None)
     assert view["clearance"] is None
     assert any("distances are not known" in note for note in view["notes"])
     assert {solid["joint"] for solid in view["figure"]["bodies"]} >= {0, 1}
-    assert view_at_rest(bare)["figure"] == figure(bare)
+    assert view_at_rest(bare.config)["figure"] == figure(bare)
+
+
+def test_a_motion_of_another_arm_is_refused(wam: ArmModel, tmp_path: Path) -> None:
+    (tmp_path / "motion.json").write_text(excitation(wam, "identification").to_json())
+    with pytest.raises(UsageError, match="a motion of 7 joints, but planar2 has 2"):
+        view_of_motion(load_arm("planar2"), tmp_path / "motion.json")
 
 
 def test_a_recording_is_thinned_and_keeps_its_ends(wam: ArmModel, tmp_path: Path) -> None:
@@ -76,7 +86,7 @@ def test_a_recording_is_thinned_and_keeps_its_ends(wam: ArmModel, tmp_path: Path
         for k in range(count):
             q = np.full(7, 1e-4 * k)
             writer.sample(Cycle(5 + k * 10_000_000, q, None, q, q, q, k, 0, 0, flags, age, 0))
-    view = view_of_recording(wam, tmp_path / "run.mcap")
+    view = view_of_recording(wam.config, tmp_path / "run.mcap")
     time, position = np.array(view["time"]), np.array(view["position"]).T
     assert len(time) == MOST_SAMPLES
     assert time[0] == 0.0

@@ -29,12 +29,13 @@ router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
 class DescriptionAnswer(BaseModel):
     """Description without mistakes.
 
-    `stable` is null for an arm that can be identified but not moved; `objections` say what is wrong with the gains,
-    `text` is all of it for a person.
+    `objections` say why the arm cannot be moved, each with line and column; `good` is whether there are none. `stable`
+    is of the gains, null where they or limits are missing; `text` is all of it for a person.
     """
 
     arm: str
     sha256: str
+    good: bool
     stable: bool | None
     objections: list[str]
     text: str
