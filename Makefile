@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	mutants test-socketcan test-foreign test-latest lock clean
+	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -18,7 +18,7 @@ demo: $(READY)
 
 # What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
 test: $(READY)
-	$(MAKE) --jobs 4 --output-sync lint types coverage collected
+	$(MAKE) --jobs 4 --output-sync lint types docs coverage collected
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
 	$(BIN)/pytest -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
@@ -45,6 +45,21 @@ lint: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
+
+# The site: build/site/index.html opens without a server, and nothing of it comes from a network.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+# Figures that pages show, drawn from what the code computes; they are committed.
+docs-figures: $(READY)
+	$(BIN)/python tools/docs_figures.py
+
+docs-pictures: $(READY)
+	$(BIN)/python tools/docs_pictures.py
+
+# What a newcomer does, in a clean clone, by the documents' own commands.
+walk: $(READY)
+	$(BIN)/python tests/documents/walk.py --clean README.md $(addprefix docs/,tutorial.md your-own-arm.md identify-recordings.md)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
@@ -92,7 +107,7 @@ test-socketcan: $(READY)
 # An independent CANopen stack on the emulated drives; needs node, and npm's registry once.
 test-foreign: $(READY)
 	cd tests/foreign_stack && npm ci --ignore-scripts --no-audit --no-fund
-	$(BIN)/pytest tests/pucks/test_pucks_foreign_stack.py
+	$(BIN)/pytest tests/emulated_drives/test_drives_foreign_stack.py
 
 # The newest of everything that pyproject.toml allows, in an environment of its own, made anew.
 LATEST := .venv-latest
@@ -124,6 +139,10 @@ endif
 $(VENV)/.mutants: $(READY)
 	$(BIN)/python -m pip install --quiet --group mutants
 	touch $@
+
+# Pictures of the daemon's pages for the documents; needs the system's Chromium and five minutes.
+screenshots: $(READY)
+	$(BIN)/python tools/screenshots.py
 
 clean:
 	rm -rf $(VENV) $(LATEST) .coverage .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -31,13 +31,19 @@ def rows(path: str, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     dq = np.gradient(q, step, axis=0)
     ddq = np.gradient(dq, step, axis=0)
     kept = slice(EDGE, len(q) - EDGE, EVERY)
-    terms = {"has_friction": True, "has_actuator_inertia": True, "has_joint_offset": True, "act_idxv": range(n)}
-    return build_regressor_basic(robot, q[kept], dq[kept], ddq[kept], terms), tau[kept].T.reshape(-1)
+    return regressor(robot, q[kept], dq[kept], ddq[kept]), tau[kept].T.reshape(-1)
+
+
+def regressor(robot: Robot, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """Columns at each state, joint after joint, shape (rows, parameters)."""
+    joints = range(robot.model.nv)
+    terms = {"has_friction": True, "has_actuator_inertia": True, "has_joint_offset": True, "act_idxv": joints}
+    return build_regressor_basic(robot, q, dq, ddq, terms)
 
 
 def main() -> None:
     """Identify and print."""
-    urdf, fit, unseen = sys.argv[1:]
+    urdf, fit, unseen, truth = sys.argv[1:]
     robot = Robot(urdf, package_dirs=str(Path(urdf).parent))
     joints = list(robot.model.names)[1:]
     prior = get_standard_parameters(robot.model) | {f"{term}_{joint}": 0.0 for term in EXTRAS for joint in joints}
@@ -51,8 +57,14 @@ def main() -> None:
     if record.theta is None:
         raise SystemExit(f"no estimate: {record.solver_status}, {record.exception}")
     H, tau = rows(unseen, robot)
-    errors = tau - H @ record.theta
-    print(json.dumps({"error_percent": 100.0 * float(np.linalg.norm(errors) / np.linalg.norm(tau))}))
+    q, dq, ddq, exact = np.split(np.loadtxt(truth, delimiter=","), 4, axis=1)
+    pairs = {"error_percent": (H, tau), "true_error_percent": (regressor(robot, q, dq, ddq), exact.T.reshape(-1))}
+    print(json.dumps({name: percent(there - H @ record.theta, there) for name, (H, there) in pairs.items()}))
+
+
+def percent(error: np.ndarray, whole: np.ndarray) -> float:
+    """Return the norm of an error over that of the whole, in percent."""
+    return 100.0 * float(np.linalg.norm(error) / np.linalg.norm(whole))
 
 
 if __name__ == "__main__":

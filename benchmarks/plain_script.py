@@ -1,6 +1,8 @@
 """Identify an arm as a script of an afternoon does: pinocchio's regressor, cvxpy's bodies, every tenth row.
 
-`python benchmarks/plain_script.py ARM.urdf FIT.csv UNSEEN.csv` prints the torque error on the unseen recording as JSON.
+`python benchmarks/plain_script.py ARM.urdf FIT.csv UNSEEN.csv TRUTH.csv` prints as JSON the torque error on the unseen
+recording, and the error against the true torque of a motion that is known exactly (positions, velocities, accelerations
+and torques of each joint, one state a row).
 It shares no line with the service, which is timed beside it (`benchmarks/peers.py`).
 """
 
@@ -26,15 +28,19 @@ def rows(path: str, model: pin.Model) -> tuple[np.ndarray, np.ndarray]:
     dq = np.gradient(q, step, axis=0)
     ddq = np.gradient(dq, step, axis=0)
     kept = slice(EDGE, len(q) - EDGE, EVERY)
-    q, dq, ddq, tau = q[kept], dq[kept], ddq[kept], tau[kept]
-    data = model.createData()
+    return regressor(model, q[kept], dq[kept], ddq[kept]), tau[kept]
+
+
+def regressor(model: pin.Model, q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
+    """Links' and drives' columns at each state, shape (rows, joints, parameters)."""
+    n, data = model.nv, model.createData()
     H = np.zeros((len(q), n, 14 * n))
     for k in range(len(q)):
         H[k, :, : 10 * n] = pin.computeJointTorqueRegressor(model, data, q[k], dq[k], ddq[k])
     joints = np.arange(n)
     for term, values in enumerate((ddq, dq, np.tanh(dq / 0.01), np.ones_like(dq))):
         H[:, joints, 10 * n + term * n + joints] = values
-    return H, tau
+    return H
 
 
 def pseudo_inertia(p: cp.Expression) -> cp.Expression:
@@ -52,7 +58,7 @@ def pseudo_inertia(p: cp.Expression) -> cp.Expression:
 
 def main() -> None:
     """Identify and print."""
-    urdf, fit, unseen = sys.argv[1:]
+    urdf, fit, unseen, truth = sys.argv[1:]
     model = pin.buildModelFromUrdf(urdf)
     n = model.nv
     H, tau = rows(fit, model)
@@ -67,8 +73,14 @@ def main() -> None:
     cost = cp.sum_squares(R[:, :-1] @ delta - R[:, -1]) + 1e-6 * cp.sum_squares(delta)
     cp.Problem(cp.Minimize(cost), [*bodies, delta[10 * n : 13 * n] >= 0]).solve(solver="CLARABEL")
     H, tau = rows(unseen, model)
-    errors = tau - H @ delta.value
-    print(json.dumps({"error_percent": 100.0 * float(np.linalg.norm(errors) / np.linalg.norm(tau))}))
+    q, dq, ddq, exact = np.split(np.loadtxt(truth, delimiter=","), 4, axis=1)
+    pairs = {"error_percent": (H, tau), "true_error_percent": (regressor(model, q, dq, ddq), exact)}
+    print(json.dumps({name: percent(there - H @ delta.value, there) for name, (H, there) in pairs.items()}))
+
+
+def percent(error: np.ndarray, whole: np.ndarray) -> float:
+    """Return the norm of an error over that of the whole, in percent."""
+    return 100.0 * float(np.linalg.norm(error) / np.linalg.norm(whole))
 
 
 if __name__ == "__main__":

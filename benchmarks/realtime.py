@@ -47,7 +47,7 @@ def planar(folder: Path) -> Path:
     drive = {"counts": 65536, "rated_torque": 0.1, "max_torque": 3.0, "max_speed": 6000.0}
     driver = {
         "kind": "canopen",
-        "eds": str(Path(shipped).with_name("puck.eds")),
+        "eds": str(Path(shipped).with_name("emulated_drive.eds")),
         "buses": [{"interface": "ident_wire", "channel": f"planar{os.getpid()}"}],
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": 1, "truth": truth},

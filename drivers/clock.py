@@ -6,8 +6,13 @@ same in real and in virtual time.
 
 from __future__ import annotations
 
+import os
 import time
-from typing import Protocol
+from typing import Final, Protocol
+
+from ident_service.errors import UsageError
+
+EPOCH: Final = "SOURCE_DATE_EPOCH"  # of reproducible-builds.org: s since 1970
 
 
 class Clock(Protocol):
@@ -62,3 +67,21 @@ class VirtualClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Move time forward to the deadline; time never runs backwards."""
         self._now = max(self._now, deadline_ns)
+
+
+def utc_offset_of_recording_ns(clock: Clock) -> int:
+    """Return what a recording adds to a clock's stamps so that they are in UTC [ns].
+
+    Virtual time begins at zero, which viewers and `ros2 bag` show as 1970. Its recordings are laid so that now is now,
+    or the second that the environment variable SOURCE_DATE_EPOCH names, for recordings that repeat to the byte.
+
+    Raises:
+        UsageError: the variable is no number of seconds.
+    """
+    if not clock.lock_step or clock.utc_offset_ns:
+        return clock.utc_offset_ns
+    if (text := os.environ.get(EPOCH)) is None:
+        return time.time_ns() - clock.now_ns()
+    if not (text.isascii() and text.isdigit() and len(text) <= 10):
+        raise UsageError(f"{EPOCH} is {text[:40]!r}; give whole seconds since 1970")
+    return int(text) * 1_000_000_000 - clock.now_ns()

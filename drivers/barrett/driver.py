@@ -24,6 +24,7 @@ from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vecto
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status, budget
+from drivers.barrett.joint_encoders import JointEncoders
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
@@ -101,6 +102,7 @@ class BarrettArm(Arm):
         joints = len(pucks)
         self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
         self._motors_of = self._coordinates.motors_of
+        self._joint_encoders = JointEncoders(config.driver, self._coordinates, list(config.joints))
         joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
         names = list(config.joints)
         self._names = [
@@ -367,6 +369,8 @@ class BarrettArm(Arm):
             settled = settled + 1 if bus.complete else 0
         nearest = zip(self._coordinates.zero, bus.codec.pucks, strict=True)
         self._unwrapped = [zero + puck.position for zero, puck in nearest]  # 22 bits are 512 turns: no arm wraps
+        self._checks += self._joint_encoders.checks(bus.codec.pucks)
+        self._joint_encoders.begin(bus.codec.pucks, self._coordinates.positions(self._unwrapped))
         bus.codec.forget_events()
         bus.lost = 0
 
@@ -473,6 +477,8 @@ class BarrettArm(Arm):
         self._unwrapped = [
             unwrapped(before, puck.position, POSITION_BITS) for before, puck in zip(self._unwrapped, pucks, strict=True)
         ]
+        position = self._coordinates.positions(self._unwrapped)
+        joint_position, slipped = self._joint_encoders.update(pucks, position)
         valid, age = self._all_fresh
         if not bus.complete:
             ages = [max(pucks[k].age for k in needed) for needed in self._motors_of]
@@ -485,7 +491,7 @@ class BarrettArm(Arm):
         return Sample(
             self._cycle,
             stamp_ns,
-            self._coordinates.positions(self._unwrapped),
+            position,
             None,
             self._acting,
             valid,
@@ -493,9 +499,10 @@ class BarrettArm(Arm):
             bus.lost,
             self._status,
             max(safety.status_age, *(puck.status_age for puck in pucks)),
-            tuple(told),
+            (*told, *slipped),
             (f"pendant: {safety.pendant}",) if self._looks else (),
             stamp_doubt_ns=bus.stamp_doubt_ns,
+            joint_position=joint_position,
         )
 
     def _events(self, bus: PuckBus) -> list[AxisEvent]:

@@ -22,10 +22,12 @@ import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import floor
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from drivers.can.can_frame import Frame
-from ident_service.config.can_bus import CanBus
+
+if TYPE_CHECKING:  # its library of checks would be a third of the time of `ident stop`
+    from ident_service.config.can_bus import CanBus
 
 FD_LENGTHS: tuple[int, ...] = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 _TAIL = 13  # CRC delimiter, acknowledge slot and delimiter, 7 of end of frame, 3 of intermission

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import errno
 import importlib.util
+import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from pathlib import Path
 from ident_service import __version__
 from ident_service.cli import (
     archive_commands,
+    completion,
     daemon_commands,
     identification_commands,
     maintenance_commands,
@@ -24,7 +26,8 @@ from ident_service.cli import (
     recovery_commands,
     remote,
 )
-from ident_service.cli.arguments import ArgumentsError, Parser, VerbList, asks_for_json
+from ident_service.cli.arguments import ArgumentsError, Parser, TopParser, VerbList, asks_for_json
+from ident_service.cli.next_command import next_after_error, next_line
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -39,7 +42,9 @@ from ident_service.cli.output import (
     print_error,
     print_to_person,
     state_folder,
+    styled,
 )
+from ident_service.cli.progress import progress_bar
 from ident_service.errors import (
     ArmFault,
     ConfigError,
@@ -86,6 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
     """
     words = sys.argv[1:] if argv is None else argv
+    if completion.VARIABLE in os.environ and argv is None:
+        completion.complete(parser())
     enable_interrupts()
     try:
         arguments = parser().parse_args(words)
@@ -96,10 +103,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         raise
     try:
         _require_own_packages()
+        _name_registered(arguments)
         verb: Callable[[argparse.Namespace], Answer] = (
             arguments.verb if arguments.server is None else remote.run_on_daemon
         )
-        code, text, document = _asked(verb, arguments)
+        with progress_bar(arguments):
+            code, text, document = _asked(verb, arguments)
     except KeyboardInterrupt:
         # A second Ctrl-C: the person does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")
@@ -109,12 +118,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     except IdentError as error:
         code = next(number for kind, number in _EXIT_CODES if isinstance(error, kind))
         notes = list(getattr(error, "__notes__", ()))
-        print_to_person("\n".join([f"ident: {error}", *notes]) + "\n")
+        head = styled(sys.stderr, "ident:", "error")
+        print_to_person("\n".join([f"{head} {error}", *notes]) + f"\n{next_after_error(arguments, error)}")
         if arguments.json:
             print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
         return code
     try:
-        print_answer(arguments, code, text, document)
+        print_answer(arguments, code, text, document, "" if arguments.json else next_line(arguments, code, document))
     except OSError as error:
         print_to_person(f"ident: done, but the output cannot be written: {error.strerror}\n")
         discard(sys.stdout)
@@ -149,6 +159,32 @@ def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Nam
         raise registry_error(state_folder(arguments) / FILE, error) from None
 
 
+def _name_registered(arguments: argparse.Namespace) -> None:
+    """Replace ids of runs and motions by their paths in the state folder, where no file here has that name."""
+    if getattr(arguments, "server", None) is not None:
+        return
+    for name in ("run", "reference", "others", "motion", "recordings", "validate", "after"):
+        value = getattr(arguments, name, None)
+        if isinstance(value, Path):
+            setattr(arguments, name, _registered(arguments, name, value))
+        elif isinstance(value, list):
+            setattr(arguments, name, [_registered(arguments, name, path) for path in value])
+
+
+def _registered(arguments: argparse.Namespace, name: str, path: Path) -> Path:
+    if not isinstance(path, Path) or len(path.parts) != 1 or path.exists():
+        return path
+    state = state_folder(arguments)
+    if name == "motion":
+        motion = state / "motions" / path / "motion.json"
+        return motion if motion.is_file() else path
+    if name in ("run", "reference", "others"):
+        return state / "runs" / path if (state / "runs" / path).is_dir() else path
+    run, at, seconds = path.name.partition("@")
+    found = [state / "runs" / run / file for file in ("run.mcap", "identification.mcap")]
+    return next((one.with_name(f"{one.name}{at}{seconds}") for one in found if one.is_file()), path)
+
+
 def _mistakes(arguments: argparse.Namespace) -> ConfigError | None:
     """Return the mistakes of the description that a model could not be made of, with their places; None without any."""
     from ident_service.operations.description_check import check_description
@@ -181,9 +217,9 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
 
 def parser() -> Parser:
     """Build the argument parser with all verbs and their arguments."""
-    top = Parser(
+    top = TopParser(
         prog="ident",
-        description="Commission a robot arm: move it, record it, and identify physically feasible dynamic parameters.",
+        description="Commission a robot arm: describe it, move it, identify its dynamic parameters.",
     )
     top.add_argument("--version", action="version", version=f"ident-service {__version__}")
     verbs = VerbList.of(top)

@@ -1,11 +1,14 @@
-"""Register and run the verbs that keep results: `accept`, `rollback`, `import`, `prune`, `backup`, `restore`."""
+"""Register and run the verbs about what the state folder keeps.
+
+`arms`, `runs` and `motions` list and delete it; `accept`, `rollback`, `import`, `prune`, `backup` and `restore`.
+"""
 
 from __future__ import annotations
 
 import argparse
 import os
 import pwd
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -17,6 +20,9 @@ from ident_service.cli.output import DONE, Answer, print_to_person, state_folder
 from ident_service.errors import IdentError, InUse, UsageError
 
 _LONGEST_NAME = 80
+_LINE = 80  # columns of a list
+_RUN = "20261124T101500Z-planar2"  # of the examples
+_RUN_KEYS = ("id", "kind", "arm", "created", "ending")
 _PATIENCE = 1.0  # s to wait for a locked registry when an act that is done is entered in the audit trail
 
 
@@ -78,41 +84,151 @@ def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **de
 
 
 def add(verbs: VerbList) -> None:
-    """Register `accept`, `rollback`, `import`, `prune`, `delete`, `backup` and `restore`."""
-    sub = verbs.add("accept", _accept, "accept a run's parameters as the arm's current ones; earlier sets are kept")
+    """Register `arms`, `runs`, `motions`, `accept`, `rollback`, `import`, `prune`, `backup` and `restore`."""
+    _add_lists(verbs)
+    sub = verbs.add(
+        "accept",
+        _accept,
+        "make a run's parameters the arm's current ones",
+        more="Earlier sets are kept.",
+        examples=("result --note 'first commissioning'", f"{_RUN} --note 'after the gear change' --by Ann"),
+    )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--note", required=True, help="the reason, for people who read it years later")
     add_by(sub)
-    sub = verbs.add("rollback", _rollback, "make an earlier accepted set the current one again")
+    sub = verbs.add(
+        "rollback",
+        _rollback,
+        "make an earlier accepted set the current one again",
+        examples=("planar2 --note 'the new set predicts worse'", "wam7 --to 2 --note 'as before the repair'"),
+    )
     sub.add_argument("arm", metavar="NAME", help="of the arm")
     sub.add_argument("--note", required=True, help="the reason, for people who read it years later")
     sub.add_argument(
         "--to", type=count, metavar="NUMBER", help="of the accepted set (default: the one before the current)"
     )
     add_by(sub)
-    sub = verbs.add("import", _import, "import a run folder from another machine, after its files were verified")
+    sub = verbs.add(
+        "import",
+        _import,
+        "import a run folder from another machine",
+        more="Its files are verified first.",
+        examples=("runs/trial", f"/mnt/lab/{_RUN} --by Ann"),
+    )
     sub.add_argument("run", type=Path, metavar="RUNFOLDER")
     add_by(sub)
-    sub = verbs.add("prune", _prune, "list old recordings of runs that nobody accepted; delete them with --yes")
+    sub = verbs.add(
+        "prune",
+        _prune,
+        "list old recordings; delete them with --yes",
+        more="Those of runs that nobody accepted.",
+        examples=("--keep 20", "--keep 20 --yes"),
+    )
     sub.add_argument("--keep", type=count, required=True, metavar="N", help="number of newest runs of each arm to keep")
     sub.add_argument("--yes", action="store_true", help="DELETE them")
     add_by(sub)
-    delete = verbs.group("delete", "delete a run, a motion or an arm; refused while something refers to it")
-    for kind in ("run", "motion", "arm"):
-        sub = delete.add(kind, _delete, f"delete one {kind} and its files")
-        sub.add_argument("name", metavar="NAME" if kind == "arm" else "ID")
-        sub.add_argument("--anyway", action="store_true", help="also if something refers to it")
-        add_by(sub)
-    sub = verbs.add("backup", _backup, "write the state folder into one file; a daemon may run meanwhile")
+    sub = verbs.add(
+        "backup",
+        _backup,
+        "write the state folder into one file",
+        more="A daemon may run meanwhile.",
+        examples=("ident.backup", "ident.backup --without-recordings"),
+    )
     sub.add_argument("file", type=Path, metavar="FILE", help="must not exist")
     sub.add_argument(
         "--without-recordings", action="store_true", help="leave recordings out; the copy lists them as deleted"
     )
     add_by(sub)
-    sub = verbs.add("restore", _restore, "restore a backup into the state folder; stop the daemon first")
+    sub = verbs.add(
+        "restore",
+        _restore,
+        "restore a backup into the state folder",
+        more="Stop the daemon first.",
+        examples=("ident.backup --state restored", "ident.backup --replace"),
+    )
     sub.add_argument("file", type=Path, metavar="FILE")
     sub.add_argument("--replace", action="store_true", help="move present contents into a subfolder replaced-DATE")
     add_by(sub)
+
+
+def _add_lists(verbs: VerbList) -> None:
+    formerly = verbs.group("delete", "delete a run, a motion or an arm", hidden=True)
+    for kind, what, run, name, metavar in (
+        ("arm", "list known arms", _arms, "planar2", "NAME"),
+        ("run", "list runs", _runs, _RUN, "ID"),
+        ("motion", "list designed and uploaded motions", _motions, _RUN, "ID"),
+    ):
+        noun, more = f"{kind}s", "" if kind == "arm" else "The newest first."
+        examples = ("", "--json") if kind == "arm" else ("", "--arm planar2", "--most 5 --json")
+        nouns = verbs.group(noun, f"{what}; delete one", run, more=more, examples=examples)
+        if kind != "arm":
+            nouns.parser.add_argument("--arm", metavar="NAME", help="only those of this arm")
+            nouns.parser.add_argument("--most", type=count, default=20, metavar="N", help="of the newest (default: 20)")
+        sub = nouns.add(
+            "delete",
+            _delete,
+            f"delete one {kind} and its files",
+            more="Refused while something refers to it.",
+            examples=(name, f"{name} --anyway"),
+        )
+        sub.add_argument("name", metavar=metavar)
+        sub.add_argument("--anyway", action="store_true", help="also if something refers to it")
+        add_by(sub)
+        sub.set_defaults(kind=kind)
+        formerly.alias(kind, sub)
+
+
+def _arms(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.arms import arm_names, know_shipped
+    from ident_service.registry.database import Database
+    from ident_service.registry.state_folder import known_arms
+
+    state = writable_state_folder(arguments)
+    with Database(state) as db:
+        know_shipped(db)
+        rows = [{key: row[key] for key in ("name", "source", "description")} for row in arm_names(db)]
+    named = {row["name"] for row in rows}
+    rows += [{"name": name, "source": "file", "description": ""} for name in known_arms(state) if name not in named]
+    return DONE, "".join(map(arm_line, rows)), {"arms": rows}
+
+
+def _runs(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.database import Database
+    from ident_service.registry.runs import rebuild_runs, runs
+
+    state = writable_state_folder(arguments)
+    with Database(state) as db:
+        unreadable = rebuild_runs(db, state)
+        rows = [{key: row[key] for key in _RUN_KEYS} for row in runs(db, arguments.arm, most=arguments.most)]
+    text = "".join(f"not listed: {line}\n" for line in unreadable)
+    return DONE, (runs_text(rows) + text), {"runs": rows, "not_listed": unreadable}
+
+
+def _motions(arguments: argparse.Namespace) -> Answer:
+    from ident_service.registry.database import Database
+    from ident_service.registry.motions import motions
+
+    with Database(writable_state_folder(arguments)) as db:
+        rows = [dict(row) for row in motions(db, arguments.arm, most=arguments.most)]
+    return DONE, motions_text(rows), {"motions": rows}
+
+
+def arm_line(row: Mapping[str, Any]) -> str:
+    """Format one arm as a line of the list."""
+    line = f"{row['name']:<20} {row['source']:<9} {row['description']}".rstrip()
+    return f"{line if len(line) <= _LINE else line[: _LINE - 3] + '...'}\n"
+
+
+def runs_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format runs as a list, one per line."""
+    lines = [f"{row['id']:<40} {row['arm']:<14} {row['kind']:<12} {row['ending']}".rstrip() + "\n" for row in rows]
+    return "".join(lines) or "no runs yet\n"
+
+
+def motions_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format motions as a list, one per line."""
+    lines = [f"{row['id']:<40} {row['arm']:<14} {row['duration']:.1f} s, by {row['added_by']}\n" for row in rows]
+    return "".join(lines) or "no motions yet\n"
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
@@ -185,7 +301,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations import deletion
     from ident_service.registry.database import Database
 
-    kind, state = arguments.word.rpartition(" ")[2], writable_state_folder(arguments)
+    kind, state = arguments.kind, writable_state_folder(arguments)
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
     with Database(state) as db, deleted_with_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
@@ -202,7 +318,7 @@ def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
         if not error.dependents:
             raise
         words = str(error).partition(";")[0]  # a daemon's go on for those who speak HTTP
-        hint = f"to delete it all the same: `ident delete {kind} {name} --anyway`"
+        hint = f"to delete it all the same: `ident {kind}s delete {name} --anyway`"
         raise InUse(f"{words}; {hint}", error.dependents) from None
 
 
@@ -222,9 +338,7 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     when = datetime.fromtimestamp(done.created, UTC).strftime("%Y-%m-%d %H:%M UTC")
     text = f"{state}: as of {when}, {done.files} files, {done.bytes / 2**20:.1f} MiB\n"
     text += "" if done.replaced is None else f"previous contents: {done.replaced}\n"
-    text += (
-        "tokens that were revoked since then count again (ident token list), the owner's does not: the daemon writes "
-    )
+    text += "tokens that were revoked since then count again (ident tokens), the owner's does not: the daemon writes "
     text += "a new one; each arm needs a new preflight\n"
     return DONE, text, {**asdict(done), "state": str(state)}
 

@@ -1,41 +1,159 @@
-"""Parse command-line arguments: the parser, the list of verbs, and converters for numbers."""
+"""Parse command-line arguments: the parser, the list of verbs with their help, and converters for numbers."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ident_service.cli.output import USAGE, Answer
+from ident_service.cli.output import USAGE, Answer, styled
 from ident_service.errors import UsageError
 
 FEASIBLE_SETS = ("pseudo_inertia", "inertia")
+_WIDEST = 100  # columns of help, on a terminal however wide
+_EXAMPLES = "examples:\n"
+
+# Verbs and nouns in the order of use, as `ident --help` lists them; a test keeps it complete.
+HELP_GROUPS: dict[str, tuple[str, ...]] = {
+    "Describe": ("new", "config", "schema", "base-parameters", "arms", "bus", "driver", "doctor", "emulate"),
+    "Move": (
+        *("design", "preview", "motions", "watch", "preflight", "run", "stop", "pause", "resume", "finish"),
+        *("supported", "acknowledge", "recover", "home", "set-home"),
+    ),
+    "Identify": (
+        *("simulate", "identify", "report", "figures", "view", "export", "compare", "payload", "verify", "feasible"),
+        *("project", "fleet"),
+    ),
+    "Operate": (
+        *("serve", "jobs", "runs", "accept", "rollback", "reidentify", "schedules", "maintenance", "due", "alarms"),
+        *("tokens", "import", "prune", "backup", "restore", "completion"),
+    ),
+}
+
+LOCAL_ONLY: dict[str, str] = {
+    "serve": "it is the daemon",
+    "schema": "it is the same for every machine of this version",
+    "completion": "it is for the shell that it is typed into",
+    "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
+    "fleet status": "its store is in the daemon's state folder; log in where the daemon runs",
+    "emulate": "it is drives on a bus of this machine, until they are switched off",
+    "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
+    "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
+    "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
+    **dict.fromkeys(
+        ("bus import", "bus store", "bus restore"), "it changes what drives keep; it is an act at the arm's computer"
+    ),
+    "view": "a viewer opens where you sit; copy the run's folder from the daemon's machine",
+    "bus report": "it writes a file beside you; log in where the daemon runs",
+    **dict.fromkeys(("backup", "restore"), "it is done at the daemon's machine, in its state folder"),
+    "tokens add": "whoever got hold of an operator's token could make others that outlive it; "
+    "it is done at the daemon's machine, in its state folder",
+}
+"""Verbs that no daemon does, each with the reason; they have no option `--server`."""
+
+ANSWERLESS = frozenset({"serve", "completion"})
+"""Verbs whose answer is no JSON object; they have no option `--json`."""
 
 
 class ArgumentsError(SystemExit):
-    """Exit after arguments that no verb understands; usage and reason are on stderr already."""
+    """Exit after arguments that no verb understands; the reason is on stderr already."""
 
     def __init__(self, message: str) -> None:
         self.message = message
         super().__init__(USAGE)
 
 
+class _Help(argparse.HelpFormatter):
+    """Help of one verb: examples keep their lines, all else is filled to the width of the terminal."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=28)
+        self._width = min(self._width, _WIDEST)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if text.startswith(_EXAMPLES) else super()._fill_text(text, width, indent)
+
+
 class Parser(argparse.ArgumentParser):
-    """Argument parser that raises `ArgumentsError` where argparse only exits, so that JSON can state the reason too."""
+    """Argument parser that answers mistakes with the nearest word that exists, and never with hidden ones.
+
+    Attributes:
+        shown: verbs that help and messages name, each with its line of help; former names are understood besides.
+        absent: options that this verb does not have and others do, each with the reason.
+    """
+
+    def __init__(self, **rest: Any) -> None:
+        super().__init__(formatter_class=_Help, **rest)
+        self.shown: dict[str, str] = {}
+        self.absent: dict[str, str] = {}
 
     def error(self, message: str) -> NoReturn:
-        """Print argparse's usage and message on stderr, and raise.
+        """Print the message and where help is, and raise.
 
         Raises:
-            WrongWords: always.
+            ArgumentsError: always.
         """
-        self.print_usage(sys.stderr)
-        sys.stderr.write(f"{self.prog}: error: {message}\n")
+        if message.endswith("required: VERB"):
+            message = f"a verb is needed: {', '.join(self.shown)}" if self.shown else message
+        head = styled(sys.stderr, f"{self.prog}: error:", "error")
+        sys.stderr.write(f"{head} {message}\nhelp: {self.prog} --help\n")
         raise ArgumentsError(message)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse arguments; refuse what this verb does not know in its own name, not in that of `ident`."""
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(self._unknown(rest[0]))
+        return found, rest
+
+    def _unknown(self, word: str) -> str:
+        option = word.partition("=")[0]
+        if option in self.absent:
+            return f"{option} is not for `{self.prog}`: {self.absent[option]}"
+        if not option.startswith("-") or option == "-":
+            return f"unexpected argument {word!r}"
+        options = (
+            name
+            for one in self._actions
+            if one.help != argparse.SUPPRESS
+            for name in one.option_strings
+            if name != "-h"
+        )
+        return f"unknown option {option}{did_you_mean(option, options)}"
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is None or value in action.choices:
+            return
+        if isinstance(action, argparse._SubParsersAction):
+            near = did_you_mean(value, self.shown)
+            known = "" if near or len(self.shown) > 9 else f"; it is one of {', '.join(self.shown)}"
+            self.error(f"unknown verb {value!r}{near}{known}")
+        choices = [str(one) for one in action.choices]
+        raise argparse.ArgumentError(action, f"{value!r} is none of {', '.join(choices)}{did_you_mean(value, choices)}")
+
+
+class _Verbs(argparse._SubParsersAction):  # type: ignore[type-arg]
+    """List of verbs that keeps the options which stand before a verb, as in `ident jobs --json show ID`."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        given = {key: value for key, value in vars(namespace).items() if value != parser.get_default(key)}
+        super().__call__(parser, namespace, values, option_string)
+        for key, value in given.items():
+            if key not in ("json", "server", "state"):
+                parser.error(f"--{key.replace('_', '-')} is for `{parser.prog}` without {values[0]!r}")
+            setattr(namespace, key, value)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return `; did you mean X?` for the nearest of the known words; empty where none is near."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(str(word), list(known), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def asks_for_json(words: Sequence[str]) -> bool:
@@ -44,30 +162,52 @@ def asks_for_json(words: Sequence[str]) -> bool:
     return any(len(word) > 2 and "--json".startswith(word) for word in options)
 
 
+class TopParser(Parser):
+    """Parser of `ident` itself, whose help lists the verbs in groups."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the whole help where no verb was given, then as every parser.
+
+        Raises:
+            ArgumentsError: always.
+        """
+        if message.endswith("required: VERB"):
+            self.print_help(sys.stderr)
+            message = "a verb is needed"
+        super().error(message)
+
+    def format_help(self) -> str:
+        """Return the help: one short line for each verb and noun."""
+        lines = ["usage: ident VERB ...", "", str(self.description)]
+        left = set(self.shown)
+        for title, names in HELP_GROUPS.items():
+            there = [name for name in names if name in left]
+            left -= set(there)
+            lines += ["", styled(sys.stdout, title, "heading")]
+            lines += [f"  {name:<17}{self.shown[name]}" for name in there]
+        lines += [f"  {name:<17}{self.shown[name]}" for name in sorted(left)]
+        lines += ["", f"{'ident VERB --help':<19}explains a verb, with examples", f"{'ident --version':<19}version"]
+        return "\n".join([*lines, ""])
+
+
 @dataclass(frozen=True)
 class VerbList:
     """List of verbs that a group registers its own with.
 
     Attributes:
         commands: argparse's list of verbs.
-        common: parser of the options that every verb has.
+        parser: that they are the verbs of.
         prefix: the words before the verb, with a space behind them.
     """
 
     commands: argparse._SubParsersAction[Parser]
-    common: Parser
+    parser: Parser
     prefix: str = ""
 
     @classmethod
     def of(cls, parser: Parser) -> VerbList:
         """Create the list of verbs of a command."""
-        common = Parser(add_help=False)
-        common.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
-        common.add_argument(
-            "--server", metavar="URL", help="run it on the daemon there; runs, motions and jobs are named by id"
-        )
-        common.add_argument("--state", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)")
-        return cls(parser.add_subparsers(required=True, metavar="VERB"), common)
+        return cls(parser.add_subparsers(required=True, metavar="VERB", action=_Verbs, parser_class=Parser), parser)
 
     def add(
         self,
@@ -75,35 +215,101 @@ class VerbList:
         run: Callable[[argparse.Namespace], Answer],
         text: str,
         *,
+        more: str = "",
+        examples: Sequence[str] = (),
         former: str | None = None,
         hidden: bool = False,
-        **rest: Any,
+        word: str | None = None,
     ) -> Parser:
         """Add a verb.
 
         Args:
             name: the word.
             run: answers it.
-            text: one line of help.
+            text: one short line of help.
+            more: further sentences of its own help.
+            examples: arguments after the verb; one string each, as typed.
             former: the verb's earlier name, which is still understood and not listed.
             hidden: leave the verb out of the list of verbs.
-            rest: for `argparse.ArgumentParser`.
+            word: the verb that a hidden one stands for.
 
         Returns:
             Its parser, to add arguments to.
         """
-        if not hidden:
-            rest["help"] = text
-        parser = self.commands.add_parser(name, parents=[self.common], description=text, **rest)
-        parser.set_defaults(verb=run, word=f"{self.prefix}{name}", words=parser)
+        word = word or f"{self.prefix}{name}"
+        parser = self._parser(name, text, hidden)
+        _describe(parser, word, text, more, [f"{word} {one}".rstrip() for one in examples])
+        _answer(parser, word, run)
         if former is not None:
-            self.commands.choices[former] = parser
+            self.alias(former, parser)
         return parser
 
-    def group(self, name: str, text: str) -> VerbList:
-        """Add a word that is followed by verbs of its own, as in `ident config check`."""
-        parser = self.commands.add_parser(name, help=text)
-        return VerbList(parser.add_subparsers(required=True, metavar="VERB"), self.common, f"{self.prefix}{name} ")
+    def _parser(self, name: str, text: str, hidden: bool) -> Parser:
+        if hidden:
+            return self.commands.add_parser(name)
+        self.parser.shown[name] = text
+        return self.commands.add_parser(name, help=text)
+
+    def alias(self, name: str, parser: Parser) -> None:
+        """Let a former name stand for a verb; it is understood, and shown nowhere."""
+        self.commands.choices[name] = parser
+
+    def group(
+        self,
+        name: str,
+        text: str,
+        run: Callable[[argparse.Namespace], Answer] | None = None,
+        *,
+        more: str = "",
+        examples: Sequence[str] = (),
+        former: str | None = None,
+        hidden: bool = False,
+    ) -> VerbList:
+        """Add a noun that is followed by verbs of its own, as in `ident config check`.
+
+        Args:
+            name: the noun.
+            text: one short line of help.
+            run: answers the bare noun, by a list as a rule; None where a verb must follow.
+            more: further sentences of its help.
+            examples: as for `add`.
+            former: its earlier name.
+            hidden: leave it out of the list of verbs.
+        """
+        word = f"{self.prefix}{name}"
+        parser = self._parser(name, text, hidden)
+        _describe(parser, word, text, more, [f"{word} {one}".rstrip() for one in examples])
+        if run is not None:
+            _answer(parser, word, run)
+        if former is not None:
+            self.alias(former, parser)
+        verbs = parser.add_subparsers(required=run is None, metavar="VERB", action=_Verbs, parser_class=Parser)
+        return VerbList(verbs, parser, f"{word} ")
+
+
+def _describe(parser: Parser, word: str, text: str, more: str, examples: Sequence[str]) -> None:
+    sentence = f"{text[:1].upper()}{text[1:]}."
+    parser.description = f"{sentence} {more}" if more else sentence
+    if examples:
+        parser.epilog = _EXAMPLES + "\n".join(f"  ident {one}" for one in examples)
+    parser.set_defaults(examples=tuple(examples))
+
+
+def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answer]) -> None:
+    """Add the options that a verb shares with others, and what is to be run."""
+    if word in ANSWERLESS:
+        parser.absent["--json"] = "its output is no answer"
+    else:
+        parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    if word in LOCAL_ONLY:
+        parser.absent["--server"] = LOCAL_ONLY[word]
+    else:
+        text = "run it on the daemon there; runs, motions and jobs are named by id"
+        parser.add_argument("--server", metavar="URL", help=text)
+    parser.add_argument(
+        "--state", metavar="DIR", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)"
+    )
+    parser.set_defaults(verb=run, word=word, words=parser, json=False, server=None)
 
 
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
@@ -133,6 +339,26 @@ def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
             f"--columns {of_all[1]}: one file is for all recordings; write RECORDING=FILE for those that differ"
         )
     return (of_all[0] if of_all else None), of_one
+
+
+def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
+    """Return the file of the known payload of each recording.
+
+    Args:
+        given: values of `--payload`, `RECORDING=FILE`.
+
+    Raises:
+        UsageError: no recording or no file in one, or two for one recording.
+    """
+    found: dict[Path, Path] = {}
+    for words in given:
+        recording, equals, file = words.partition("=")
+        if not (recording and equals and file):
+            raise UsageError(f"--payload {words}: write RECORDING=FILE, the recording and the file of its known load")
+        if Path(recording) in found:
+            raise UsageError(f"--payload {words}: {recording} has a payload already")
+        found[Path(recording)] = Path(file)
+    return found
 
 
 def seed(text: str) -> int:
@@ -182,6 +408,11 @@ def frequency(text: str) -> float:
 def seconds(text: str) -> float:
     """Parse a finite number above 0 [s]."""
     return _positive(text, "a number of seconds above 0 is needed")
+
+
+def hours(text: str) -> float:
+    """Parse a finite number above 0 [h]."""
+    return _positive(text, "a number of hours above 0 is needed")
 
 
 def share(text: str) -> float:

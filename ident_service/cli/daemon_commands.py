@@ -1,4 +1,4 @@
-"""Register and run the verbs about the daemon: `serve`, and `token` for its access tokens."""
+"""Register and run the verbs about the daemon, `serve` and `tokens`, and `completion`, about the shell."""
 
 from __future__ import annotations
 
@@ -10,14 +10,20 @@ from typing import Any
 
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
+from ident_service.cli.completion import SHELLS, install_completion
 from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 
 _PORT = 8470
 
 
 def add(verbs: VerbList) -> None:
-    """Register `serve`, `token add`, `token list` and `token revoke`."""
-    sub = verbs.add("serve", _serve, "start the daemon: HTTP API, pages, jobs and schedules")
+    """Register `serve`, `tokens`, `tokens add`, `tokens revoke` and `completion`."""
+    sub = verbs.add(
+        "serve",
+        _serve,
+        "start the daemon: pages, HTTP API, jobs and schedules",
+        examples=("", "--port 0", "--host 0.0.0.0 --tls-cert chain.pem --tls-key key.pem"),
+    )
     sub.add_argument("--host", default="127.0.0.1", help="address to listen on; other than loopback needs TLS")
     sub.add_argument("--port", type=_port, default=_PORT, help=f"default {_PORT}; 0 for any that is free")
     sub.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
@@ -34,15 +40,40 @@ def add(verbs: VerbList) -> None:
         "--webhook-secret", type=Path, metavar="FILE", help="file with the secret that signs notices; chmod 600"
     )
 
-    token = verbs.group("token", "access tokens of the daemon")
-    sub = token.add("add", _add, "create a token and print it once")
+    tokens = verbs.group(
+        "tokens",
+        "list the daemon's access tokens; add, revoke",
+        _list,
+        former="token",
+        examples=("", "--server http://127.0.0.1:8470"),
+    )
+    sub = tokens.add(
+        "add", _add, "create a token and print it once", examples=("ann --role operator", "wall --role viewer")
+    )
     sub.add_argument("name", metavar="NAME", help="shown in the audit log")
     sub.add_argument("--role", choices=["viewer", "operator"], required=True)
     add_by(sub)
-    token.add("list", _list, "list names and roles")
-    sub = token.add("revoke", _revoke, "revoke a token and its sessions")
+    tokens.add("list", _list, "list names and roles", hidden=True, word="tokens")
+    sub = tokens.add(
+        "revoke", _revoke, "revoke a token and its sessions", examples=("ann", "ann --server http://127.0.0.1:8470")
+    )
     sub.add_argument("name", metavar="NAME")
     add_by(sub)
+    sub = verbs.add(
+        "completion",
+        _completion,
+        "print or install completion for bash, zsh or fish",
+        more='For one shell: `eval "$(ident completion bash)"`, and `ident completion fish | source`.',
+        examples=("bash", "zsh", "fish --install"),
+    )
+    sub.add_argument("shell", choices=SHELLS)
+    sub.add_argument("--install", action="store_true", help="write it where the shell looks for it (bash, fish)")
+
+
+def _completion(arguments: argparse.Namespace) -> Answer:
+    script, path = install_completion(arguments.shell, install=arguments.install)
+    text = script if path is None else f"{path}: written; a new {arguments.shell} completes `ident`\n"
+    return DONE, text, {}
 
 
 def _serve(arguments: argparse.Namespace) -> Answer:

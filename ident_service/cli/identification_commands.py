@@ -12,8 +12,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import FEASIBLE_SETS, VerbList, columns_files, delay, replicates, seed, weight, workers
+from ident_service.cli.arguments import (
+    FEASIBLE_SETS,
+    VerbList,
+    columns_files,
+    delay,
+    did_you_mean,
+    payload_files_of,
+    replicates,
+    seed,
+    weight,
+    workers,
+)
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
+from ident_service.cli.progress import step_of
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
 
@@ -26,7 +38,13 @@ _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for p
 
 def _add_commission(verbs: VerbList) -> None:
     """Register `simulate` and `identify`."""
-    sub = verbs.add("simulate", _simulate, "commission a simulated arm and compare the result with its true parameters")
+    sub = verbs.add(
+        "simulate",
+        _simulate,
+        "commission a simulated arm, and score the result",
+        more="It moves, is identified, and is compared with its true parameters; no hardware and no file is needed.",
+        examples=("", "planar2 --seed 3", "planar2 --out trial"),
+    )
     sub.add_argument("arm", nargs="?", default="wam7_sim", metavar="ARM", help="description with a simulated driver")
     sub.add_argument("--out", type=Path, help="run folder; must not exist (default: below the state folder)")
     sub.add_argument("--motion", type=Path, metavar="MOTION", help="motion.json to identify from (default: the arm's)")
@@ -34,7 +52,15 @@ def _add_commission(verbs: VerbList) -> None:
     sub.add_argument("--feasible-set", choices=[*FEASIBLE_SETS, "none"])
 
     sub = verbs.add(
-        "identify", _identify, "identify parameters from recordings; writes parameters.json, URDF and report"
+        "identify",
+        _identify,
+        "identify parameters from recordings",
+        more="Writes parameters.json, a URDF and a report (exit code 3: infeasible, or not to be used).",
+        examples=(
+            "run.mcap --arm my_arm.yaml",
+            "first.mcap second.mcap@5:60 --arm wam7 --validate third.mcap",
+            "log.csv --arm planar2 --columns columns.yaml --out result",
+        ),
     )
     sub.add_argument(
         "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@41:60 reads 41 s to 60 s of it"
@@ -54,6 +80,18 @@ def _add_commission(verbs: VerbList) -> None:
         default=[],
         metavar="[RECORDING=]FILE",
         help="YAML file with column names and units, for all recordings or one; may be repeated",
+    )
+    sub.add_argument(
+        "--payload",
+        action="append",
+        default=[],
+        metavar="RECORDING=FILE",
+        help="YAML file with mass and center_of_mass of the known load in a recording; may be repeated",
+    )
+    sub.add_argument(
+        "--torque-constants",
+        action="store_true",
+        help="also identify every motor's torque constant; needs a recording with a known load (--payload)",
     )
     sub.add_argument(
         "--cut-standstill", action="store_true", help="leave out standstill at the start and end of recordings"
@@ -110,12 +148,13 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
             described=described,
             custom=custom_of(arguments.arm, described),
             tell=lambda line: tell(arguments, line),
+            step=step_of(arguments),
             stop_requested=stopping.requested,
         )
     scored, estimate = result.score, result.estimate
     lines = [
         "",
-        summary(estimate, result.unusable),
+        summary(estimate, result.unusable, warnings=result.warnings),
         "comparison with the true parameters",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
         f"  validation residual over that of the true parameters: {scored.residual_ratio:.4f}",
@@ -126,8 +165,8 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         "",
     ]
     document = {"folder": str(result.folder), "score": score_document(scored)}
-    document |= _estimate_document(estimate, result.unusable)
-    return _exit_code(estimate, result.unusable), "\n".join(lines), document
+    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    return _exit_code(document), "\n".join(lines), document
 
 
 @contextmanager
@@ -156,6 +195,8 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         validation=tuple(arguments.validate),
         columns=columns,
         columns_of=columns_of,
+        payloads=payload_files_of(arguments.payload),
+        torque_constants=arguments.torque_constants,
         cut_standstill=arguments.cut_standstill,
         method=arguments.method,
         set_name=arguments.feasible_set,
@@ -169,29 +210,32 @@ def _identify(arguments: argparse.Namespace) -> Answer:
         second_opinion=arguments.second_opinion,
     )
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name)
-    result = identify_files(request, folder, lambda line: tell(arguments, line))
+    result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
-    text = summary(estimate, result.unusable, result.torque)
+    text = summary(estimate, result.unusable, result.torque, result.warnings)
     text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
     document["torque"] = result.torque
-    document |= _estimate_document(estimate, result.unusable)
-    return _exit_code(estimate, result.unusable), text, document
+    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    return _exit_code(document), text, document
 
 
-def _exit_code(estimate: Estimate, unusable: Sequence[str]) -> int:
-    return DONE if estimate.feasible and not unusable else VERDICT_NO
+def _exit_code(document: dict[str, Any]) -> int:
+    return DONE if document["usable"] else VERDICT_NO
 
 
-def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str, Any]:
+def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Sequence[str]) -> dict[str, Any]:
+    from ident_service.results.assessment import assess_estimate
     from ident_service.results.parameter_file import convex_document
-    from ident_service.results.summary import how_fitted, implausible_links
+    from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
     own = estimate.candidates[estimate.chosen]
+    found = assess_estimate(estimate, unusable, warnings)
     return {
         "arm": estimate.model.config.name,
-        "usable": estimate.feasible and not unusable,
+        "assessment": found.document(),
+        "usable": found.word != "do not use",
         "unusable": list(unusable),
         "feasible": estimate.feasible,
         "margin": estimate.margin,
@@ -212,17 +256,24 @@ def _estimate_document(estimate: Estimate, unusable: Sequence[str]) -> dict[str,
             for candidate in estimate.candidates
         ],
         "verdicts": {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")},
+        **torque_constants_document(estimate),
         **convex_document(estimate),
     }
 
 
 def _add_fleet(verbs: VerbList) -> None:
     """Register `fleet identify` and `fleet status`."""
-    fleet = verbs.group("fleet", "many recordings of many arms, on several processes or a cluster")
+    fleet = verbs.group(
+        "fleet",
+        "identify many arms from many recordings",
+        more="On several processes of this machine, or on a Dask cluster.",
+    )
     sub = fleet.add(
         "identify",
         _fleet_identify,
-        "each arm and what is common, trends, one page (exit code 3: recordings left out, or an arm changed)",
+        "identify each arm, what is common, and trends",
+        more="Writes one page with all of it (exit code 3: recordings left out, or an arm changed).",
+        examples=("'recordings/*/*.mcap' --arm wam7", "s3://lab/wam/ --arm wam7 --scheduler tcp://node1:8786"),
     )
     sub.add_argument(
         "patterns",
@@ -245,7 +296,13 @@ def _add_fleet(verbs: VerbList) -> None:
         metavar="DIR",
         help="where results go, in the place of an earlier result (default: a new folder below the state folder)",
     )
-    sub = fleet.add("status", _fleet_status, "what the store has of these recordings; nothing is computed")
+    sub = fleet.add(
+        "status",
+        _fleet_status,
+        "show what the store has of these recordings",
+        more="Nothing is computed.",
+        examples=("--arm wam7", "'recordings/*/*.mcap' --arm wam7 --store factors"),
+    )
     sub.add_argument("patterns", nargs="*", metavar="PATTERN", help="as for identify")
     _fleet_options(sub)
 
@@ -292,7 +349,7 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
     config = load_arm(arguments.arm)
     arm_model(config)  # what cannot be used is told before workers start
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name, "fleets")
-    result = identify_fleet(request, folder, lambda line: tell(arguments, line))
+    result = identify_fleet(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     good = not result.document["left_out"] and not result.changed
     files = [f"files: {folder}", f"  {PAGE}, {FLEET}, {TABLE}, arms/*/parameters.json", ""]
     text = "\n".join([*fleet_lines(result.document), *files])
@@ -347,7 +404,11 @@ def _fleet_status(arguments: argparse.Namespace) -> Answer:
 def _add_comparing(verbs: VerbList) -> None:
     """Register `compare` and `payload`."""
     sub = verbs.add(
-        "compare", _compare, "compare parameter sets: has the arm changed? (exit code 3: yes, or undecided)"
+        "compare",
+        _compare,
+        "compare parameter sets: has the arm changed?",
+        more="Exit code 3: it has, or that is undecided.",
+        examples=("before/parameters.json after", "accepted:wam7 result --out comparison"),
     )
     reference = "the reference: a folder of results, a parameters.json, or accepted:NAME, the accepted set of an arm"
     sub.add_argument("reference", type=Path, metavar="A", help=reference)
@@ -359,7 +420,11 @@ def _add_comparing(verbs: VerbList) -> None:
     out.add_argument("--keep", action="store_true", help="write into folder B and its manifest; one B only")
 
     sub = verbs.add(
-        "payload", _payload, "identify the payload of an identified arm (exit code 3: none, or no physical body)"
+        "payload",
+        _payload,
+        "identify the payload of an identified arm",
+        more="Exit code 3: there is none, or no physical body.",
+        examples=("result with_load.mcap", "result with_load.mcap@10:40 --refit-offsets --out load"),
     )
     sub.add_argument("run", type=Path, metavar="RUN", help="folder of results of the arm without the load")
     sub.add_argument(
@@ -381,6 +446,17 @@ def accepted_name(path: Path) -> str | None:
     return name if word == "accepted" and name and "/" not in name and not path.exists() else None
 
 
+def _require_arm(arm: str, known: Sequence[str]) -> None:
+    """Refuse `accepted:NAME` of an arm of which nothing is known.
+
+    Raises:
+        UsageError: with the arms that are.
+    """
+    if arm not in known:
+        there = f"; known are {', '.join(known)}" if known else ""
+        raise UsageError(f"accepted:{arm}: no arm of this name has an accepted set{did_you_mean(arm, known) or there}")
+
+
 def _compare(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.parameter_files import KEPT, compare_files, compare_into
     from ident_service.results.comparison.presentation import comparison_document, comparison_text
@@ -388,7 +464,9 @@ def _compare(arguments: argparse.Namespace) -> Answer:
     reference = arguments.reference
     if (arm := accepted_name(reference)) is not None:
         from ident_service.operations.acceptance import PARAMETERS, accepted_set
+        from ident_service.registry.state_folder import known_arms
 
+        _require_arm(arm, known_arms(state_folder(arguments)))
         reference = accepted_set(state_folder(arguments), arm)[1] / PARAMETERS
     if arguments.keep:
         if len(arguments.others) != 1 or not arguments.others[0].is_dir():
@@ -419,17 +497,37 @@ def _payload(arguments: argparse.Namespace) -> Answer:
 
 def _add_parameters(verbs: VerbList) -> None:
     """Register `base-parameters`, `feasible`, `project` and `verify`."""
-    sub = verbs.add("base-parameters", _base, "list the base parameters and their expressions", former="base")
+    sub = verbs.add(
+        "base-parameters",
+        _base,
+        "list the base parameters and their expressions",
+        former="base",
+        examples=("wam7", "my_arm.yaml --json"),
+    )
     sub.add_argument("arm", metavar="ARM")
 
-    sub = verbs.add("feasible", _feasible, "test whether parameters are physically feasible (exit code 3: no)")
+    sub = verbs.add(
+        "feasible",
+        _feasible,
+        "test whether parameters are physically feasible",
+        more="Exit code 3: they are not.",
+        examples=("parameters.json", "table.json --arm wam7 --feasible-set inertia"),
+    )
     sub.add_argument("file", type=Path, metavar="FILE")
     sub.add_argument("--feasible-set", choices=FEASIBLE_SETS)
     sub.add_argument("--arm", metavar="ARM", help="adds the arm's constraints on mass, centre of mass and signs")
     sub.add_argument("--notation", choices=NOTATIONS, help="notation of the parameter names in the file")
 
-    text = "write the feasible parameters nearest to those of a file"
-    sub = verbs.add("project", _correct, text, former="correct")
+    sub = verbs.add(
+        "project",
+        _correct,
+        "write the feasible parameters nearest to given ones",
+        former="correct",
+        examples=(
+            "table.json --out feasible.json",
+            "table.json --metric covariance --out nearest.json",
+        ),
+    )
     sub.add_argument("file", type=Path, metavar="FILE")
     sub.add_argument(
         "--metric", choices=["euclidean", "covariance"], default="euclidean", help="metric of the distance"
@@ -440,7 +538,11 @@ def _add_parameters(verbs: VerbList) -> None:
     sub.add_argument("--notation", choices=NOTATIONS, help="notation of the parameter names in the file")
 
     sub = verbs.add(
-        "verify", _verify, "check a certificate in exact arithmetic (exit code 3: infeasible, or not valid)"
+        "verify",
+        _verify,
+        "check a certificate of feasibility in exact arithmetic",
+        more="Exit code 3: infeasible, or not valid.",
+        examples=("parameters.json", "result --arm wam7"),
     )
     sub.add_argument("file", type=Path, metavar="FILE", help="parameters.json, or the folder that holds it")
     sub.add_argument(
@@ -540,7 +642,11 @@ _FORMATS = "urdf,mjcf,sdf,json,csv,c"
 def _add_exports(verbs: VerbList) -> None:
     """Register `export`."""
     sub = verbs.add(
-        "export", _export, "export identified parameters for other tools; each file is read back and checked"
+        "export",
+        _export,
+        "export identified parameters for other tools",
+        more="Each file is read back and checked.",
+        examples=("result", "result --format urdf,mjcf --out models"),
     )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--format", default=_FORMATS, metavar="LIST", help=f"comma-separated (default: {_FORMATS})")
@@ -553,7 +659,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
     formats = known_formats(arguments.format)
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "exports")
-    made = export_run(arguments.run, formats, folder)
+    made = export_run(arguments.run, formats, folder, step_of(arguments))
     lines, files = [f"files: {folder}"], []
     for export in made:
         lines.append(f"  {export.name} ({export.format})")
@@ -565,23 +671,47 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
 
 def _add_results(verbs: VerbList) -> None:
-    """Register `report` and `figures`."""
-    sub = verbs.add("report", _report, "write the report of a result folder as one HTML file")
+    """Register `report`, `figures` and `view`."""
+    sub = verbs.add(
+        "report",
+        _report,
+        "write the report of a result folder as one HTML file",
+        examples=("result", "result --out result.html"),
+    )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--out", type=Path, metavar="FILE", help="default: report.html in the folder")
 
-    sub = verbs.add("figures", _figures, "write the figures of a report as files")
+    sub = verbs.add(
+        "figures",
+        _figures,
+        "write the figures of a report as files",
+        examples=("result --out figures", "result --format png --out figures"),
+    )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--format", choices=["svg", "png"], default="svg", help="png needs the extra `figures`")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="files of the same name are replaced")
 
+    sub = verbs.add(
+        *("view", _view, "show a run in Rerun: the arm, its joints, its residuals"),
+        examples=("result", "result --save result.rrd"),
+    )
+    sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
+    sub.add_argument(
+        *("--recording",), type=Path, action="append", default=[], metavar="FILE",
+        help="besides those in the folder; may be repeated",
+    )  # fmt: skip
+    sub.add_argument("--urdf", type=Path, metavar="FILE", help="draw its meshes, which stand beside it")
+    sub.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for Rerun instead of opening it")
+
 
 def _report(arguments: argparse.Namespace) -> Answer:
     from ident_service.results.report_files import make_report
+    from ident_service.results.summary import assessment_lines
 
-    page = make_report(arguments.run, arguments.out)
+    page, found = make_report(arguments.run, arguments.out)
     size = page.stat().st_size
-    return DONE, f"{page}: {size / 1e6:.2f} MB\n", {"file": str(page), "bytes": size}
+    text = "\n".join([*assessment_lines(found), "", f"{page}: {size / 1e6:.2f} MB", ""])
+    return DONE, text, {"file": str(page), "bytes": size, "assessment": found.document()}
 
 
 def _figures(arguments: argparse.Namespace) -> Answer:
@@ -590,6 +720,18 @@ def _figures(arguments: argparse.Namespace) -> Answer:
     names = write_figures(arguments.run, arguments.out, arguments.format)
     text = f"files: {arguments.out}\n" + "".join(f"  {name}\n" for name in names)
     return DONE, text, {"folder": str(arguments.out), "files": names}
+
+
+def _view(arguments: argparse.Namespace) -> Answer:
+    from ident_service.operations.run_view import view_run
+
+    seen = view_run(arguments.run, arguments.recording, arguments.save, arguments.urdf)
+    text = f"recordings: {', '.join(seen.recordings)}\n"
+    text += f"residuals: {', '.join(seen.residuals) or 'none; identify parameters from the recording first'}\n"
+    if seen.saved is not None:
+        text += f"{seen.saved}: {seen.saved.stat().st_size / 1e6:.2f} MB; show it with: rerun {seen.saved}\n"
+    file = None if seen.saved is None else str(seen.saved)
+    return DONE, text, {"recordings": list(seen.recordings), "residuals": list(seen.residuals), "file": file}
 
 
 def add(verbs: VerbList) -> None:

@@ -1,4 +1,4 @@
-"""Register and run the verbs about scheduled re-identification: `schedule`, `maintenance`, `due`, `alarm`.
+"""Register and run the verbs about scheduled re-identification: `schedules`, `maintenance`, `due`, `alarms`.
 
 They work on the registry of the state folder; a daemon that serves it sees what they wrote within a second.
 """
@@ -9,10 +9,11 @@ import argparse
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.archive_commands import add_by, terminal_user
-from ident_service.cli.arguments import Parser, VerbList, count
+from ident_service.cli.arguments import Parser, VerbList, count, hours
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, state_folder, writable_state_folder
 
 if TYPE_CHECKING:
@@ -20,43 +21,75 @@ if TYPE_CHECKING:
 
 
 def add(verbs: VerbList) -> None:
-    """Register `schedule`, `maintenance`, `due` and `alarm`."""
-    group = verbs.group("schedule", "schedules of re-identification")
-    sub = group.add("add", _add, "add a schedule; a due re-identification waits for a person")
+    """Register `schedules`, `maintenance`, `due` and `alarms`."""
+    group = verbs.group(
+        "schedules",
+        "list schedules of re-identification; add, remove",
+        _list,
+        former="schedule",
+        examples=("", "--arm wam7"),
+    )
+    _of_arm(group.parser)
+    sub = group.add(
+        "add",
+        _add,
+        "add a schedule",
+        more="A due re-identification waits for a person.",
+        examples=("planar2 --cron '0 6 * * mon'", "planar2 --hours 500", "planar2 --maintenance"),
+    )
     _arm(sub)
     when = sub.add_mutually_exclusive_group(required=True)
     when.add_argument("--cron", metavar="FIELDS", help="five fields, UTC: '0 6 * * mon'")
-    when.add_argument("--hours", type=float, metavar="H", help="operating hours between re-identifications")
+    when.add_argument("--hours", type=hours, metavar="H", help="operating hours between re-identifications")
     when.add_argument("--maintenance", action="store_true", help="after each maintenance event")
     sub.add_argument("--motion", metavar="ID", help="of a motion of the registry; default: the description's")
     add_by(sub)
-    sub = group.add("list", _list, "list schedules and when they are due")
+    sub = group.add("list", _list, "list schedules and when they are due", hidden=True, word="schedules")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
     for name, verb, text in (
         ("remove", _remove, "remove a schedule"),
         ("enable", _enable, "enable a schedule"),
         ("disable", _disable, "disable a schedule"),
     ):
-        sub = group.add(name, verb, text)
+        sub = group.add(name, verb, text, examples=("2", "2 --by Ann"))
         sub.add_argument("number", type=count, metavar="NUMBER")
         add_by(sub)
-    sub = verbs.add("maintenance", _maintenance, "record a maintenance event")
+    sub = verbs.add(
+        "maintenance",
+        _maintenance,
+        "record a maintenance event",
+        examples=("planar2 --what 'gear oil changed'", "wam7 --what 'cable replaced' --note 'j3, motor side'"),
+    )
     _arm(sub)
     sub.add_argument("--what", required=True, help='a few words: "gear oil changed"')
     sub.add_argument("--note", default="", help="further details")
     add_by(sub)
-    group = verbs.group("due", "due re-identifications")
-    sub = group.add("list", _due, "list due re-identifications")
+    group = verbs.group("due", "list due re-identifications; dismiss one", _due, examples=("", "--arm wam7"))
+    _of_arm(group.parser)
+    sub = group.add("list", _due, "list due re-identifications", hidden=True, word="due")
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _add_number_and_note(group.add("dismiss", _dismiss, "dismiss a due re-identification"))
-    group = verbs.group("alarm", "drift alarms")
-    sub = group.add("list", _alarms, "list open alarms (exit code 3: there are some)")
-    sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
-    _add_number_and_note(
-        group.add(
-            "acknowledge", _ack, "confirm that a person knows of it; the accepted set stays as it is", former="ack"
-        )
+    noted = ("1 --note 'new gear box next week'", "1 --note 'arm is out of use' --by Ann")
+    _add_number_and_note(group.add("dismiss", _dismiss, "dismiss a due re-identification", examples=noted))
+    group = verbs.group(
+        "alarms",
+        "list open drift alarms; acknowledge one",
+        _alarms,
+        more="Exit code 3: there are some.",
+        former="alarm",
+        examples=("", "--arm wam7"),
     )
+    _of_arm(group.parser)
+    sub = group.add("list", _alarms, "list open alarms", hidden=True, word="alarms")
+    sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
+    sub = group.add(
+        "acknowledge",
+        _ack,
+        "confirm that a person knows of an alarm",
+        more="The accepted set stays as it is.",
+        former="ack",
+        examples=("1 --note 'gripper was changed'", "1 --note 'known' --by Ann"),
+    )
+    _add_number_and_note(sub)
 
 
 def registry(arguments: argparse.Namespace) -> Database:
@@ -71,6 +104,10 @@ def registry(arguments: argparse.Namespace) -> Database:
 
 def _arm(sub: Parser) -> None:
     sub.add_argument("arm", metavar="NAME", help="name of a shipped arm, or of one uploaded to a daemon")
+
+
+def _of_arm(sub: Parser) -> None:
+    sub.add_argument("--arm", metavar="NAME", help="only those of this arm")
 
 
 def _add_number_and_note(sub: Parser) -> None:
@@ -137,19 +174,19 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as db:
         name = _known(db, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
-        due = pending(db, name)
+        due = _with_accepted(state_folder(arguments), pending(db, name))
     text = f"{name}: recorded: {row['what']}\n" + "".join(due_line(one) for one in due)
     if not due:
-        text += f"nothing is due after it; see `ident schedule add {name} --maintenance`\n"
-    return DONE, text, {**row, "due": [dict(one) for one in due]}
+        text += f"nothing is due after it; see `ident schedules add {name} --maintenance`\n"
+    return DONE, text, {**row, "due": due}
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import pending
 
     with registry(arguments) as db:
-        rows = pending(db, arguments.arm)
-    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": [dict(row) for row in rows]}
+        rows = _with_accepted(state_folder(arguments), pending(db, arguments.arm))
+    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -189,8 +226,18 @@ def schedule_line(row: Row) -> str:
 
 
 def due_line(row: Row) -> str:
-    """Format one re-identification that is due as a line for a person."""
-    return f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}; `ident reidentify {row['arm']}`\n"
+    """Format one re-identification that is due as a line for a person; it needs an `accepted` set to compare with."""
+    line = f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}"
+    if row["accepted"]:
+        return f"{line}; `ident reidentify {row['arm']}`\n"
+    return f"{line}; nothing of it has been accepted to compare with: run, identify and accept it first\n"
+
+
+def _with_accepted(state: Path, rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return due re-identifications, each with whether its arm has an accepted set."""
+    from ident_service.operations.acceptance import acceptances
+
+    return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in rows]
 
 
 def alarm_lines(rows: Sequence[Row]) -> str:

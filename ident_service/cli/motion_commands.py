@@ -34,6 +34,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 RELEASED = 0.15  # s without the key, after which it counts as released
 REPEATS = 4  # in a row, each in time, before it counts as held
 KEY = b" "
+_AROUND = 8.0  # s that approach, return and holding take, as a rule; for the time that is left, and for nothing else
 _MOST_MISSED = 10  # parameters that are printed
 
 
@@ -153,6 +155,7 @@ def run_and_report(
     Raises:
         As `service.run.run_motion`; MotionRefused without a ticket.
     """
+    from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.command_channel import LEASE_SECONDS
     from ident_service.motion.ticket import read_ticket
     from ident_service.operations.motion_run import run_motion
@@ -170,6 +173,20 @@ def run_and_report(
         begun = True
         tell(arguments, f"{config.name}: {sentence}, into {folder}")
 
+    step, words, reached = step_of(arguments), "preparing the motion", 0.0
+    whole = motion.duration / speed if isinstance(motion, Excitation) else None
+
+    def entered(state_name: str) -> None:
+        nonlocal words
+        words = state_name
+        tell(arguments, state_name)
+
+    def moved(seconds: float) -> None:
+        nonlocal reached
+        if seconds > reached:
+            reached = seconds
+            step(words, None if whole is None else min(seconds / (whole + _AROUND), 1.0))
+
     try:
         ran = run_motion(
             config,
@@ -182,7 +199,8 @@ def run_and_report(
             log_frames=arguments.can_log,
             begin=begin,
             asked_ns=arguments.asked_ns,
-            tell=lambda word: tell(arguments, word),
+            tell=entered,
+            moved=moved,
             stop_requested=stop_requested,
             until=until,
         )
@@ -319,13 +337,23 @@ _HELP_ARM = "description file, or the name of a shipped one"
 
 def add(verbs: VerbList) -> None:
     """Register `watch`, `preflight`, `run`, `stop`, `pause`, `resume`, `finish`, `supported` and `acknowledge`."""
-    sub = verbs.add("watch", _watch, "show positions and drive states; sends no torque and changes nothing")
+    sub = verbs.add(
+        "watch",
+        _watch,
+        "show positions and drive states; changes nothing",
+        more="Sends no torque.",
+        examples=("my_arm.yaml", "planar2 --seconds 5"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
-    text = (
-        "test the arm and its drives before a motion, and write the ticket that `run` asks for (exit code 3: refused)"
+    sub = verbs.add(
+        "preflight",
+        _check,
+        "test arm and drives before a motion; writes a ticket",
+        more="`ident run` asks for the ticket (exit code 3: refused).",
+        former="check",
+        examples=("my_arm.yaml", "planar2 motion/motion.json --confirm planar2", "my_arm.yaml --home"),
     )
-    sub = verbs.add("preflight", _check, text, former="check")
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover` instead of a motion")
@@ -341,7 +369,12 @@ def add(verbs: VerbList) -> None:
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
     add_dry_run(sub)
     add_lease(sub, confirm=False)
-    sub = verbs.add("run", _run, "move the arm along a motion and record it")
+    sub = verbs.add(
+        "run",
+        _run,
+        "move the arm along a motion and record it",
+        examples=("my_arm.yaml --hold-to-run", "planar2", "planar2 motion/motion.json --speed 0.5 --until 0.05"),
+    )
     _motion(sub)
     sub.add_argument(
         "--speed", type=speed, metavar="SHARE", help="of the motion's own speed (default: 1, with --hold-to-run 0.2)"
@@ -365,19 +398,27 @@ def add(verbs: VerbList) -> None:
     _motion(sub)
     sub.add_argument("--no-key", action="store_true", help="no key to hold; Ctrl-C and `ident stop` stop")
     sub.add_argument("--speed", type=speed, default=SLOW, metavar="SHARE", help="of the motion's own speed")
-    for name, text in (
-        ("stop", "stop the arm, or every arm, under control"),
-        ("pause", "pause the motion"),
-        ("resume", "resume the motion"),
-        ("finish", "end the motion early: the arm returns to where the run began"),
-        ("supported", "confirm that an arm held after a stop is supported; it is then lowered"),
+    for name, text, more in (
+        ("stop", "stop the arm, or every arm, under control", "It needs no lease and no ticket, and always works."),
+        ("pause", "pause the motion", "The arm stands, with torque."),
+        ("resume", "resume the motion", ""),
+        ("finish", "end the motion early, in order", "The arm returns to where the run began."),
+        ("supported", "confirm that a held arm is supported", "It is held after a stop, and then lowered."),
     ):
-        sub = verbs.add(name, _stop if name == "stop" else _ask, text)
+        examples = ("", "planar2") if name == "stop" else ("planar2", "my_arm.yaml")
+        sub = verbs.add(name, _stop if name == "stop" else _ask, text, more=more, examples=examples)
         sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
         if name == "supported":
             sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees the arm")
         sub.set_defaults(asks=name)
-    sub = verbs.add("acknowledge", _ack, "acknowledge an active fault by its name", former="ack")
+    sub = verbs.add(
+        "acknowledge",
+        _ack,
+        "acknowledge an active fault by its name",
+        more="When you know its cause; `ident recover` lists active faults.",
+        former="ack",
+        examples=("planar2 following_error", "my_arm.yaml drive_fault --by Ann"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("fault", metavar="FAULT")
     add_by(sub)
@@ -413,9 +454,20 @@ def _watch(arguments: argparse.Namespace) -> Answer:
     if (pid := controlling_pid(control_path(state_folder(arguments), config.name))) is not None:
         raise DriverError(f"{config.name}: process {pid} is moving the arm; see its recording")
     stopping = StopOnSignal()
+    step_of(arguments)("watching", left=arguments.seconds)
     with stopping:
         seen = watch(make_arm(config), arguments.seconds, stop_requested=stopping.requested)
     return DONE, watch_text(seen), watch_document(seen)
+
+
+# By the check that was made last: what follows it, and the share of the time that is over, as for an arm of two joints.
+_PREFLIGHT = {
+    "configuration": ("checking that the motion fits", 0.02),
+    "motion_fits": ("proving that it keeps all limits", 0.03),
+    "motion_proven": ("looking at the arm at rest", 0.28),
+    "noise": ("moving each joint a little", 0.3),
+    "gravity": ("testing the drives' watchdog", 0.95),
+}
 
 
 def _check(arguments: argparse.Namespace) -> Answer:
@@ -437,7 +489,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     def confirm(question: str) -> str:
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     if arguments.scale:
         return _scale(arguments, config)
@@ -460,6 +512,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     ):
         stoppable = InterruptibleArm(arm, stop_or_lapsed(lambda: controls.stop or stopping.requested(), lease))
         positions = PositionFile(arm_folder(state, config.name), config)
+        step = step_of(arguments)
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
         with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
@@ -468,6 +521,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
                 model,
                 motion,
                 confirm=confirm,
+                tell=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
                 rate_seconds=seconds,
                 closed=closed,
                 announce=lambda action: tell(arguments, f"{config.name}: {action}"),
@@ -485,7 +539,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
 
     if arguments.json or not sys.stdin.isatty():
         raise UsageError("--scale needs a person at a terminal who turns each joint by hand")
-    found = check_scale(config, writable_state_folder(arguments), lambda question: input(f"{question} "))
+    found = check_scale(config, writable_state_folder(arguments), lambda question: ask(arguments, f"{question} "))
     lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]
     lines.append(f"kept in {FILE} of the arm's folder" if found else "no joint was turned")
     good = bool(found) and all(one.good for one in found)
@@ -612,6 +666,14 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
     return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
 
 
+_ASKED = {
+    "pause": "pause requested of",
+    "resume": "resumption requested of",
+    "finish": "early end requested of",
+    "supported": "support confirmed to",
+}
+
+
 def _ask(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.command_channel import ControlFile, in_use
 
@@ -634,7 +696,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
         pid = controls.pid
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
-    return DONE, f"{name}: {arguments.asks} requested of process {pid}\n", document
+    return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:
@@ -645,7 +707,8 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
     """
     typed = arguments.confirm
     if typed is None and sys.stdin.isatty() and not arguments.json:
-        typed = input(f"{name} {follows}. If it is supported and nobody is under it, type its name: ").strip()
+        question = f"{name} {follows}. If it is supported and nobody is under it, type its name: "
+        typed = ask(arguments, question).strip()
     if typed != name:
         raise UsageError(f"confirm that the arm is supported by its name: --confirm {name}; nothing has changed")
 

@@ -30,12 +30,25 @@ Answer = tuple[int, str, dict[str, Any]]
 """Exit code; text for a person, with its last line break; JSON values for a program."""
 
 
-def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any]) -> None:
-    """Print a verb's answer as text, or with `--json` as one JSON object."""
+_STYLES = {"error": "1;31", "heading": "1", "next": "36"}
+
+
+def styled(stream: TextIO | None, text: str, style: str) -> str:
+    """Return text in the style `error`, `heading` or `next` where the stream is a terminal that shows colours.
+
+    They are left out in pipes and files, in a terminal called `dumb`, and where `NO_COLOR` is set (no-color.org).
+    """
+    if stream is None or not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    return f"\x1b[{_STYLES[style]}m{text}\x1b[0m"
+
+
+def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any], last: str = "") -> None:
+    """Print a verb's answer as text with a last line, or with `--json` as one JSON object."""
     if arguments.json:
         _print_json({**document, "exit_code": code})
     else:
-        write(sys.stdout, text)
+        write(sys.stdout, text + styled(sys.stdout, last, "next") if last else text)
 
 
 def print_error(kind: str, message: str, code: int, more: Mapping[str, object] | None = None) -> None:
@@ -59,6 +72,9 @@ def _print_json(document: dict[str, Any]) -> None:
 
 def tell(arguments: argparse.Namespace, line: str) -> None:
     """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
+    bar = getattr(arguments, "progress", None)
+    if bar is not None and sys.stdout is not None and sys.stdout.isatty() and bar.tell(line):
+        return
     # With --json, stdout belongs to the one object.
     with suppress(OSError):
         write(sys.stderr if arguments.json else sys.stdout, line + "\n")
@@ -219,11 +235,14 @@ def _ticket(values: Any) -> str:
 def lines_of(value: Any, indent: str = "") -> Iterator[str]:
     """Yield one line per value of a JSON object or list; nested values are indented by two spaces.
 
-    Lists of plain values, and plain values, stand on the line of their name.
+    Lists of plain values, and plain values, stand on the line of their name; sentences have a line each.
     """
     pairs = value.items() if isinstance(value, dict) else enumerate(value, 1)
     for name, part in pairs:
-        if isinstance(part, dict | list) and not _plain(part):
+        if isinstance(part, list) and any(isinstance(one, str) and one.endswith(".") for one in part):  # sentences
+            yield f"{indent}{name}:"
+            yield from (f"{indent}  {one}" for one in part)
+        elif isinstance(part, dict | list) and not _plain(part):
             yield f"{indent}{name}:"
             yield from lines_of(part, indent + "  ")
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import select
 import sys
@@ -20,6 +21,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
@@ -38,7 +40,16 @@ _MARGINS = ("criterion", "position_margin", "torque_margin")
 
 def _add_motions(verbs: VerbList) -> None:
     """Register `design` and `preview`."""
-    sub = verbs.add("design", _design, "search for the most informative motion within the arm's limits")
+    sub = verbs.add(
+        "design",
+        _design,
+        "search for the most informative motion within limits",
+        examples=(
+            "planar2 --search-time 20",
+            "my_arm.yaml --length 30 --out motion",
+            "planar2 --parameter fv2 --after run.mcap",
+        ),
+    )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("--criterion", choices=_CRITERIA, help="default: the arm's")
     sub.add_argument(
@@ -69,7 +80,11 @@ def _add_motions(verbs: VerbList) -> None:
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
 
     sub = verbs.add(
-        "preview", _preview, "show a motion's demands on the arm and its expected accuracy (exit code 3: refused)"
+        "preview",
+        _preview,
+        "show a motion's demands and its expected accuracy",
+        more="Exit code 3: the arm's limits refuse it.",
+        examples=("planar2", "my_arm.yaml motion/motion.json --out preview"),
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
@@ -127,7 +142,6 @@ def _design(arguments: argparse.Namespace) -> Answer:
     stopping = StopOnSignal()
     with stopping:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
-    _progress_end(arguments)
     unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
     if unfinished:
         sys.stderr.write(f"ident: {unfinished}\n")
@@ -148,27 +162,24 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
-    """Return a callback that shows search progress: one line rewritten on a terminal, else a new one every 10 s."""
-    stream = sys.stderr
+    """Return a callback that shows the progress of a search: a bar on a terminal, else a line every 10 s."""
+    step, terminal = step_of(arguments), sys.stderr.isatty() and not arguments.json
     last = [-10.0]
 
     def show(progress: Progress) -> None:
+        if terminal:
+            found = "" if progress.best is None else f", best {progress.best:.4g}"
+            known = progress.remaining == progress.remaining
+            step(f"{progress.phase}: {progress.finished}{found}", None, progress.remaining if known else None)
+            return
         best = "none yet" if progress.best is None else f"{progress.best:.4f}"
         left = f", about {progress.remaining:.0f} s left" if progress.remaining == progress.remaining else ""
         words = f"{progress.phase}: {progress.finished} starts, best {best}, {progress.elapsed:.0f} s{left}"
-        if stream.isatty():
-            stream.write(f"\r{words}\x1b[K")
-            stream.flush()
-        elif progress.elapsed - last[0] >= 10.0:
+        if progress.elapsed - last[0] >= 10.0:
             last[0] = progress.elapsed
             tell(arguments, words)
 
     return show
-
-
-def _progress_end(arguments: argparse.Namespace) -> None:
-    if sys.stderr.isatty():
-        sys.stderr.write("\r\x1b[K")
 
 
 def _preview(arguments: argparse.Namespace) -> Answer:
@@ -186,19 +197,53 @@ def _preview(arguments: argparse.Namespace) -> Answer:
 
 def _add_configs(verbs: VerbList) -> None:
     """Register `new` and `config check`."""
-    new = verbs.add("new", _new, "write a first description of an arm from its URDF, with a simulated driver")
-    new.add_argument("urdf", metavar="URDF", type=Path)
+    new = verbs.add(
+        "new",
+        _new,
+        "write a first description of an arm",
+        more="From its URDF, MJCF or DH table, with a simulated driver.",
+        examples=(
+            "robot.urdf",
+            "robot.xml --tip wrist_3_link --out my_arm.yaml",
+            "table.csv --convention modified",
+        ),
+    )
+    help_source = "URDF (.urdf, .xml), MJCF (.xml), or DH table (.csv, .yaml)"
+    new.add_argument("source", metavar="FILE", type=Path, help=help_source)
     new.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: NAME.yaml here)")
-    new.add_argument("--name", help="of the arm (default: the URDF's file name)")
-    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: the root)")
+    new.add_argument("--name", help="of the arm (default: the file's)")
+    new.add_argument("--base", metavar="LINK", help="base link of the arm (default: found)")
     new.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where the gripper begins)")
-    config = verbs.group("config", "arm descriptions")
+    help_convention = "of a DH table that does not say it: standard (distal frames) or modified (Craig)"
+    new.add_argument("--convention", choices=["standard", "modified"], help=help_convention)
+    config = verbs.group("config", "check arm descriptions")
     check = config.add(
         "check",
         _check,
-        "check a description: mistakes with file, line and column; stability of the gains (exit code 3: unstable)",
+        "check a description",
+        more="Mistakes come with file, line and column; then the stability of the gains (exit code 3: unstable).",
+        examples=("my_arm.yaml", "wam7"),
     )
     check.add_argument("file", metavar="FILE")
+    schema = verbs.add(
+        *("schema", _schema, "print the JSON schema of a file format"),
+        examples=("arm", "parameters"),
+    )
+    schema.add_argument("of", metavar="FORMAT", choices=_SCHEMAS, help=f"{', '.join(_SCHEMAS)}; arm is a description")
+
+
+_SCHEMAS = ("arm", "comparison", "evidence", "parameters", "payload")
+
+
+def _schema(arguments: argparse.Namespace) -> Answer:
+    from importlib.resources import files
+
+    from ident_service.config.yaml_source import arm_schema_file
+
+    of = arguments.of
+    file = arm_schema_file() if of == "arm" else files("ident_service.results").joinpath(f"{of}.schema.json")
+    text = file.read_text(encoding="utf-8")
+    return DONE, text, json.loads(text)
 
 
 def _new(arguments: argparse.Namespace) -> Answer:
@@ -207,11 +252,10 @@ def _new(arguments: argparse.Namespace) -> Answer:
     def tell(line: str) -> None:
         print_to_person(f"{line} ...\n")
 
-    words = (arguments.urdf, arguments.out, arguments.name, arguments.base, arguments.tip)
-    path, guessed = new_description(*words, tell)
+    words = (arguments.source, arguments.out, arguments.name, arguments.base, arguments.tip)
+    path, guessed = new_description(*words, tell, arguments.convention)
     lines = [f"{path}: description written, with a simulated driver"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
-    lines += ["next:", f"  ident config check {path}", f"  ident simulate {path}"]
     return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 
 
@@ -228,48 +272,77 @@ _HELP_ARM = "description file, or the name of a shipped one"
 
 def _add_bus(verbs: VerbList) -> None:
     """Register `bus load`, `bus scan` and `bus probe`."""
-    bus = verbs.group("bus", "the fieldbus of an arm")
-    load = bus.add("load", _load, "bus load per frame and in all (exit code 3: too much)")
+    bus = verbs.group("bus", "look at the fieldbus of an arm, configure its drives")
+    load = bus.add(
+        "load",
+        _load,
+        "show the bus load per frame and in all",
+        more="Exit code 3: too much.",
+        examples=("wam7_canopen", "wam7_canopen --rate 500"),
+    )
     load.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     load.add_argument("--rate", type=frequency, metavar="HZ", help="cycles per second (default: control.rate)")
-    text = "list the nodes on the buses with state, identity and errors; reads only (exit code 3: not as configured)"
-    sub = bus.add("scan", _scan, text)
+    sub = bus.add(
+        "scan",
+        _scan,
+        "list the nodes with state, identity and errors",
+        more="Reads only (exit code 3: not as configured).",
+        examples=("wam7_canopen", "my_arm.yaml --json"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
 
-    text = "read each drive's capabilities: modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable)"
-    sub = bus.add("probe", _probe, text)
+    sub = bus.add(
+        "probe",
+        _probe,
+        "read what each drive can do",
+        more="Modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable).",
+        examples=("wam7_canopen", "my_arm.yaml --eds drive.eds"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     help_eds = "EDS or DCF files to read instead of the drives, without a bus"
     sub.add_argument("--eds", nargs="+", default=[], metavar="FILE", help=help_eds)
 
-    text = (
-        "write what DCFs of the maker's tool configure: one file for each drive; each change is listed, drives are off"
+    sub = bus.add(
+        "import",
+        _import,
+        "write what DCFs of the maker's tool configure",
+        more="One file for each drive; each change is listed, and drives are off meanwhile.",
+        examples=("my_arm.yaml j1.dcf j2.dcf --dry-run", "my_arm.yaml j1.dcf j2.dcf --confirm my_arm"),
     )
-    sub = bus.add("import", _import, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("files", nargs="+", metavar="DCF", help="one for each drive, in the order of the description")
     sub.add_argument("--dry-run", action="store_true", help="list the changes, and write nothing")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
-    for name, text in (
-        ("store", "have all drives store what they hold (1010h), over the loss of power; drives are off"),
-        ("restore", "have all drives take back what they were shipped with (1011h), at the next loss of power"),
+    for name, text, more in (
+        ("store", "have all drives store what they hold", "Over the loss of power (1010h); drives are off meanwhile."),
+        ("restore", "give all drives back what they were shipped with", "At the next loss of power (1011h)."),
     ):
-        sub = bus.add(name, _store, text)
+        sub = bus.add(name, _store, text, more=more, examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"))
         sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
         sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
         sub.set_defaults(stores=name == "store")
 
-    text = "a ZIP file to send when drives do not work: probe, frames, EDS hashes, ticket, versions; no secrets"
-    sub = bus.add("report", _bus_report, text)
+    sub = bus.add(
+        "report",
+        _bus_report,
+        "write a ZIP file to send when drives do not work",
+        more="Probe, frames, EDS hashes, ticket, versions; no secrets.",
+        examples=("my_arm.yaml", "my_arm.yaml --run failed_run --out drives.zip"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--out", type=Path, metavar="FILE", help="must not exist (default: below the state folder)")
     sub.add_argument(
         "--run", type=Path, metavar="DIR", help="run folder whose can.log goes along (`ident run --can-log`)"
     )
 
-    driver = verbs.group("driver", "drivers of arms, your own ones too (docs/drivers.md)")
-    text = "try a driver on the promises of the Arm contract, with zero torque alone (exit code 3: one is broken)"
-    sub = driver.add("test", _driver_test, text)
+    driver = verbs.group("driver", "test drivers of arms, your own ones too", more="See docs/drivers.md.")
+    sub = driver.add(
+        "test",
+        _driver_test,
+        "try a driver on the promises of the Arm contract",
+        more="With zero torque alone (exit code 3: a promise is broken).",
+        examples=("planar2", "my_arm.yaml --confirm my_arm"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument(
         "--confirm", metavar="NAME", help="the arm's name: it is supported, and nobody is within its reach"
@@ -298,7 +371,7 @@ def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
     """Require that a person has typed the arm's name; raises UsageError."""
     typed = arguments.confirm
     if typed is None and sys.stdin.isatty() and not arguments.json:
-        typed = input(f"{name}: {what}. Type the arm's name to go on: ").strip()
+        typed = ask(arguments, f"{name}: {what}. Type the arm's name to go on: ").strip()
     if typed != name:
         raise UsageError(f"{what}: that is confirmed by the arm's name, typed: --confirm {name}; nothing was written")
 
@@ -342,7 +415,7 @@ def _driver_test(arguments: argparse.Namespace) -> Answer:
     def confirm(question: str) -> str:
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(question) if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, question) if sys.stdin.isatty() and not arguments.json else ""
 
     with ControlFile.take(control_path(writable_state_folder(arguments), config.name), None):
         found = try_driver(config, confirm)
@@ -390,8 +463,13 @@ _DOUBT = 3.0  # events that a Poisson process of which none came has at most, wi
 
 def _add_doctor(verbs: VerbList) -> None:
     """Register the verb."""
-    text = "check whether this computer keeps the control rate (exit code 3: not that of the arm)"
-    sub = verbs.add("doctor", _doctor, text)
+    sub = verbs.add(
+        "doctor",
+        _doctor,
+        "check whether this computer keeps the control rate",
+        more="Exit code 3: not that of the arm.",
+        examples=("", "my_arm.yaml --seconds 300"),
+    )
     sub.add_argument("arm", nargs="?", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("--seconds", type=seconds, default=60.0, help="duration of the measurement (60)")
 
@@ -409,6 +487,7 @@ def _doctor(arguments: argparse.Namespace) -> Answer:
     findings = kernel_findings(settings) + ([] if config is None else bus_findings(config))
     tell(arguments, f"measuring wake-up latency for {arguments.seconds:g} s; Ctrl-C ends it early")
     stopping = StopOnSignal()
+    step_of(arguments)("measuring wake-up latency", left=arguments.seconds)
     with stopping:
         woken = measure_wake_up(measuring_rate(rate), arguments.seconds, settings, stop_requested=stopping.requested)
     held = judge_rates(woken, rate, None if config is None else config.control.longest_stall, watchdogs)
@@ -489,8 +568,10 @@ def _add_emulate(verbs: VerbList) -> None:
     sub = verbs.add(
         "emulate",
         _emulate,
-        "the drives of an arm, emulated on its configured bus until Ctrl-C; lines on standard input inject faults: "
-        "`drive_fault joint=j2 at=1`, `clear`, `state`, `quit`",
+        "emulate the drives of an arm on its bus",
+        more="Until Ctrl-C; lines on standard input inject faults: `drive_fault joint=j2 at=1`, `clear`, `state`, "
+        "`quit`.",
+        examples=("wam7_canopen --seconds 60", "wam7_canopen --fault 'drive_fault joint=j2 at=1'"),
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument(

@@ -17,6 +17,7 @@ from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
 from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
+from ident_service.cli.next_command import command
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -30,6 +31,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
+from ident_service.cli.progress import ask
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
 if TYPE_CHECKING:
@@ -44,7 +46,13 @@ _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 def _add_recovery(verbs: VerbList) -> None:
     """Register `home`, `set-home` and `recover`."""
-    sub = verbs.add("home", _home, "move the arm home, at a tenth of its velocity limits at most")
+    sub = verbs.add(
+        "home",
+        _home,
+        "move the arm home, slowly",
+        more="At a tenth of its velocity limits at most.",
+        examples=("planar2", "my_arm.yaml --dry-run"),
+    )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
     sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
@@ -52,10 +60,13 @@ def _add_recovery(verbs: VerbList) -> None:
     add_can_log(sub)
     add_dry_run(sub)
     add_lease(sub, confirm=False)
-    text = (
-        "define the posture in which the arm stands as its home: sets the zero of incremental encoders, moves nothing"
+    sub = verbs.add(
+        "set-home",
+        _home,
+        "define the arm's present posture as its home",
+        more="Sets the zero of incremental encoders, and moves nothing.",
+        examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"),
     )
-    sub = verbs.add("set-home", _home, text)
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
     add_lease(sub, confirm=False)
@@ -63,7 +74,9 @@ def _add_recovery(verbs: VerbList) -> None:
     sub = verbs.add(
         "recover",
         _recover,
-        "show what must be done after a fault or a stop; reset drives (exit code 3: not usable yet)",
+        "show what to do after a fault or a stop; reset drives",
+        more="Exit code 3: the arm is not usable yet.",
+        examples=("planar2", "my_arm.yaml --leave-limit"),
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
@@ -117,11 +130,12 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)
     write_audit_entry(arguments, "home", config.name, reached=[config.name])
+    supported = command(arguments, ["supported", arguments.arm])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
-        return DONE, f"{config.name}: at home; held there until `ident supported {arguments.arm}`\n", document
+        return DONE, f"{config.name}: at home; held there until `{supported}`\n", document
     why = "see the events of its run" if stage is Homing.REFUSED else "it was stopped"
-    held = f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "it is not held"
+    held = f"it is still held: support it, then `{supported}`" if in_use(path) else "it is not held"
     return FAILED, f"{config.name}: not moved home, {why}; {held}\n", document
 
 
@@ -138,7 +152,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
             raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
         if arguments.confirm is not None:
             return str(arguments.confirm)
-        return input(f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]
@@ -147,7 +161,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
         lines.append(
             "  but these drives are emulated in this command and lose it now; over ident_wire they would keep it"
         )
-    lines.append(f"next: `ident watch {arguments.arm}` against the arm, then `ident preflight {arguments.arm}`")
+    lines.append("compare what `ident watch` shows with the arm, then make a new preflight")
     document = asdict(done) | {"faults": [fault.code for fault in done.faults]}
     return DONE, "\n".join([*lines, ""]), document
 
@@ -223,7 +237,7 @@ def _text(found: Recovery) -> str:
     lines += [f"  outside its position limits: {words}" for words in found.outside]
     if found.seen is not None:
         lines += ["", watch_text(found.seen).rstrip("\n")]
-    lines += ["", "next:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
+    lines += ["", "steps:", *(f"  {number}. {step}" for number, step in enumerate(found.steps, 1)), ""]
     return "\n".join(lines)
 
 
@@ -239,7 +253,11 @@ EXIT_CODES: Final = {
 def _add_reidentify(verbs: VerbList) -> None:
     """Register `reidentify`."""
     sub = verbs.add(
-        "reidentify", _reidentify, "preflight, run, identify, compare with the accepted set (exit code 3: changed)"
+        "reidentify",
+        _reidentify,
+        "identify again, and compare with the accepted set",
+        more="Preflight, run, identification, comparison in one (exit code 3: the arm has changed).",
+        examples=("planar2", "my_arm.yaml motion/motion.json --confirm my_arm"),
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
@@ -289,7 +307,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     }
     lines = f"{text}{verdict.words}\n"
     if verdict.state == "changed":
-        lines += "a drift alarm is open until `ident alarm acknowledge`, or `ident accept` of another set\n"
+        lines += "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
     return EXIT_CODES[verdict.state], lines, answer
 
 
@@ -299,6 +317,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
 
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
+    parsed.progress = getattr(arguments, "progress", None)
     parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
     tell(arguments, f"-- {words[0]}")
     try:

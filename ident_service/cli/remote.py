@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import VerbList, columns_files, count
+from ident_service.cli.arguments import LOCAL_ONLY, VerbList, columns_files, count
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -27,6 +27,7 @@ from ident_service.cli.output import (
     tell,
     with_answer_lines,
 )
+from ident_service.cli.progress import ask, step_of
 from ident_service.cli.remote_recordings import file_of, recording, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.errors import AccessRefused, ArmError, IdentError, UnknownId, UsageError
@@ -39,6 +40,7 @@ Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
+_JOB = "20261124T101500Z-planar2-7b2f10"  # of the examples
 _MOVE = (
     "check",
     "run",
@@ -49,16 +51,25 @@ _MOVE = (
 
 
 def add(verbs: VerbList) -> None:
-    """Register `jobs list`, `jobs show`, `jobs watch` and `jobs cancel`."""
-    jobs = verbs.group("jobs", "jobs of a daemon; without --server, of the one that serves the state folder")
-    sub = jobs.add("list", _with_client(_list), "list jobs, the newest first")
+    """Register `jobs`, `jobs show`, `jobs watch` and `jobs cancel`."""
+    listed = _with_client(_list)
+    jobs = verbs.group(
+        "jobs",
+        "list a daemon's jobs; show, watch, cancel one",
+        listed,
+        more="Without --server, of the daemon that serves the state folder; the newest first.",
+        examples=("", "--most 50", "--server http://127.0.0.1:8470"),
+    )
+    jobs.parser.add_argument("--most", type=count, default=20, metavar="N", help="of the newest (default: 20)")
+    sub = jobs.add("list", listed, "list jobs, the newest first", hidden=True, word="jobs")
     sub.add_argument("--most", type=count, default=20, metavar="N")
-    for name, verb, text in (
-        ("show", _show, "show one job and its result"),
-        ("watch", _watch, "wait for a job to end and return its exit code"),
-        ("cancel", _cancel, "cancel a job; a motion ends with a controlled stop"),
+    for name, verb, text, more in (
+        ("show", _show, "show one job and its result", ""),
+        ("watch", _watch, "wait for a job to end", "Returns its exit code."),
+        ("cancel", _cancel, "cancel a job", "A motion ends with a controlled stop."),
     ):
-        sub = jobs.add(name, _with_client(verb), text)
+        examples = (_JOB, f"{_JOB} --server http://robot:8470")
+        sub = jobs.add(name, _with_client(verb), text, more=more, examples=examples)
         sub.add_argument("job", metavar="ID")
 
 
@@ -83,9 +94,9 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
 
 def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
     """Return the verbs that a daemon can do, and for each the arguments that are sent to it."""
-    from ident_service.cli import remote_maintenance, remote_results, remote_watching
+    from ident_service.cli import remote_results, remote_watching
 
-    groups = (remote_maintenance, remote_results, remote_watching)
+    groups = (remote_results, remote_watching)
     verbs, carried = dict(REMOTE), dict(_CARRIED)
     for group in groups:
         verbs |= group.VERBS
@@ -97,7 +108,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
     """Return the verb as a function that opens and closes its own connection."""
 
     def connected(arguments: argparse.Namespace) -> Answer:
-        with closing(_client(arguments)) as client:
+        with closing(connection(arguments)) as client:
             try:
                 return verb(client, arguments)
             except AccessRefused as error:
@@ -107,7 +118,7 @@ def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
                 given = "$IDENT_TOKEN" if os.environ.get("IDENT_TOKEN") else str(state_folder(arguments) / "token")
                 raise AccessRefused(
                     f"{client.url}: the token from {given} does not count there: it was revoked, or is of another"
-                    " daemon; `ident token add NAME --role operator` makes one at the daemon's machine, and"
+                    " daemon; `ident tokens add NAME --role operator` makes one at the daemon's machine, and"
                     " IDENT_TOKEN=... gives it to this command"
                 ) from None
 
@@ -234,9 +245,11 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     except UnknownId:
         text = f"{arm}: the daemon has no arm of this name; `ident stop --server {client.url}` stops all\n"
         return USAGE, text, {"arms": [], "jobs": []}
-    names = ", ".join([*answer["arms"], *answer["jobs"]])
+    parts = [f"stop requested of {', '.join(answer['arms'])}"] if answer["arms"] else []
+    parts += [f"cancelled: {', '.join(f'job {job}' for job in answer['jobs'])}"] if answer["jobs"] else []
+    names = "; ".join(parts)
     nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
-    return DONE, f"stop requested of {names}\n" if names else f"{nobody}\n", answer
+    return DONE, f"{names or nobody}\n", answer
 
 
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -294,33 +307,17 @@ REMOTE: dict[str, Verb] = {
     **dict.fromkeys(("pause", "resume", "finish"), _ask),
     "supported": _supported,
     "acknowledge": _ack,
-    "jobs list": _list,
+    "jobs": _list,
     "jobs show": _show,
     "jobs watch": _watch,
     "jobs cancel": _cancel,
 }
 
 
-LOCAL_ONLY: dict[str, str] = {
-    "serve": "it is the daemon",
-    "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
-    "fleet status": "its store is in the daemon's state folder; log in where the daemon runs",
-    "emulate": "it is drives on a bus of this machine, until they are switched off",
-    "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
-    "new": "it writes files beside yours; `ident config check --server` sends what it wrote",
-    "import": "a run with its recordings is larger than a request may be; copy its folder to the daemon's machine",
-    **dict.fromkeys(
-        ("bus import", "bus store", "bus restore"), "it changes what drives keep; it is an act at the arm's computer"
-    ),
-    "bus report": "it writes a file beside you; log in where the daemon runs",
-    **dict.fromkeys(("backup", "restore"), "it is done at the daemon's machine, in its state folder"),
-    "token add": "whoever got hold of an operator's token could make others that outlive it; "
-    "it is done at the daemon's machine, in its state folder",
-}
-"""Verbs that no daemon does, each with the reason."""
-
 # Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
-_OURS = frozenset({"json", "state", "server", "verb", "word", "words", "asks", "asked_ns"})
+_OURS = frozenset(
+    {"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind", "progress"}
+)
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {
     "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
@@ -332,7 +329,7 @@ _CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
     "supported": frozenset({"arm", "confirm"}),
     "acknowledge": frozenset({"arm", "fault"}),
-    "jobs list": frozenset({"most"}),
+    "jobs": frozenset({"most"}),
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
 }
 
@@ -356,8 +353,10 @@ def _wait_for_job(
             if job["held"] and not held:
                 for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
                     tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
+            known = job["progress"] or {}
             state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
-            said = (job["progress"] or {}).get("phase", state)
+            said = known.get("phase", state)
+            step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
             if said != phase:
                 phase = said
                 tell(arguments, phase)
@@ -394,7 +393,8 @@ def typed(arguments: argparse.Namespace) -> str:
     if name is None and sys.stdin.isatty() and not arguments.json:
         what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
         what = "is lowered" if getattr(arguments, "word", "") == "supported" else what
-        name = input(f"{arguments.arm} {what} where you may not see it. Type its name to confirm: ").strip()
+        question = f"{arguments.arm} {what} where you may not see it. Type its name to confirm: "
+        name = ask(arguments, question).strip()
     if name != arguments.arm:
         raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
     return str(name)
@@ -418,7 +418,12 @@ def motion_id(client: IdentClient, arm: str, motion: Path | None) -> str | None:
     return str(motion)
 
 
-def _client(arguments: argparse.Namespace) -> IdentClient:
+def connection(arguments: argparse.Namespace) -> IdentClient:
+    """Connect to the daemon that `--server` names, or to that which serves the state folder.
+
+    Raises:
+        UsageError: there is none, or no token for it.
+    """
     from ident_service.client import IdentClient
     from ident_service.registry.state_folder import access_refusal
     from ident_service.registry.tokens import TOKEN_FILE, read_token

@@ -122,7 +122,7 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read as text: {error}") from None
     found = client.post(f"{_API}/descriptions/check", {"description": text, "files": named_files(path)})
-    return VERDICT_NO if found["stable"] is False else DONE, found["text"], found
+    return DONE if found["good"] else VERDICT_NO, found["text"], found
 
 
 def _run(client: IdentClient, arguments: argparse.Namespace) -> Answer:

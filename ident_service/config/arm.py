@@ -43,18 +43,22 @@ from ident_service.config.quantities import (
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
 
+BUILT_IN_KINDS = ("simulated", "canopen", "barrett")
+
 
 class PluginDriver(Section):
     """Driver that another distribution provides; it checks its own options."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
 
-    kind: str
+    # Built-in kinds are described by their own sections.
+    kind: Annotated[str, Field(json_schema_extra={"not": {"enum": list(BUILT_IN_KINDS)}})]
+    """Name under which another distribution registers its driver; the keys beside it are that driver's."""
 
 
 def _driver_kind(value: Any) -> str:
     kind = value.get("kind") if isinstance(value, dict) else getattr(value, "kind", None)
-    return kind if kind in ("simulated", "canopen", "barrett") else "plugin"
+    return kind if kind in BUILT_IN_KINDS else "plugin"
 
 
 # Chosen by `kind`, so that a mistake in a built-in driver's section is not taken for a plug-in's options.
@@ -81,7 +85,9 @@ class Box(Section):
     """An axis-aligned box in a link frame [m] (table 7)."""
 
     lower: Vector3
+    """Lowest corner [m]."""
     upper: Vector3
+    """Highest corner [m]."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Box:
@@ -94,14 +100,14 @@ class Box(Section):
 
 
 class Ellipsoid(Section):
-    """Ellipsoid in a link frame that contains all mass of the link: centre and half-axes [m].
-
-    The rows of `axes` are unit vectors along the half-axes; those of the frame when left out.
-    """
+    """Ellipsoid in a link frame that contains all mass of the link."""
 
     center: Vector3
+    """Centre in the link's frame [m]."""
     semi_axes: tuple[Positive, Positive, Positive]
+    """Half-axes [m]."""
     axes: tuple[Vector3, Vector3, Vector3] | None = None
+    """Unit vectors along the half-axes [1]; those of the link's frame when left out."""
 
     @model_validator(mode="after")
     def _orthonormal(self) -> Ellipsoid:
@@ -113,41 +119,50 @@ class Ellipsoid(Section):
 
 
 class Body(Section):
-    """Prior knowledge about the link that a joint moves (eqs. 25, 26).
-
-    Its mass, a box and a convex hull of points that its centre of mass lies in, an ellipsoid that all its mass lies in,
-    and the coordinate planes of its frame that it is symmetric about.
-    """
+    """Prior knowledge about the link that a joint moves (eqs. 25, 26)."""
 
     mass: Interval | None = None
+    """Lowest and highest mass of the link [kg] (eq. 25)."""
     center_of_mass: Box | None = None
+    """Box that the centre of mass lies in (eq. 26)."""
     hull: Annotated[tuple[Vector3, ...], Field(min_length=4)] | None = None
+    """Points whose convex hull contains the centre of mass [m], at least four."""
     ellipsoid: Ellipsoid | None = None
+    """Ellipsoid that contains all mass of the link."""
     symmetry: tuple[Literal["xy", "yz", "xz"], ...] = ()
+    """Coordinate planes of the link's frame that its mass is symmetric about."""
 
 
 class Joint(ExtendedSection):
-    """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified.
-
-    `drive_inertia` [kg m^2 or kg] is what its rotors have at the joint by data sheet, the least that is there.
-    Margins of the gains are stated with it where the prior, a CAD model of the links, lacks it. `brake` says whether a
-    holding brake closes whenever the power stage is off. Where nothing is said, a simulated drive has one and a real
-    one has none.
-    """
+    """Limits, gains and body of one joint; what a motion needs may be left out of an arm that is only identified."""
 
     position: Interval | None = None
+    """Lowest and highest position [rad or m]; angles may be written `-pi/2` or `'90 deg'`."""
     velocity: Positive | None = None
+    """Largest speed [rad/s or m/s]."""
     acceleration: Positive | None = None
+    """Largest acceleration [rad/s^2 or m/s^2]."""
     jerk: Positive | None = None
+    """Largest jerk [rad/s^3 or m/s^3]."""
     torque: Positive | None = None
+    """Largest torque or force at the joint [N m or N]."""
     following_error: Positive | None = None
+    """Distance from the reference at which a motion is stopped [rad or m]."""
     home: Angle | None = None
+    """Posture in which motions begin and end [rad or m]; zero, or the limit nearest to it, when left out."""
     kp: Positive | None = None
+    """Position gain: acceleration per position error [1/s^2] (table 4)."""
     kd: Positive | None = None
+    """Velocity gain: acceleration per speed error [1/s] (table 4)."""
     drive_inertia: NonNegative | None = None
+    """Inertia of the joint's rotors at the joint by data sheet, the least that is there [kg m^2 or kg]. Margins of the
+    gains are stated with it where the prior, a CAD model of the links, lacks it."""
     brake: bool | None = None
+    """A holding brake closes whenever the power stage is off. Where nothing is said, a simulated drive has one and a
+    real one has none."""
     later = frozenset({"brake"})
     body: Body = Body()
+    """Knowledge about the link that the joint moves."""
 
     @model_validator(mode="after")
     def _home_inside(self) -> Joint:
@@ -164,21 +179,23 @@ class Mass(Section):
     """Bounds of the whole arm's mass [kg]; the moving links only."""
 
     lower: NonNegative = 0.0
+    """Lowest mass [kg]."""
     upper: Positive | None = None
+    """Highest mass [kg]; no bound when left out."""
 
 
 class Constraints(ExtendedSection):
-    """Physical knowledge about the whole arm (eqs. 25, 28).
-
-    `torque_constant` bounds, per joint, what its measured torque must be multiplied by to be true; 1 elsewhere.
-    `custom` names a Python function, `module:function`, that returns further constraints in cvxpy (docs/extending.md);
-    the module stands beside the description or on PYTHONPATH. A description that is sent to a daemon must not name one.
-    """
+    """Physical knowledge about the whole arm (eqs. 25, 28)."""
 
     total_mass: Mass = Mass()
+    """Bounds of the mass of all moving links together."""
     positive: tuple[Literal["drive_inertia", "viscous", "coulomb"], ...] = ("drive_inertia", "viscous", "coulomb")
+    """Parameters of the joints that are not negative."""
     torque_constant: dict[str, tuple[Positive, Positive]] = Field(default_factory=dict)
+    """By joint, bounds of the factor that makes its measured torque true [1]; 1 for joints that are not named."""
     custom: Annotated[str, Field(pattern=_FUNCTION)] | None = None
+    """Python function, `module:function`, that returns further constraints in cvxpy (docs/extending.md). The module
+    stands beside the description or on PYTHONPATH; a description that is sent to a daemon must not name one."""
     later = frozenset({"custom"})
 
     @field_validator("custom")
@@ -201,22 +218,24 @@ class Constraints(ExtendedSection):
 
 
 class Smoothing(Section):
-    """Zero-phase low-pass and derivatives (5.2.2).
-
-    `butterworth` of `order`, or `savitzky_golay` polynomials of that degree over a window of about the same cut-off
-    [Hz], chosen from the spectra of the positions by default. `filter_torque` sends the torque through the Butterworth
-    filter too. `regressor_cutoff` [Hz] filters both sides of eq. 59 alike, the torque then no second time. `decimate`
-    keeps every so many-th sample, after all filters; chosen, ten a period of the cut-off are left. `velocity` is the
-    recording's own, or of the positions; by default the recording's where it has one that predicts better.
-    """
+    """Zero-phase low-pass and derivatives (5.2.2)."""
 
     method: Literal["butterworth", "savitzky_golay"] = "butterworth"
+    """`butterworth` of `order`, or `savitzky_golay` polynomials of that degree over a window of about the same cut-off.
+    """
     order: Annotated[Count, Field(le=8)] = 3
+    """Order of the low-pass, or degree of the polynomials [1]."""
     cutoff: Positive | Literal["choose"] = "choose"
+    """Cut-off frequency [Hz]; `choose`: from the spectra of the positions."""
     filter_torque: bool = True
+    """The torque goes through the Butterworth filter, too."""
     regressor_cutoff: Positive | None = None
+    """Cut-off of a filter for both sides of eq. 59 alike [Hz]; the torque is then filtered no second time."""
     decimate: Count | Literal["choose"] = "choose"
+    """Every so many-th sample is kept after all filters [1]; `choose`: ten in a period of the cut-off."""
     velocity: Literal["position", "measured", "choose"] = "choose"
+    """The recording's own velocity, or that of the positions; `choose`: the recording's where it has one that predicts
+    better."""
 
     @model_validator(mode="before")
     @classmethod
@@ -227,59 +246,68 @@ class Smoothing(Section):
 
 
 class Reversal(Section):
-    """Rows of a joint near standstill: slower than `speed` [rad/s or m/s], or within `window` [s] of a reversal.
+    """Rows of a joint near standstill.
 
     Their friction is known less well than that of a joint in motion, and they count as their residuals allow.
     """
 
     speed: NonNegative = 0.05
+    """Speed below which a joint counts as standing [rad/s or m/s]."""
     window: NonNegative = 0.2
+    """Time before and after a reversal that counts likewise [s]."""
 
 
 class FrictionShape(Section):
-    """Nonlinear friction parameters, per joint or one number for all, given or fitted (`fit`).
-
-    `presliding` is the way [rad or m] over which friction turns round with the velocity (Dahl 1968), 0 for at once;
-    `stribeck_velocity` [rad/s or m/s] is v_s of the term `stribeck`.
-    """
+    """Nonlinear friction parameters, per joint or one number for all, given or fitted."""
 
     presliding: NonNegative | tuple[NonNegative, ...] | Literal["fit"] = "fit"
+    """Distance over which friction turns round with the velocity (Dahl 1968) [rad or m], one or per joint; 0 for at
+    once, `fit` for fitted."""
     stribeck_velocity: Positive | tuple[Positive, ...] | Literal["fit"] = "fit"
+    """v_s of the term `stribeck` [rad/s or m/s], one or per joint; `fit` for fitted."""
 
 
 class PriorRegularisation(Section):
-    """Regularisation of constrained estimates towards the prior (CAD) parameters: divergence and weight.
-
-    `weight` is that of one unit of divergence against one residual variance, or `held_out`: the one that explains best
-    the last third of the recordings, fitted to the rest.
-    """
+    """Regularisation of constrained estimates towards the prior (CAD) parameters: divergence and weight."""
 
     kind: Literal["none", "euclidean", "entropic"] = "none"
+    """Divergence from the prior that is penalised."""
     weight: NonNegative | Literal["held_out"] = "held_out"
+    """Weight of one unit of divergence against one residual variance [1]; `held_out`: the one that explains best the
+    last third of the recordings, fitted to the rest."""
 
 
 class Identification(ExtendedSection):
-    """Settings that turn a recording into equations, and equations into an estimate.
-
-    `method` is the estimator, by default the one of `wls` and `huber` that predicts held-out parts of the recordings
-    better; `edge` [s] is left out at both ends of every recording, two periods of the cut-off by default; `block` [s]
-    is the block length of the uncertainty estimate; `delay` [s] is the delay of torque stamps against position stamps,
-    by default none, or one of a few samples where that predicts held-out parts clearly better; `period` [s] averages a
-    periodic motion over its periods, without the filters of the torque. `torque` is what drives measured or what they
-    were told; left out, what they measured where a recording has it in every sample.
-    """
+    """Settings that turn a recording into equations, and equations into an estimate."""
 
     method: Method | Literal["choose"] = "choose"
+    """Estimator: ordinary, weighted or robust least squares, or instrumental variables; `choose`: the one of `wls` and
+    `huber` that predicts held-out parts of the recordings better."""
     smoothing: Smoothing = Smoothing()
+    """Low-pass and derivatives."""
     reversal: Reversal = Reversal()
+    """Weight of rows near a standstill."""
     friction: FrictionShape = FrictionShape()
+    """Nonlinear friction parameters."""
     prior: PriorRegularisation = PriorRegularisation()
+    """Regularisation towards the prior."""
     edge: NonNegative | Literal["choose"] = "choose"
+    """Time that is left out at both ends of every recording [s]; `choose`: two periods of the cut-off."""
     block: Positive = 1.0
+    """Block length of the uncertainty estimate [s]."""
     delay: Number | Literal["estimate", "choose"] = "choose"
+    """Delay of torque stamps against position stamps [s]; `estimate`: estimated; `choose`: none, or one of a few
+    samples where that predicts held-out parts clearly better."""
     period: Positive | None = None
+    """Period over which a periodic motion is averaged [s], instead of filters of the torque; no averaging when left
+    out."""
     torque: Literal["measured", "commanded"] | None = None
-    later = frozenset({"torque"})
+    """Torque that drives measured, or were told; left out, what they measured where a recording has it in every sample.
+    """
+    torque_factors: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None
+    """Factors that recorded torques of the motors are multiplied by [1], one a motor in the order of the transmission:
+    for recordings that were made with torque constants which have turned out to be wrong; all 1 when left out."""
+    later = frozenset({"torque", "torque_factors"})
 
     @model_validator(mode="after")
     def _averaged_instead(self) -> Identification:
@@ -298,11 +326,14 @@ class Identification(ExtendedSection):
 
 
 class FourierJoint(Section):
-    """Coefficients of one joint (table 5): a, b [rad/s], q0 [rad]."""
+    """Coefficients of one joint (table 5)."""
 
     a: Annotated[tuple[Number, ...], Field(min_length=1)]
+    """Sine coefficients [rad/s or m/s]."""
     b: Annotated[tuple[Number, ...], Field(min_length=1)]
+    """Cosine coefficients [rad/s or m/s]."""
     q0: Number
+    """Middle of the motion [rad or m]."""
 
     @model_validator(mode="after")
     def _same_length(self) -> FourierJoint:
@@ -312,13 +343,18 @@ class FourierJoint(Section):
 
 
 class FourierMotion(Section):
-    """Finite Fourier series (eq. 78) with `base_frequency` [Hz] that fades in and out over `ramp` [s]."""
+    """Finite Fourier series (eq. 78) that fades in and out."""
 
     kind: Literal["fourier"]
+    """Fourier series with given coefficients."""
     base_frequency: Positive
+    """Frequency of the first harmonic [Hz]."""
     periods: Count = 3
+    """Number of periods [1]."""
     ramp: NonNegative = 0.0
+    """Time to swell from rest, and to die down [s]."""
     joints: dict[str, FourierJoint]
+    """Coefficients of every joint, in the order of the arm."""
 
     @model_validator(mode="after")
     def _same_harmonics(self) -> FourierMotion:
@@ -328,20 +364,25 @@ class FourierMotion(Section):
 
 
 class SeededMotion(ExtendedSection):
-    """Random Fourier motion, the same for the same seed, scaled into the arm's limits with a margin.
-
-    It is about the middle of the position limits, or about home. About home the torque, of which gravity takes its part
-    whatever `use` is, may take 70 % of its limit.
-    """
+    """Random Fourier motion, the same for the same seed, scaled into the arm's limits with a margin."""
 
     kind: Literal["seeded"]
+    """Random Fourier motion, the same for the same seed."""
     seed: Seed
+    """Seed of the random numbers [1]."""
     base_frequency: Positive = 0.05
+    """Frequency of the first harmonic [Hz]."""
     harmonics: Annotated[Count, Field(le=50)] = 5
+    """Number of harmonics [1]."""
     periods: Count = 3
+    """Number of periods [1]."""
     ramp: NonNegative = 0.0
+    """Time to swell from rest, and to die down [s]."""
     use: Annotated[float, Field(gt=0, le=1)] = 0.7
+    """Share of the limits that the motion uses [1]."""
     about: Literal["middle", "home"] = "middle"
+    """Centre of the motion: the middle of the position limits, or home. About home the torque, of which gravity takes
+    its part whatever `use` is, may take 70 % of its limit."""
     later = frozenset({"about"})
 
 
@@ -352,7 +393,9 @@ class Motions(Section):
     """The motion to identify from and the one to validate on."""
 
     identification: Motion = SeededMotion(kind="seeded", seed=1)
+    """Motion to identify from."""
     validation: Motion = SeededMotion(kind="seeded", seed=2)
+    """Motion to validate on."""
 
 
 _MOTION_DEPENDS_ON = (
@@ -385,30 +428,58 @@ class ArmConfig(ExtendedSection):
     later = frozenset({"payload", "realtime"})
 
     format: Literal["ident-arm"]
+    """Kind of file."""
     version: Literal[1]
+    """Version of the format."""
     # As long as an address of the API, and a folder with a time before it, may be.
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    """Name of the arm: letters, digits and `_.-`, at most 64; registry, folders and files use it."""
     description: str = ""
+    """Words for people."""
     kinematics: Kinematics
+    """Mechanism: a DH table, or the part of a URDF or MJCF file that is the arm."""
     gravity: Vector3 = (0.0, 0.0, -9.81)
+    """Gravity in the frame of the base [m/s^2]."""
     terms: tuple[JointTerm, ...] = ("drive_inertia", "viscous", "coulomb", "offset")
+    """Parameters of every joint beside its link's."""
     joints: dict[str, Joint] = Field(default_factory=dict)
+    """Limits, gains and knowledge by joint name, in the order of the mechanism."""
     constraints: Constraints = Constraints()
+    """Physical knowledge about the whole arm."""
     prior: ParameterTable | None = None
+    """Known link parameters of the arm alone, such as those of CAD [SI]: `{m1: 2.0, ...}`, or a JSON file with `names`
+    and `values`. Those of a URDF or MJCF when left out."""
     payload: Payload | None = None
+    """Tool or load that is mounted."""
     feasible_set: FeasibleSetName = "pseudo_inertia"
+    """Bodies that identified links may be: with a density that is nowhere negative (`pseudo_inertia`), or with a
+    positive mass and inertia (`inertia`), which is weaker."""
     control: Control = Control()
+    """Control loop, and what follows a stop."""
     realtime: Realtime = Realtime()
+    """Scheduling of the motion process on this computer."""
     identification: Identification = Identification()
+    """Settings of the estimate."""
     recording: RecordingFormat = RecordingFormat()
+    """Format of recordings."""
     transmission: Transmission | None = None
+    """Gears and couplings between motors and joints."""
     geometry: Geometry = Field(default_factory=dict)
+    """Capsules of links, by joint name or `base`, in the links' frames; they replace the geometry of a URDF."""
     workspace: Workspace = Workspace()
+    """Obstacles and allowed space."""
     supply: Supply | None = None
+    """Power supply of the drives."""
     design: Design = Design()
+    """Settings for `ident design`."""
     motions: Motions = Motions()
+    """Motions that are made without a motion file."""
     driver: Driver | None = None
+    """Access to the arm: `simulated`, `canopen`, `barrett`, or the name of another distribution's driver. Left out for
+    an arm that is identified from recordings only."""
     unattended_motion: Literal["refused", "allowed"] = "refused"
+    """Whether a scheduled re-identification may move the arm with nobody there. `allowed` is for the simulator, and for
+    a cell whose fence and interlock take the drives' power away as soon as a person can reach in."""
 
     @property
     def can_buses(self) -> tuple[CanBus, ...]:
@@ -425,6 +496,11 @@ class ArmConfig(ExtendedSection):
         if isinstance(self.driver, BarrettDriver):
             return tuple(puck.max_torque * puck.torque_scale for puck in self.driver.pucks)
         return None
+
+    @property
+    def point_speed_limit(self) -> float | None:
+        """Return the speed of elbow and tip at which the arm's own safety system stops it [m/s]; None without one."""
+        return self.driver.limits.velocity if isinstance(self.driver, BarrettDriver) else None
 
     @property
     def watchdog(self) -> float | None:

@@ -12,17 +12,19 @@ _KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
 
 
 class CanBus(Section):
-    """One CAN bus, and the interface that gives access to it.
-
-    `interface` is python-can's name of an interface, or `raw` for a CAN socket of the kernel without python-can, or
-    `lock_step` for emulated drives in this process and in virtual time. `options` go to python-can as they are.
-    """
+    """One CAN bus, and the interface that gives access to it."""
 
     interface: Annotated[str, Field(min_length=1)] = "socketcan"
+    """python-can's name of an interface; `raw` for a CAN socket of the kernel without python-can; `lock_step` for
+    emulated drives in this process and in virtual time."""
     channel: str = "can0"
+    """Name of the bus at that interface."""
     bitrate: Annotated[Count, Field(le=1_000_000)] = 1_000_000
+    """Bit rate [bit/s]."""
     data_bitrate: Count | None = None
+    """Bit rate of the data of CAN FD frames [bit/s]; classic CAN when left out."""
     options: dict[str, str | int | float | bool] = Field(default_factory=dict)
+    """Further options of python-can's interface."""
 
     @property
     def medium(self) -> str:

@@ -40,12 +40,16 @@ _MAKERS = range(0x2000, 0x6000)  # indices that CiA 301 leaves to makers of driv
 
 
 class WatchdogEntry(Section):
-    """Maker-specific entry of type `type` that sets a drive's watchdog; it is written and read back."""
+    """Maker-specific entry that sets a drive's watchdog; it is written and read back."""
 
     index: Annotated[int, Field(strict=True, ge=_MAKERS.start, lt=_MAKERS.stop)]
+    """Index of the object [1], as hexadecimal in the manual."""
     sub: Annotated[int, Field(strict=True, ge=0, le=0xFF)] = 0
+    """Sub-index [1]."""
     type: Literal["i8", "u8", "i16", "u16", "i32", "u32"]
+    """Type of the object."""
     value: Annotated[int, Field(strict=True)]
+    """Value that is written and read back [1]."""
 
     @model_validator(mode="after")
     def _fits(self) -> WatchdogEntry:
@@ -57,16 +61,18 @@ class WatchdogEntry(Section):
 
 
 class Heartbeats(ExtendedSection):
-    """Heartbeats of host and drives: periods and timeouts [s] (1017h, 1016h).
-
-    Drives whose watchdog it is wait for the host's for `host_timeout`, which is `timeout` where it is left out.
-    """
+    """Heartbeats of host and drives (1017h, 1016h)."""
 
     node: NodeId = 127
+    """Node number of the host [1]."""
     period: Seconds = 0.1
+    """Period of the host's heartbeat [s]."""
     drives: Seconds = 0.1
+    """Period of the drives' heartbeats (1017h) [s]."""
     timeout: Seconds = 0.3
+    """Time without a drive's heartbeat after which it counts as gone [s]."""
     host_timeout: Seconds | None = None
+    """Time that drives whose watchdog it is wait for the host's (1016h) [s]; `timeout` when left out."""
     later = frozenset({"host_timeout"})
 
     @property
@@ -84,10 +90,12 @@ class Heartbeats(ExtendedSection):
 
 
 class NodeGuarding(Section):
-    """Timing of `watchdog: node_guarding`: every `period` [s] (100Ch), of which `factor` may be missed (100Dh)."""
+    """Timing of `watchdog: node_guarding`."""
 
     period: Seconds = 0.02
+    """Guard time (100Ch) [s]."""
     factor: Annotated[int, Field(strict=True, ge=2, le=255)] = 3
+    """Guard times that may be missed (100Dh) [1]."""
 
 
 InhibitTime = Annotated[float, Field(strict=True, ge=0.0001, le=6.5)]  # 100 us of 16 bits
@@ -104,45 +112,52 @@ class DriveIdentity(Section):
     """Expected identity of a drive (object 1018h); fields left out are logged but not compared."""
 
     vendor: Unsigned32 | None = None
+    """Vendor identity (1018h:01) [1]."""
     product: Unsigned32 | None = None
+    """Product code (1018h:02) [1]."""
     revision: Unsigned32 | None = None
+    """Revision (1018h:03) [1]."""
     serial: Unsigned32 | None = None
+    """Serial number (1018h:04) [1]."""
 
 
 class CanopenDrive(ExtendedSection):
-    """One drive and its motor.
-
-    `counts` are those of a motor turn (6064h); `rated_torque` [N m] at the motor is what 6076h is set to, or must be
-    where the drive does not let it be set; a torque is sent in thousandths of it. `torque_scale` is how much torque
-    the motor really gives for one that was asked for. `max_torque` [N m] and `max_speed` [turns per minute] of the
-    motor are set as 6072h and 6080h. `notices` are the emergency codes by which this drive, as its manual says, only
-    informs: they are reported and recorded, and stop nothing.
-
-    `watchdog` says what makes this drive stop by itself when the host is gone: torque frames that stay away
-    (`rpdo_timer`, 1400h:05), the host's heartbeat (1016h), SYNC, node guarding (100Ch, 100Dh), or something of its
-    maker's that watches torque frames. For `sync_loss` and `vendor`, `watchdog_time` [s] is when, by the maker, and
-    `watchdog_entry` what sets it. `quick_stop_deceleration` is what 6085h is set to, in the drive's unit; left
-    out, it stops the joints at their acceleration limits, in counts per square second.
-
-    `eds` is this drive's own, where it is another type than the others. `torque_constant` [N m/A] is for drives whose
-    thousandths are of a current.
-    """
+    """One drive and its motor."""
 
     node: NodeId
+    """Node number [1]."""
     bus: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Number of its bus in `buses`, from 0 [1]."""
     identity: DriveIdentity = DriveIdentity()
+    """Expected identity; keys that are left out are logged but not compared."""
     counts: Count = 4096
+    """Counts of a motor turn (6064h) [1]."""
     rated_torque: Positive
+    """Torque at the motor that 6076h is set to, or must be where the drive does not let it be set [N m]; torques are
+    sent in thousandths of it."""
     torque_scale: Positive = 1.0
+    """Torque that the motor really gives per torque that was asked for [1]."""
     max_torque: Positive
+    """Largest torque of the motor (6072h) [N m]."""
     max_speed: Positive
+    """Largest speed of the motor (6080h) [turns/min]."""
     notices: tuple[EmergencyCode, ...] = ()
+    """Emergency codes by which this drive, as its manual says, only informs [1]: they are reported and recorded, and
+    stop nothing."""
     watchdog: WatchdogKind = "rpdo_timer"
+    """Signal of the host whose loss makes the drive stop by itself: torque frames (`rpdo_timer`, 1400h:05), heartbeat
+    (1016h), SYNC, node guarding, or something of its maker's that watches torque frames."""
     watchdog_time: Seconds | None = None
+    """Time after which a watchdog `sync_loss` or `vendor` trips, by the maker [s]."""
     watchdog_entry: WatchdogEntry | None = None
+    """Maker's object that sets the watchdog `vendor`."""
     quick_stop_deceleration: Annotated[Unsigned32, Field(ge=1)] | None = None
+    """Value of 6085h [drive's unit]; left out, it stops the joints at their acceleration limits, in counts per square
+    second."""
     eds: AnyTextBeside | None = None
+    """Data sheet of this drive, where it is another type than the others; a file beside the description."""
     torque_constant: Positive | None = None
+    """Torque per current of the motor [N m/A], for drives whose thousandths are of a current."""
     later = frozenset(
         {"watchdog", "watchdog_time", "watchdog_entry", "quick_stop_deceleration", "eds", "torque_constant"}
     )
@@ -181,79 +196,92 @@ class CanopenDrive(ExtendedSection):
 
 
 class Reactions(Section):
-    """Reactions of a drive to faults and stops: option codes of CiA 402, as its manual numbers them.
-
-    Left out, `quick_stop` is 2, or 6 for an arm whose `control.after_stop` is `hold` or `lower`: it has no brakes, and
-    stays in quick stop, where the drive goes on holding the motor.
-    """
+    """Reactions of a drive to faults and stops: option codes of CiA 402, as its manual numbers them."""
 
     quick_stop: Annotated[int, Field(strict=True)] | None = (
         None  # 605Ah: 2 and 6 ramp, then switch-on disabled, or stay
     )
+    """Reaction to quick stop (605Ah) [1]: 2 and 6 ramp, then switch on disabled, or stay. Left out it is 2, or 6 for an
+    arm without brakes (`control.after_stop` is `hold` or `lower`), which the drive goes on holding."""
     fault: Annotated[int, Field(strict=True)] = 2  # 605Eh: quick-stop ramp
+    """Reaction to a fault (605Eh) [1]: 2 is the quick-stop ramp."""
     abort_connection: Annotated[int, Field(strict=True)] = 3  # 6007h: quick stop
+    """Reaction to the loss of the host (6007h) [1]: 3 is quick stop."""
 
 
 class StatusReports(Section):
-    """Timing [s] of status word and torque (TPDO2): on change, not within `inhibit`, and every `period`."""
+    """Timing of status word and torque (TPDO2), sent on change."""
 
     period: Seconds = 0.1
+    """Longest time between two reports (TPDO2) [s]."""
     inhibit: InhibitTime = 0.05
+    """Shortest time between two reports [s]."""
 
 
 class Emulation(ExtendedSection):
-    """Simulated arm behind emulated drives, with true parameters, noise and faults, as `SimulatedDriver` has.
-
-    A drive whose power stage is off leaves its motor coasting, or braked where `windings_off` is `shorted`. `eds` are
-    data sheets of makers: the drives are emulated by them, one after the other and then from the first again.
-    """
+    """Simulated arm behind emulated drives, with true parameters, noise and faults, as `SimulatedDriver` has."""
 
     seed: Seed = 0
+    """Seed of the random numbers [1]."""
     truth: ParameterTable | None = None
+    """True parameters [SI]; the prior's when left out."""
     torque_noise: PerJoint = 0.0
+    """Standard deviation of the torque in each cycle [N m or N], one or per joint."""
     braking: PerJoint | None = None
+    """Damping of drives that are off [N m s/rad or N s/m], one or per joint."""
     windings_off: WindingsOff = "open"
+    """Windings of a drive whose power stage is off: `open` coasts, `shorted` brakes."""
     eds: tuple[AnyTextBeside, ...] = ()
+    """Data sheets of makers by which the drives are emulated, one after the other and then from the first again."""
     later = frozenset({"windings_off", "eds"})
     faults: tuple[SimulatedFault, ...] = ()
+    """Faults to inject."""
 
 
 class CanopenDriver(ExtendedSection):
-    """CANopen drives in cyclic synchronous torque mode.
-
-    `torque_frames` says whether up to four drives share a frame, by dummy mapping, or each has its own.
-    `torque_deadline` [s] without torque frames makes a drive stop by itself (1400h:05). After `lost_cycles` in a row
-    without its position a joint counts as gone: 3 to 5 (FIELDBUS.md), or what takes 10 ms, as long as a stall may last.
-    `bring_up` [s] is how long all drives together may take for one step to `operation enabled`. `zero` says whether
-    encoders know where they stand (`absolute`), or count from where they were when power came; then a person leads
-    the arm to the joints' `home` and says so, `ident set-home ARM`, after every loss of power. `measured_torque`
-    says whether drives report the torque that they measure (6077h): with their positions, in every cycle
-    (`cyclic`), with their status (`status`), or not at all; left out, with their status where the EDS has the
-    object. `watchdog_reason` says why drives of an arm that can fall may take longer than 0.1 s to notice that the
-    host is gone. `profiles` are files of families of drives, which count before the shipped ones. `streams` says
-    what the host sends in every cycle: the torque of each drive, or its position (cyclic synchronous position), where
-    the drives close the position loop by themselves and tell the torque that they measure.
-    """
+    """CANopen drives in cyclic synchronous torque mode, or position mode."""
 
     kind: Literal["canopen"]
+    """CANopen drives (CiA 402)."""
     eds: AnyTextBeside
+    """Electronic data sheet of the drives, their maker's; a file beside the description."""
     buses: Annotated[tuple[CanBus, ...], Field(min_length=1, max_length=4)] = (CanBus(),)
+    """CAN buses, at most four."""
     drives: Annotated[tuple[CanopenDrive, ...], Field(min_length=1)]
+    """Drives, in the order of `transmission.ratios`."""
     torque_frames: Literal["shared", "single"] = "shared"
+    """Up to four drives share a torque frame, by dummy mapping, or each has its own."""
     torque_deadline: Seconds = 0.01
+    """Time without torque frames after which a drive stops by itself (1400h:05) [s]."""
     lost_cycles: Annotated[int, Field(ge=3, le=20)] = 3
+    """Cycles in a row without its position after which a joint counts as gone [1]: 3 to 5, or what takes 10 ms, as long
+    as a stall may last."""
     bring_up: Positive = 0.5
+    """Time that all drives together may take for one step to `operation enabled` [s]."""
     zero: Literal["absolute", "at_home"] = "absolute"
+    """Encoders know where they stand (`absolute`), or count from where they were when power came. Then a person leads
+    the arm to the joints' `home` and says so, `ident set-home ARM`, after every loss of power."""
     measured_torque: Literal["cyclic", "status", "none"] | None = None
+    """Drives report the torque that they measure (6077h) with their positions in every cycle, with their status, or not
+    at all; left out, with their status where the EDS has the object."""
     watchdog_reason: Annotated[str, Field(max_length=200)] = ""
+    """Reason why drives of an arm that can fall may take longer than 0.1 s to notice that the host is gone."""
     guarding: NodeGuarding = NodeGuarding()
+    """Timing of `watchdog: node_guarding`."""
     profiles: tuple[TextBeside, ...] = ()
+    """Files of families of drives, which count before the shipped ones."""
     streams: Literal["torque", "position"] = "torque"
+    """Torque of each drive in every cycle, or its position (cyclic synchronous position): then the drives close the
+    position loop, and tell the torque that they measure."""
     later = frozenset({"measured_torque", "watchdog_reason", "guarding", "profiles", "streams"})
     heartbeats: Heartbeats = Heartbeats()
+    """Heartbeats of host and drives."""
     reactions: Reactions = Reactions()
+    """Reactions of drives to faults and stops."""
     status: StatusReports = StatusReports()
+    """Timing of status reports."""
     emulation: Emulation = Emulation()
+    """Simulated arm behind emulated drives."""
 
     @property
     def watchdog(self) -> float:

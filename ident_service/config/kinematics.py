@@ -45,13 +45,18 @@ def snap_angles(urdf: str) -> str:
 
 
 class DHRow(Section):
-    """One row of a Denavit-Hartenberg table (table 2); the joint variable adds to theta or, if prismatic, to d."""
+    """One row of a Denavit-Hartenberg table (table 2)."""
 
     type: Literal["revolute", "prismatic"] = "revolute"
+    """Kind of joint; its variable adds to `theta`, or to `d` if prismatic."""
     theta: Angle = 0.0
+    """Angle about the old z axis [rad]."""
     d: Number = 0.0
+    """Distance along the old z axis [m]."""
     a: Number = 0.0
+    """Length of the link along the x axis [m]."""
     alpha: Angle = 0.0
+    """Twist about the x axis [rad]."""
 
     @model_validator(mode="after")
     def _of_an_arm(self) -> DHRow:
@@ -67,27 +72,35 @@ class DHRow(Section):
 
 
 class DHTable(Section):
-    """A serial chain, standard (distal frames, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`) or modified (Craig) convention."""
+    """A serial chain."""
 
     convention: Literal["standard", "modified"]
+    """`standard` (distal frames, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`), or `modified` (Craig)."""
     joints: Annotated[dict[str, DHRow], Field(min_length=1)]
+    """Rows by joint name, from the base to the tip."""
 
 
 class Kinematics(Section):
     """Exactly one description of the mechanism, and which part of it is the arm.
 
-    Of a URDF or MJCF file, the arm is what moves between the links `base` and `tip`, its world the frame of `base`. The
-    joints of `lock` are held at a position [rad or m], all others outside at zero; what hangs on them is part of the
-    link before them. With `snap`, angles in `rpy` within 0.002 rad of a multiple of 15 degrees are that multiple.
+    Of a URDF or MJCF file, the arm is what moves between the links `base` and `tip`; what hangs on joints that are held
+    is part of the link before them.
     """
 
     dh: DHTable | None = None
+    """Denavit-Hartenberg table."""
     snap: bool = False
+    """Angles in `rpy` of a URDF within 0.002 rad of a multiple of 15 degrees are that multiple."""
     urdf: TextBeside | None = None
+    """URDF file beside the description."""
     mjcf: TextBeside | None = None
+    """MJCF file beside the description."""
     base: Annotated[str, Field(min_length=1)] | None = None
+    """Link that the arm stands on, whose frame is the world; the root of the file when left out."""
     tip: Annotated[str, Field(min_length=1)] | None = None
+    """Link that the arm ends at; all that moves is the arm when left out."""
     lock: dict[str, Angle] = Field(default_factory=dict)
+    """Positions of joints that are held [rad or m], by name. All others outside base and tip are held at zero."""
 
     @field_validator("urdf")
     @classmethod

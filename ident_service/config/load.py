@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from ident_service.config import barrett, control, motion_design, recording, simulation
-from ident_service.config.arm import ArmConfig, FourierMotion
+from ident_service.config.arm import ArmConfig, FourierMotion, Joint
 from ident_service.config.barrett import BarrettDriver
 from ident_service.config.canopen import ABORTING, CanopenDriver, joint_torques, motor_speeds
 from ident_service.config.eds import data_sheet
 from ident_service.config.kinematics import DHTable
-from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile
+from ident_service.config.payload import Payload
+from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile, did_you_mean
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.config.yaml_source import KeyPath, Tree, first_problems, read_tree
+from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
-from ident_service.errors import ConfigError, DriverError, Problem, UsageError
+from ident_service.errors import ConfigError, DriverError, Problem, UsageError, plain_mistake
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
+    from ident_service.config.schema import KnownKeys
 
 _ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
@@ -170,7 +178,8 @@ def find_arm(arm: str) -> Path:
     shipped = shipped_arms()
     if arm in shipped:
         return shipped[arm]
-    raise UsageError(f"no arm description {arm!r}: not a file, and not one of {', '.join(shipped)}")
+    near = did_you_mean(arm, shipped)
+    raise UsageError(f"no arm description {arm!r}: not a file, and not one of {', '.join(shipped)}{near}")
 
 
 def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
@@ -240,7 +249,9 @@ def arm_from_json(path: Path) -> ArmConfig:
     try:
         return ArmConfig.model_validate_json(data)
     except ValidationError as error:
-        places = [(".".join(map(str, mistake["loc"])), mistake["msg"]) for mistake in error.errors(include_url=False)]
+        places = [
+            (".".join(map(str, mistake["loc"])), plain_mistake(mistake)) for mistake in error.errors(include_url=False)
+        ]
         raise ConfigError([Problem(path, 1, 1, f"{where}: {said}") for where, said in places[:10]]) from None
 
 
@@ -269,6 +280,19 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
     return _validated(RecordingFormat, read_tree(path), path)
 
 
+def load_payload(path: str | Path) -> Payload:
+    """Read and check a YAML file that has the keys of an arm description's `payload` and nothing else.
+
+    Raises:
+        UsageError: no such file.
+        ConfigError: every mistake in it, each with file, line and column.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; expected a YAML file with mass and center_of_mass of a payload")
+    return _validated(Payload, read_tree(path), path)
+
+
 def folder_of(arm: str | Path, where: KeyPath) -> Path:
     """Return the folder of the file in which a key stands: of the description, or of one that it extends.
 
@@ -288,39 +312,146 @@ def config_error(arm: str | Path, where: KeyPath, message: str) -> ConfigError:
         where: keys from the top of the file; the nearest of them that stands there is the place.
         message: what is wrong, and what to do.
     """
+    return ConfigError([located(arm, where, f"{'.'.join(map(str, where))}: {message}")])
+
+
+def located(arm: str | Path, where: KeyPath, message: str) -> Problem:
+    """Return a message with its place in a description, as `config_error`."""
     path = find_arm(str(arm))
-    return ConfigError([read_tree(path).problem(where, f"{'.'.join(map(str, where))}: {message}", path)])
+    return read_tree(path).problem(where, message, path)
 
 
 def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str, Any] | None = None) -> _Described:
     try:
         return kind.model_validate(tree.value, context=context)
     except ValidationError as error:
-        raise ConfigError(first_problems(list(_problems(error, tree, path)))) from None
+        section = "" if kind is ArmConfig else kind.__name__
+        raise ConfigError(first_problems(list(_problems(error, tree, path, section)))) from None
 
 
-def _problems(error: ValidationError, tree: Tree, path: Path) -> Iterator[Problem]:
-    seen = set()
+def _problems(error: ValidationError, tree: Tree, path: Path, section: str = "") -> Iterator[Problem]:
+    """Yield each mistake that the models found, those of one value as one, with what should stand there instead."""
+    from ident_service.config.schema import KnownKeys  # only for a file with mistakes
+
+    known = KnownKeys(section)
+    found: dict[KeyPath, list[ErrorDetails]] = {}
     for mistake in error.errors(include_url=False):
         where = _where(mistake["loc"], tree.value)
-        message = mistake["msg"].removeprefix("Value error, ")
-        if mistake["type"] == "extra_forbidden":
-            message = f"unknown key {where[-1]!r}"
-        elif mistake["type"] == "tuple_type":
-            message = "must be a list"
-        elif mistake["type"] == "missing":
-            message = f"{mistake['loc'][-1]!r} is missing"
-        name = ".".join(str(part) for part in where)
-        problem = tree.problem(where, f"{name}: {message}" if name else message, path)
-        if problem not in seen:
-            seen.add(problem)
-            yield problem
+        if mistake["type"] == "missing":
+            where = (*where, mistake["loc"][-1])
+        found.setdefault(where, []).append(mistake)
+    for number, (where, mistakes) in enumerate(found.items()):
+        if number > MOST_PROBLEMS:  # the rest are counted
+            yield tree.problem(where, mistakes[0]["type"], path)
+            continue
+        name = ".".join(str(part) for part in (where[:-1] if mistakes[0]["type"] == "missing" else where))
+        # Of a value that may be one thing or another, each branch has its own complaint.
+        told = list(dict.fromkeys(_told(one, where, known, tree) for one in mistakes))
+        wanted = [words for kind, words in told if kind == "wanted"]
+        said = [words for kind, words in told if kind == "said"]
+        if wanted and not said:
+            said = [f"must be {' or '.join(wanted)}, not {_value(mistakes[0]['input'])}"]
+            if texts := [one for one in mistakes if isinstance(one["input"], str)]:
+                said[0] += _nearest(str(texts[0]["input"]), mistakes)
+        for words in said:
+            yield tree.problem(where, f"{name}: {words}" if name else words, path)
+
+
+# What a value must be, by pydantic's type of its mistake; `{}` is one of its facts.
+_WANTED = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a mapping of keys to values",
+    "model_type": "a mapping of keys to values",
+    "model_attributes_type": "a mapping of keys to values",
+}
+_BOUNDS = {
+    "greater_than": ("greater than", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("less than", "lt"),
+    "less_than_equal": ("at most", "le"),
+}
+
+
+def _told(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -> tuple[str, str]:
+    """Return whether a mistake is told by what is `wanted` or in words that are `said`, and those words."""
+    kind, context, value = mistake["type"], mistake.get("ctx", {}), mistake["input"]
+    if kind in _WANTED:
+        unit = known.unit(where, tree.value)
+        if kind in ("float_type", "int_type") and isinstance(value, str) and _is_number(value):
+            return "said", f"{str(value)!r} is text, and {_WANTED[kind]} is needed; leave out the quotes"
+        return "wanted", _WANTED[kind] + (f" [{unit}]" if unit and "number" in _WANTED[kind] else "")
+    if kind in _BOUNDS:
+        words, key = _BOUNDS[kind]
+        unit = known.unit(where, tree.value)
+        return "said", f"must be {words} {context[key]:g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
+    if kind in ("literal_error", "enum"):
+        return "wanted", str(context["expected"])
+    if kind == "union_tag_invalid":
+        tag, tags = str(context["tag"]), [one.strip("' ") for one in str(context["expected_tags"]).split(",")]
+        return "said", f"kind must be {' or '.join(tags)}, not {tag!r}{did_you_mean(tag, tags)}"
+    if kind == "union_tag_not_found":
+        return "said", "'kind' is missing; add it"
+    if kind == "extra_forbidden":
+        return "said", f"unknown key {where[-1]!r}{known.remedy(where, tree.value)}"
+    if kind == "missing":
+        if isinstance(where[-1], int):
+            return "said", f"must be a list of {known.items(where[:-1], tree.value)}, not {where[-1]}"
+        words = known.description(where, tree.value)
+        return "said", f"{where[-1]!r} is missing; add it" + (f": {words}" if words else "")
+    if kind in ("too_long", "too_short"):
+        bound = f"at most {context['max_length']}" if kind == "too_long" else f"at least {context['min_length']}"
+        return "said", f"must be a list of {bound}, not {context['actual_length']}"
+    if kind == "string_pattern_mismatch":
+        words = known.description(where, tree.value)
+        return "said", plain_mistake(mistake) + (f"; {words}" if words else "")
+    return "said", plain_mistake(mistake)
+
+
+def _nearest(word: str, mistakes: Sequence[ErrorDetails]) -> str:
+    """Return the choice that is nearest to a word."""
+    texts = [str(one["ctx"]["expected"]) for one in mistakes if one["type"] in ("literal_error", "enum")]
+    return did_you_mean(word, re.findall(r"'([^']*)'", " ".join(texts)))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def _value(value: Any) -> str:
+    """Return a value as a message shows it."""
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, tuple | list):
+        return "a list"
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(str(value)) if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _where(loc: tuple[int | str, ...], value: Any) -> KeyPath:
     """Return the part of a validator's location that exists in the file, without union branches and missing keys."""
     where: list[str | int] = []
-    for part in loc:
+    for number, part in enumerate(loc):
+        if part == "values" and isinstance(value, dict) and part not in value:  # of a table of parameters
+            index = loc[number + 1] if number + 1 < len(loc) else None
+            if isinstance(index, int) and index < len(value):
+                where.append(list(value)[index])
+            break
         if isinstance(value, tuple) and isinstance(part, int):
             value = dict(enumerate(value))
         if isinstance(value, dict) and part in value:
@@ -337,7 +468,11 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
         and config.joints
         and tuple(config.joints) != tuple(config.kinematics.dh.joints)
     ):
-        yield ("joints",), f"joints: {', '.join(config.joints)} are not those of kinematics.dh: {', '.join(names)}"
+        yield (
+            ("joints",),
+            f"joints: {', '.join(config.joints)} are not those of kinematics.dh: {', '.join(names)}; give the same"
+            " names in the same order",
+        )
     for label, motion in (("identification", config.motions.identification), ("validation", config.motions.validation)):
         if isinstance(motion, FourierMotion) and names and tuple(motion.joints) != names:
             yield ("motions", label, "joints"), f"motions.{label}.joints: must be {', '.join(names)}, in this order"
@@ -347,6 +482,10 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
             if names and isinstance(given, tuple) and len(given) != len(names):
                 yield ("driver", key), f"driver.{key}: {len(given)} values for {len(names)} joints"
         yield from simulation.disagreements(config.driver, names, config.control.rate)
+    for name, one in config.joints.items():
+        table = config.kinematics.dh
+        slides = table is not None and name in table.joints and table.joints[name].type == "prismatic"
+        yield from _other_units(name, one, slides=slides)
     homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
     if isinstance(config.driver, BarrettDriver):
         yield from barrett.disagreements(config.driver, config.transmission, names, config.control.rate, homeless)
@@ -368,11 +507,42 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
                 " leave it out, or set it to measured",
             )
     if config.payload is not None and config.payload.link is not None and names and config.payload.link not in names:
-        yield ("payload", "link"), f"payload.link: {config.payload.link!r} is none of {', '.join(names)}"
+        near = did_you_mean(config.payload.link, names)
+        yield ("payload", "link"), f"payload.link: {config.payload.link!r} is none of {', '.join(names)}{near}"
+    factors = config.identification.torque_factors
+    if factors is not None and names and len(factors) != len(names):
+        yield (
+            ("identification", "torque_factors"),
+            f"identification.torque_factors: {len(factors)} values for {len(names)} motors",
+        )
     yield from recording.disagreements(config.recording, config.transmission, names)
     yield from motion_design.disagreements(config.geometry, config.workspace, config.supply, names)
     yield from motion_design.design_disagreements(config.design, names)
     yield from control.disagreements(config.control, names)
+
+
+_MOST_TURNS = 8.0 * math.pi  # rad either way; cables allow less, and few slides are so long in metres
+_FASTEST = 35.0  # rad/s, or m/s; the fastest arms have a third of it
+
+
+def _other_units(name: str, joint: Joint, *, slides: bool) -> Iterator[tuple[KeyPath, str]]:
+    """Yield the limits of a joint that are those of no arm in radians and metres, but may be in other units."""
+    what = "m" if slides else "rad (m of a slide)"
+    for key, values in (("position", joint.position or ()), ("home", () if joint.home is None else (joint.home,))):
+        if values and max(map(abs, values)) > _MOST_TURNS:
+            said, written = (", ".join(f"{value:g}{unit}" for value in values) for unit in ("", " deg"))
+            if key == "position":
+                said, written = f"[{said}]", f"[{written}]"
+            remedy = "lengths are metres" if slides else f"if it is in degrees, write {written}"
+            yield ("joints", name, key), f"joints.{name}.{key}: {said} {what} is no arm's; {remedy}"
+    if joint.velocity is not None and joint.velocity > _FASTEST:
+        unit, given = ("m/s", "mm/s") if slides else ("rad/s (m/s of a slide)", "degrees per second")
+        scale = 1e-3 if slides else math.pi / 180.0
+        yield (
+            ("joints", name, "velocity"),
+            f"joints.{name}.velocity: {joint.velocity:g} {unit} is no arm's; if it is in {given}, write"
+            f" {joint.velocity * scale:.4g}",
+        )
 
 
 def _joint_names(table: DHTable | None, config: ArmConfig) -> tuple[str, ...]:

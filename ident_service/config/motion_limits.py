@@ -17,7 +17,7 @@ from ident_service.errors import MotionRefused
 
 Vector = NDArray[np.float64]
 _ROUNDING = 1e-12  # of the largest number in a row
-_NEEDED = ("position", "velocity", "acceleration", "jerk", "torque", "following_error", "kp", "kd")
+NEEDED = ("position", "velocity", "acceleration", "jerk", "torque", "following_error", "kp", "kd")
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,7 @@ def motion_limits(config: ArmConfig) -> MotionLimits:
         MotionRefused: the description leaves out something that a safe motion needs; all gaps are named.
     """
     missing = [
-        f"joints.{name}.{key}"
-        for name, joint in config.joints.items()
-        for key in _NEEDED
-        if getattr(joint, key) is None
+        f"joints.{name}.{key}" for name, joint in config.joints.items() for key in NEEDED if getattr(joint, key) is None
     ]
     if missing or not config.joints:
         raise MotionRefused(
@@ -132,5 +129,5 @@ def motion_limits(config: ArmConfig) -> MotionLimits:
     position = column("position")
     lower, upper = position[:, 0].copy(), position[:, 1].copy()
     home = np.array([j.home if j.home is not None else np.clip(0.0, *p) for j, p in zip(joints, position, strict=True)])
-    columns = {key: column(key) for key in _NEEDED[1:]}
+    columns = {key: column(key) for key in NEEDED[1:]}
     return MotionLimits(lower, upper, home=home, motors=motor_limits(config), **columns)

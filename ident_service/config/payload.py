@@ -23,20 +23,17 @@ _ROUNDING = 1e-9
 
 
 class Payload(Section):
-    """A tool or load that is on the arm for as long as the description says so.
-
-    Attributes:
-        mass: [kg].
-        center_of_mass: in the frame of the link that carries it [m].
-        inertia: Jxx, Jxy, Jxz, Jyy, Jyz, Jzz about the centre of mass [kg m^2], along the axes of that frame; those of
-            a point when left out.
-        link: which link carries it, by the name of the joint that moves it; the last one when left out.
-    """
+    """A tool or load that is on the arm for as long as the description says so."""
 
     mass: Annotated[Positive, Field(le=_HEAVIEST)]
+    """Mass [kg]."""
     center_of_mass: Vector3
+    """Centre of mass in the frame of the link that carries it [m]."""
     inertia: tuple[Number, Number, Number, Number, Number, Number] | None = None
+    """Jxx, Jxy, Jxz, Jyy, Jyz, Jzz about the centre of mass, along the axes of that frame [kg m^2]; those of a point
+    when left out."""
     link: str | None = None
+    """Link that carries it, by the name of the joint that moves it; the last one when left out."""
 
     @field_validator("center_of_mass")
     @classmethod

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -61,6 +63,13 @@ class ExtendedSection(Section):
         return {k: v for k, v in document.items() if k not in self.later or getattr(self, k) != fields[k].default}
 
 
+def did_you_mean(word: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """Return the known word that is nearest to a misspelt one, in a phrase to end a message; empty for none near."""
+    lower = {one.lower(): one for one in known}
+    near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=cutoff)
+    return f"; did you mean {lower[near[0]]!r}?" if near else ""
+
+
 def _angle(value: Any) -> Any:
     if isinstance(value, str):
         if match := _PI.match(value):
@@ -81,7 +90,13 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 Number = Annotated[float, Field(strict=True)]
-Angle = Annotated[float, Field(strict=True), BeforeValidator(_angle)]
+Angle = Annotated[
+    float,
+    Field(strict=True),
+    BeforeValidator(
+        _angle, json_schema_input_type=float | Annotated[str, Field(pattern=f"{_PI.pattern}|{_DEGREES.pattern}")]
+    ),
+]
 Count = Annotated[int, Field(strict=True, ge=1)]
 Positive = Annotated[float, Field(gt=0, strict=True)]
 NonNegative = Annotated[float, Field(ge=0, strict=True)]
@@ -125,7 +140,7 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
     except OSError:  # for example, the name is too long
         there = False
     if not there:
-        raise ValueError(f"no such file: {path}")
+        raise ValueError(f"no such file: {path}; give its path as seen from the description's folder")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path} is larger than {MAX_FILE_BYTES} bytes")
     try:
@@ -136,13 +151,21 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
         raise ValueError(f"{path} is not UTF-8 text") from None
 
 
-TextBeside = Annotated[TextFile, BeforeValidator(read_relative_file)]
-AnyTextBeside = Annotated[TextFile, BeforeValidator(_read_any)]
+TextBeside = Annotated[TextFile, BeforeValidator(read_relative_file, json_schema_input_type=str)]
+AnyTextBeside = Annotated[TextFile, BeforeValidator(_read_any, json_schema_input_type=str)]
 """Text of any encoding: makers' data sheets are often not UTF-8."""
+
+
+def _table_schema(schema: dict[str, Any]) -> None:
+    """Describe a parameter table as people write it, in place of its two lists."""
+    schema.clear()
+    schema["anyOf"] = [{"type": "string"}, {"type": "object", "additionalProperties": {"type": "number"}}]
 
 
 class ParameterTable(Section):
     """Named link parameters: inline `{m1: 2.0, ...}` or a JSON file with `names` and `values`."""
+
+    model_config = ConfigDict(json_schema_extra=_table_schema)
 
     names: tuple[str, ...]
     values: tuple[Number, ...]

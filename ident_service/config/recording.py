@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import (
+    ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
     ValidationInfo,
@@ -59,17 +60,29 @@ _WITH_FACTOR = {
 ColumnName = Annotated[str, Field(pattern=r"^(t|(q|dq|tau)[1-9]\d{0,3})$")]
 
 
+def _name_alone_schema(schema: dict[str, Any]) -> None:
+    """Describe that a column may be its name alone."""
+    whole = dict(schema)
+    schema.clear()
+    schema["anyOf"] = [{"type": "string", "minLength": 1}, whole]
+
+
 class Column(Section):
     """One column of a CSV file: its name in the file, and the conversion of its numbers to SI.
 
-    The value is `factor` times the number converted from `unit`; both may be left out. A negative factor turns the
-    sign. Currents (`A`, `mA`), encoder `counts` and `%` of a rated torque need a factor: N m per A, rad per count,
-    the rated torque in N m. A factor beside any other unit is for what is left, a gear ratio or a sign.
+    The value is `factor` times the number converted from `unit`; both may be left out. A factor beside a unit that
+    needs none is for what is left, a gear ratio or a sign.
     """
 
+    model_config = ConfigDict(json_schema_extra=_name_alone_schema)
+
     column: Annotated[str, Field(min_length=1)]
+    """Name of the column in the file."""
     unit: str | None = None
+    """Unit of its numbers, such as `deg`, `rpm`, `mNm`, `A`, `%` or `counts`; SI when left out."""
     factor: Number = 1.0
+    """Factor to SI, beside the unit's own [SI/unit]; negative turns the sign. Currents, counts and % of a rated torque
+    need it: N m per A, rad per count, rated torque in N m."""
 
     @model_validator(mode="before")
     @classmethod
@@ -128,18 +141,19 @@ class Column(Section):
 
 
 class Transmission(ExtendedSection):
-    """Gear ratios per joint (motor over joint, the sign tells the sense), coupling of joints, offsets of zero.
-
-    `drive_terms` says whose drive inertia and friction are: those of the motors, which a coupling spreads over joints,
-    or those of the joints as if there were no coupling, as in the paper's model of the WAM. `motor_torque` [N m] is the
-    most that each motor gives, where motors share joints and the driver's section does not say it.
-    """
+    """Gear ratios, coupling of joints, and offsets of zero."""
 
     ratios: Annotated[tuple[Number, ...], Field(min_length=1)]
+    """Turns of each motor per turn of its joint [1]; the sign tells the sense."""
     coupling: tuple[tuple[Number, ...], ...] | None = None
+    """Matrix C of coupled joints [1]: `q_motor = diag(r) C (q - q0)`."""
     offsets: tuple[Angle, ...] | None = None
+    """Joint positions at which the motors are at zero [rad or m]."""
     drive_terms: Literal["motors", "joints"] = "motors"
+    """Drive inertia and friction are those of the motors, which a coupling spreads over joints, or those of the joints
+    as if there were no coupling, as in the paper's model of the WAM."""
     motor_torque: tuple[Positive, ...] | None = None
+    """Most that each motor gives [N m], where motors share joints and the driver's section does not say it."""
     later = frozenset({"motor_torque"})
 
     @field_validator("ratios")
@@ -195,28 +209,31 @@ def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
 
 
 class RecordingFormat(Section):
-    """Format of an arm's recordings; `columns`, `joint_names`, `topic` and sides are for foreign files only.
-
-    `columns` gives a CSV file's own name for each of `t`, `q1`, `tau1` and optionally `dq1`, or that name with unit and
-    factor (`Column`); `joint_names` a JointState's own name for a joint of the arm. `side` says where positions,
-    velocities and torques were measured, `torque_side` where torques were if elsewhere. Irregular `stamps` are either
-    when each sample was taken (`sampled`), or when the sample arrived (`arrival`) although it was taken on time: then
-    the samples count as evenly spaced between gaps. `trim` [s] is cut off at start and end; a step of more than `gap`
-    usual periods is a gap; `rate` [Hz] resamples. Samples with a `missing` value (NaN, an empty field) are refused, or
-    left out and counted; `standstill` at the ends is kept, or cut.
-    """
+    """Format of an arm's recordings; `columns`, `joint_names`, `topic` and sides are for foreign files only."""
 
     columns: dict[ColumnName, Column] = Field(default_factory=dict)
+    """Columns of a CSV file for `t`, `q1`, `tau1` and optionally `dq1`: its name, or name, unit and factor."""
     joint_names: dict[str, str] = Field(default_factory=dict)
+    """A JointState's own name for a joint of the arm."""
     topic: Annotated[str, Field(min_length=1)] = "/joint_states"
+    """Topic of joint states in a foreign MCAP file."""
     side: Literal["joint", "motor"] = "joint"
+    """Side on which positions and velocities were measured, and torques where `torque_side` does not say."""
     torque_side: Literal["joint", "motor"] | None = None
+    """Side on which torques were measured; `side` when left out."""
     stamps: Literal["sampled", "arrival"] = "sampled"
+    """Irregular stamps are when each sample was taken (`sampled`), or when it arrived although it was taken on time
+    (`arrival`): then samples count as evenly spaced between gaps."""
     trim: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """Time cut off at start and end [s]."""
     gap: Annotated[float, Field(gt=1, strict=True)] = 3.0
+    """Step that counts as a gap [usual periods]."""
     rate: Annotated[Positive, Field(le=_FASTEST)] | None = None
+    """Rate that recordings are resampled at [Hz]; their own when left out."""
     missing: Literal["refuse", "skip"] = "refuse"
+    """Samples with a missing value are refused, or left out and counted."""
     standstill: Literal["keep", "cut"] = "keep"
+    """Standstill at the ends is kept, or cut."""
 
     @field_validator("columns")
     @classmethod

@@ -23,6 +23,7 @@ from ident_service.config.quantities import (
     Section,
     Seed,
     Vector3,
+    did_you_mean,
 )
 
 
@@ -105,25 +106,22 @@ _NOT_NEGATIVE = (
 
 
 class SimulatedFault(Section):
-    """One fault to inject, at a time [s] or in a cycle, counted from the first cycle after the arm was opened.
-
-    Attributes:
-        kind: what goes wrong.
-        joint: of which joint; all of them when left out.
-        at: when [s].
-        cycle: or in which cycle.
-        duration: how long [s]; when left out, one cycle or for good, as `FAULT_RULES` says.
-        size: what `FAULT_RULES` says.
-        offset: of a load, in the frame of the last link [m].
-    """
+    """One fault to inject, at a time or in a cycle; `FAULT_RULES` describes each kind."""
 
     kind: FaultKind
+    """Fault to inject."""
     joint: str | None = None
+    """Joint that it strikes; all of them when left out."""
     at: NonNegative | None = None
+    """Time after the arm was opened [s]."""
     cycle: Annotated[int, Field(strict=True, ge=0)] | None = None
+    """Cycle after the arm was opened, instead of `at` [1]."""
     duration: Positive | None = None
+    """Duration [s]; when left out, one cycle or for good, as its kind is."""
     size: Number | None = None
+    """Size, in the unit of its kind [of the kind]."""
     offset: Vector3 | None = None
+    """Place of an attached load in the frame of the last link [m]."""
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> SimulatedFault:
@@ -144,35 +142,48 @@ class SimulatedFault(Section):
 
 
 class SimulatedDriver(ExtendedSection):
-    """Simulated arm: true parameters and imperfections, all per joint or one number for all.
-
-    `process` says where its plant lives; `bus` names a separate one that other processes may ask for, `status` the file
-    it reports to, `deadline` [s] how long an answer of it may take. `watchdog` [s] without a torque frame makes
-    the drives idle; idle drives brake with `braking` [N m s/rad], for 0.1 s or, where `windings_off` is `shorted`, for
-    as long as they are off. `stand` [rad or m] is how far an arm that nothing holds sinks from where it was found until
-    it rests on the support that a person has put under it; left out, nothing catches it. `watchdog_reason` says why
-    drives of an arm that can fall may go on for longer than 0.1 s.
-    """
+    """Simulated arm: true parameters and imperfections, all per joint or one number for all."""
 
     kind: Literal["simulated"]
+    """Simulated arm."""
     time: Literal["virtual", "real"] = "virtual"
+    """`virtual` runs as fast as it can; `real` by the clock of this computer."""
     process: Literal["own", "separate"] = "own"
+    """Plant in the process of the host, or in one of its own."""
     bus: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")] | None = None
+    """Name of a separate plant that other processes may ask for."""
     status: str | None = None
+    """File that a separate plant reports to."""
     deadline: Positive | None = None
+    """Longest time that an answer of a separate plant may take [s]."""
     seed: Seed = 0
+    """Seed of the random numbers [1]."""
     truth: ParameterTable | None = None
+    """True parameters [SI]: `{m1: 2.0, ...}`, or a JSON file with `names` and `values`; the prior's when left out,
+    which is a perfect model."""
     encoder_resolution: PerJoint = 0.0
+    """Step of the encoders at the joint [rad or m], one or per joint."""
     torque_resolution: PerJoint = 0.0
+    """Step of the torque at the joint [N m or N], one or per joint."""
     torque_noise: PerJoint = 0.0
+    """Standard deviation of the torque in each cycle [N m or N], one or per joint."""
     delay_cycles: Annotated[Count, Field(le=100)] = 1
+    """Cycles from a sample to the torque that is computed from it [1]."""
     watchdog: Positive = 0.01
+    """Time without a torque frame after which drives are idle [s]."""
     watchdog_reason: Annotated[str, Field(max_length=200)] = ""
+    """Reason why drives of an arm that can fall may go on for longer than 0.1 s."""
     braking: PerJoint | None = None
+    """Damping of idle drives [N m s/rad or N s/m], one or per joint, for 0.1 s, or for as long as they are off where
+    `windings_off` is `shorted`."""
     windings_off: WindingsOff = "open"
+    """Windings of a drive whose power stage is off: `open` coasts, `shorted` brakes."""
     stand: Positive | None = None
+    """Distance that an arm which nothing holds sinks until it rests on the support that a person has put under it [rad
+    or m]; nothing catches it when left out."""
     later = frozenset({"windings_off", "watchdog_reason", "stand"})
     faults: tuple[SimulatedFault, ...] = ()
+    """Faults to inject."""
 
 
 def disagreements(
@@ -200,4 +211,5 @@ def disagreements(
     for number, fault in enumerate(driver.faults):
         if fault.joint is not None and fault.joint not in joints:
             where = ("driver", "faults", number, "joint")
-            yield where, f"driver.faults.{number}.joint: {fault.joint!r} is none of {', '.join(joints)}"
+            near = did_you_mean(fault.joint, joints)
+            yield where, f"driver.faults.{number}.joint: {fault.joint!r} is none of {', '.join(joints)}{near}"

@@ -15,22 +15,32 @@ from typing import Any
 
 import yaml
 
-from ident_service.config.quantities import LocatedStr
+from ident_service.config.quantities import LocatedStr, did_you_mean
 from ident_service.errors import ConfigError, Problem
 
+SCHEMA = "ident-arm.schema.json"
+MODELINE = f"# yaml-language-server: $schema={SCHEMA}"  # with it, editors complete and explain keys
 _FOLDERS = (Path(__file__).parent.parent / "configs", Path(__file__).parent.parent.parent / "configs")
 
 
 def shipped_arms() -> dict[str, Path]:
     """Return names and files of the arm descriptions that come with this package."""
-    folder = next((folder for folder in _FOLDERS if folder.is_dir()), None)
-    return {} if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+    return {path.stem: path for path in sorted(_shipped_folder().glob("*.yaml"))}
+
+
+def arm_schema_file() -> Path:
+    """Return the JSON schema of descriptions that comes with this package (`config/schema.py`)."""
+    return _shipped_folder() / SCHEMA
+
+
+def _shipped_folder() -> Path:
+    return next((folder for folder in _FOLDERS if folder.is_dir()), _FOLDERS[-1])
 
 
 KeyPath = tuple[str | int, ...]
 MAX_DEPTH = 32
 MOST_BYTES = 256 * 2**10
-_MOST_PROBLEMS, _LONGEST = 100, 500
+MOST_PROBLEMS, _LONGEST = 100, 500
 # YAML 1.1 reads 1e-4 as text; numbers people write are numbers here.
 _FLOAT = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
 _INTEGER = re.compile(r"^[-+]?\d+$")
@@ -53,7 +63,7 @@ class Tree:
 
 def first_problems(problems: Sequence[Problem]) -> list[Problem]:
     """Return the first hundred problems of a file, in at most 500 characters each, and how many others there are."""
-    first = [replace(one, message=_shortened(one.message)) for one in problems[:_MOST_PROBLEMS]]
+    first = [replace(one, message=_shortened(one.message)) for one in problems[:MOST_PROBLEMS]]
     if (more := len(problems) - len(first)) > 0:
         first.append(replace(first[-1], message=f"and {more} more mistakes"))
     return first
@@ -96,7 +106,8 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False
     except (OSError, ValueError) as error:  # a name that no file can have
         raise ConfigError([tree.problem(("extends",), f"{parent[:40]}...: {error.args[-1]}", path)]) from None
     if not there:
-        raise ConfigError([tree.problem(("extends",), f"no such file: {base_path}", path)])
+        near = did_you_mean(Path(parent).stem, shipped_arms()) or f"; shipped are {', '.join(shipped_arms())}"
+        raise ConfigError([tree.problem(("extends",), f"extends: no such file: {base_path}{near}", path)])
     base = read_tree(base_path, (*_chain, path))
     merged = _merge(base.value, tree.value)
     return Tree(merged, base.places | tree.places)
@@ -145,7 +156,9 @@ class _Builder:
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             line, column = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-            raise ConfigError([Problem(self._path, line, column, error.problem or "not YAML")]) from None
+            remedy = "quote text with a colon in it, and look for a bracket, a quote or an indentation that is wrong"
+            said = f"{error.problem or 'not YAML'}; {remedy}"
+            raise ConfigError([Problem(self._path, line, column, said)]) from None
         except yaml.YAMLError as error:
             raise ConfigError([Problem(self._path, 1, 1, f"not YAML: {error}")]) from None
         # First the constructs that would change the meaning of the rest of the file.
@@ -192,7 +205,7 @@ class _Builder:
                 self._refuse_unplain(key_event)
                 key = str(key_event.value)
                 if key in result:
-                    self._wrong.append(Problem(*here, f"{key!r} stands twice"))
+                    self._wrong.append(Problem(*here, f"{key!r} stands twice; leave one out"))
                 result[key] = self._value(next(events), (*where, key), events, depth + 1)
                 # A mistake about a key (unknown, wrong kind of value) is best seen at the key.
                 self._tree.places[(*where, key)] = here

@@ -40,8 +40,10 @@ from ident_service.daemon.routes import (
     pruning,
     runs,
     uploads,
+    views,
 )
 from ident_service.daemon.routes.checks import Checks
+from ident_service.daemon.run_series import RunSeries
 from ident_service.daemon.settings import Settings
 from ident_service.daemon.uploads import delete_stale_uploads
 from ident_service.daemon.web import (
@@ -81,6 +83,7 @@ ROUTERS = (
         live.router,
         runs.router,
         pruning.router,
+        views.router,
     ),
     *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
 )
@@ -140,6 +143,8 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     )
     app.state.service = service
     app.state.live = LiveRuns()
+    app.state.views = views.Views()
+    app.state.series = RunSeries()
     app.state.watch = EventPoller(
         db, settings.state, lambda row: jobs.job_answer_document(service, row).model_dump(mode="json")
     )

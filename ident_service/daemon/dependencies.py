@@ -64,7 +64,7 @@ async def serving(request: Request) -> Service:
     return service_of(request)
 
 
-_bearer = HTTPBearer(auto_error=False, description="a token, as `ident token add` prints it")
+_bearer = HTTPBearer(auto_error=False, description="a token, as `ident tokens add` prints it")
 _cookie = APIKeyCookie(name=COOKIE, auto_error=False, description="a session, from /api/v1/login")
 Bearer = Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
 Cookie = Annotated[str | None, Depends(_cookie)]

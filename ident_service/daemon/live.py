@@ -17,9 +17,10 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.config.load import arm_from_json
 from ident_service.errors import IdentError, RecordingError
@@ -38,6 +39,7 @@ _FRAMES = 600  # frames kept for viewers who join late
 _MOST_WAITING = 120  # pieces of at most a MiB of the file that may wait for the thread
 _MOST_RUNS = 8
 _LOG = logging.getLogger("ident.live")
+Array: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,64 @@ class Frame:
     number: int
     kind: str
     data: str
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """Samples for display, one of every bin.
+
+    Attributes:
+        joints: names of the joints.
+        time: of the last sample in each bin [s] after the recording's first, shape (bins,).
+        position: measured, of that sample [rad or m], shape (bins, joints).
+        reference: position that was asked for, likewise.
+        torque: commanded, likewise [N m or N].
+        error: following error of largest size in the bin [rad or m], shape (bins, joints).
+        measured: torque that the drives measured [N m or N], shape (bins, joints); None where they measured none.
+    """
+
+    joints: tuple[str, ...]
+    time: Array
+    position: Array
+    reference: Array
+    torque: Array
+    error: Array
+    measured: Array | None
+
+    def document(self) -> dict[str, Any]:
+        """Return JSON values: each quantity as a list per joint; None for what is not finite."""
+        shown = {"position": 5, "reference": 5, "torque": 4, "error": 7, "measured": 4}
+        given = {name: values for name in shown if (values := getattr(self, name)) is not None}
+        return {
+            "joints": list(self.joints),
+            "time": _numbers(self.time, 3),
+            **{name: [_numbers(column, shown[name]) for column in values.T] for name, values in given.items()},
+        }
+
+
+def thinned(samples: Samples, names: tuple[str, ...], first_ns: int, bin_ns: int = BIN_NS) -> Thinned:
+    """Return one point of every bin of samples.
+
+    Args:
+        samples: consecutive cycles.
+        names: of the joints.
+        first_ns: stamp from which time and bins count [ns].
+        bin_ns: width of a bin [ns].
+    """
+    bins = (samples.stamp_ns - first_ns) // bin_ns
+    starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
+    ends = np.append(starts[1:], len(bins)) - 1
+    error = samples.reference - samples.position
+    high, low = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
+    return Thinned(
+        names,
+        (samples.stamp_ns[ends] - first_ns) * 1e-9,
+        samples.position[ends],
+        samples.reference[ends],
+        samples.torque[ends],
+        np.where(high >= -low, high, low),
+        None if samples.measured is None else samples.measured[ends],
+    )
 
 
 class LiveRun:
@@ -108,7 +168,9 @@ class LiveRun:
         samples = self._tail.read()
         if samples is None:
             return
-        self._publish("samples", self._thinned(samples, self._tail.joint_names))
+        if self._first_ns is None:
+            self._first_ns = int(samples.stamp_ns[0])
+        self._publish("samples", thinned(samples, self._tail.joint_names, self._first_ns).document())
         self._lost |= len(self._waiting) == _MOST_WAITING
         if self._lost:
             return
@@ -116,24 +178,6 @@ class LiveRun:
         if self._worker is None or not self._worker.is_alive():
             self._worker = threading.Thread(target=self._work, name="live doubt", daemon=True)
             self._worker.start()
-
-    def _thinned(self, samples: Samples, names: tuple[str, ...]) -> dict[str, Any]:
-        """Return the last position and torque of every 20 ms, and the largest following error in them."""
-        if self._first_ns is None:
-            self._first_ns = int(samples.stamp_ns[0])
-        bins = (samples.stamp_ns - self._first_ns) // BIN_NS
-        starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
-        ends = np.append(starts[1:], len(bins)) - 1
-        error = samples.reference - samples.position
-        high, low = np.maximum.reduceat(error, starts), np.minimum.reduceat(error, starts)
-        time_s = (samples.stamp_ns[ends] - self._first_ns) * 1e-9
-        return {
-            "joints": list(names),
-            "time": _numbers(time_s, 3),
-            "position": [_numbers(column, 5) for column in samples.position[ends].T],
-            "torque": [_numbers(column, 4) for column in samples.torque[ends].T],
-            "error": [_numbers(column, 7) for column in np.where(high >= -low, high, low).T],
-        }
 
     def _publish(self, kind: str, value: dict[str, Any]) -> None:
         self._number += 1

@@ -91,6 +91,15 @@ class ArmAnswer(ArmLine):
     accepted: AcceptanceAnswer | None
 
 
+class AddedArmAnswer(ArmAnswer):
+    """Arm that was added; `objections` say why it cannot be moved, each with line and column of the description.
+
+    They are null where the same description was known already: it is judged once (`POST /descriptions/check`).
+    """
+
+    objections: list[str] | None
+
+
 class ChallengeAnswer(BaseModel):
     """Challenge that confirms one motion, once."""
 
@@ -195,13 +204,15 @@ class ParametersAnswer(BaseModel):
 
 
 class RunLine(BaseModel):
-    """One run in the list of runs."""
+    """One run in the list of runs, with the tags and the note that people gave it."""
 
     id: str
     kind: str
     arm: str
     created: float
     ending: str
+    tags: list[str] = []
+    note: str = ""
 
 
 class RunAnswer(RunLine):
@@ -212,6 +223,34 @@ class RunAnswer(RunLine):
     files: dict[str, str]
     recordings: list[RecordingAnswer]
     parameters: ParametersAnswer | None
+
+
+class SeriesEvent(BaseModel):
+    """Line that was logged while a run was recorded: a `state`, a `warning`, or a `fault` that stopped the arm."""
+
+    time: float
+    kind: Literal["state", "warning", "fault"]
+    message: str
+
+
+class SeriesAnswer(BaseModel):
+    """Recording of a run, thinned for display: times [s] after its first sample, a list per joint of each quantity.
+
+    `position` and `reference` (commanded) are in rad or m; `torque`, which was commanded, and `measured` in N m or N;
+    `error` is the largest following error near each time. Quantities that were not recorded are null. `begins` is when
+    the motion itself began, `start` the stamp of the first sample [s].
+    """
+
+    joints: list[str]
+    time: list[float]
+    position: list[list[float | None]]
+    torque: list[list[float | None]]
+    reference: list[list[float | None]] | None = None
+    error: list[list[float | None]] | None = None
+    measured: list[list[float | None]] | None = None
+    start: float
+    begins: float | None
+    events: list[SeriesEvent]
 
 
 class AuditLine(BaseModel):

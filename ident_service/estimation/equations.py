@@ -15,17 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import Identification
+from ident_service.config.payload import Payload
 from ident_service.errors import RecordingError
 from ident_service.estimation.repeats import Label, Stretches, stretches
 from ident_service.estimation.signal_processing import Motion, averaged, smoothed, windows
 from ident_service.estimation.spectra import with_chosen_cutoff
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, with_payload
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.zero_phase import low_pass
+from ident_service.recordings.cached_recording import payload_of
 from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid
 
@@ -33,6 +35,7 @@ MAX_BLOCKS = 256
 LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known
 _CHUNK = 4096  # samples whose regressor is computed at once
 _DECAY = 28.0  # -ln(1e-12)
+_UNCOUPLED = 1e-12
 
 
 @dataclass(frozen=True)
@@ -244,9 +247,66 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
 def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:
     """Yield the equations themselves, in chunks, for methods that need more than one pass.
 
+    Recorded torques are multiplied by the factors of the motors that the description states, and lack what a known
+    payload needs.
+
     Raises:
         RecordingError: the recording does not fit the arm or cannot be smoothed.
     """
+    mixes = _torque_factors(model)
+    for rows in _recorded_rows(recording, model, base):
+        torque = rows.torque if mixes is None else rows.torque @ mixes.T
+        carried = known_torque(recording, model, base, rows)
+        yield replace(rows, torque=torque if carried is None else torque - carried)
+
+
+def motors_of_torques(model: ArmModel) -> Array:
+    """Return what recorded joint torques are multiplied by to be those of the motors, shape (motors, joints).
+
+    Without gears in the description, motors are the joints.
+    """
+    gears = model.config.transmission
+    if gears is None:
+        return np.eye(model.chain.joints)
+    ratios = np.array(gears.ratios)
+    coupling = np.eye(len(ratios)) if gears.coupling is None else np.array(gears.coupling)
+    found = np.linalg.inv(coupling.T * ratios)
+    # An inverse that is only nearly zero would couple motors that are not coupled.
+    return np.where(np.abs(found) > _UNCOUPLED * np.abs(found).max(axis=1, keepdims=True), found, 0.0)
+
+
+def known_torque(recording: Recording, model: ArmModel, base: BaseParameters, rows: Rows) -> Array | None:
+    """Return the torque of a recording's known payload [N m or N], shape (samples, joints); None without one.
+
+    Args:
+        recording: that the rows are of.
+        model: the arm.
+        base: grouping of its parameters.
+        rows: of the recording.
+    """
+    payload = payload_of(recording)
+    if payload is None:
+        return None
+    if base.K.shape != (rows.H_b.shape[1], len(model.layout.names)):  # of some columns only, whose torque nobody reads
+        return None
+    return np.asarray(np.einsum("jbs,b->sj", rows.H_b, base.K @ payload_parameters(model, payload)))
+
+
+def payload_parameters(model: ArmModel, payload: Payload) -> Array:
+    """Return what a payload adds to an arm's link parameters [SI], shape (parameters,)."""
+    loaded = model.config.model_copy(update={"payload": payload})
+    return with_payload(loaded, model.chain.names, model.layout, np.zeros(model.layout.size))
+
+
+def _torque_factors(model: ArmModel) -> Array | None:
+    factors = model.config.identification.torque_factors
+    if factors is None:
+        return None
+    to_motors = motors_of_torques(model)
+    return np.asarray(np.linalg.solve(to_motors, np.array(factors)[:, None] * to_motors))
+
+
+def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:
     if recording.joints != model.chain.joints:
         raise RecordingError(
             recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"

@@ -26,8 +26,9 @@ from ident_service.estimation.friction_fit import fit_friction, fitted_friction_
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
-from ident_service.estimation.shape_uncertainty import shape_uncertainty
+from ident_service.estimation.shape_uncertainty import ShapeUncertainty, shape_uncertainty
 from ident_service.estimation.spectra import with_chosen_cutoff
+from ident_service.estimation.torque_constants import TorqueConstants, identify_torque_constants
 from ident_service.estimation.torque_delay import Delay, choose_delay, estimate_delay, with_delay
 from ident_service.estimation.uncertainty import uncertainty, widening
 from ident_service.model.arm_model import ArmModel
@@ -51,6 +52,7 @@ class Prepared:
         torque_scales: what each joint's measured torque was multiplied by, shape (joints,).
         choices: of what the configuration left to be chosen.
         shapes: which numbers of the friction's shape were fitted.
+        torque_constants: of the motors, where they were identified; `model` multiplies recorded torques by them.
     """
 
     model: ArmModel
@@ -59,6 +61,7 @@ class Prepared:
     torque_scales: Array
     choices: tuple[Choice, ...] = ()
     shapes: tuple[str, ...] = ()
+    torque_constants: TorqueConstants | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,8 @@ def prepare(
     base: BaseParameters,
     conditions: FeasibleSet,
     validation: Sequence[Recording] = (),
+    *,
+    torque_constants: Literal["described", "unconstrained", "feasible"] = "described",
 ) -> Prepared:
     """Find delay, friction shape and torque constants, which make the equations linear, and gather the equations.
 
@@ -108,8 +113,10 @@ def prepare(
         base: grouping of the parameters.
         conditions: that torque constants are found under, and choices judged.
         validation: what will be judged on; only whether it has velocities is looked at.
+        torque_constants: whether to identify those of the motors, with any parameters or with feasible ones.
 
     Raises:
+        UsageError: torque constants without a known payload.
         RecordingError: a recording does not fit the arm or cannot be used.
         ParameterError: bounds of torque constants that mean nothing.
         SolverError: the solver stopped without an optimum.
@@ -136,13 +143,18 @@ def prepare(
     fitted = fitted_friction_parameters(model)
     model, shapes = fit_friction(trials, model, base, conditions)
     choices += shapes
+    constants = None
+    if torque_constants != "described":
+        within = conditions if torque_constants == "feasible" else None
+        constants = identify_torque_constants(recordings, model, base, within)
+        model = constants.of(model)
     gathered = gather(recordings, model, base)
     scales = np.ones(model.chain.joints)
     if bounds := scale_bounds(model.config, model.chain.names):
         weights = weighted_least_squares(gathered.total).weights
         scales = constrained_least_squares_with_scales(gathered.total, base, conditions, bounds, weights).scales
         gathered = gathered.with_torques_times(scales)
-    return Prepared(model, gathered, delay, scales, choices, fitted)
+    return Prepared(model, gathered, delay, scales, choices, fitted, constants)
 
 
 def _with_velocity(
@@ -192,7 +204,7 @@ def unconstrained(
 ) -> Fit:
     """Estimate by a method, or by the one of `wls` and `huber` that predicts held-out thirds better.
 
-    The covariance has the doubt about the friction's shape in it, where that was fitted.
+    The covariance has the doubt about the friction's shape and the torque constants in it, where those were fitted.
 
     Raises:
         RecordingError: a recording cannot be used.
@@ -200,6 +212,8 @@ def unconstrained(
         SolverError: the solver stopped without an optimum.
     """
     found = _with_known_shape(method, recordings, prepared, base, conditions)
+    if prepared.torque_constants is not None:
+        found = _joined(found, prepared.torque_constants.uncertainty())
     if not prepared.shapes:
         return found
     # The weights of Huber's rows are in his equations, not among those per joint.
@@ -214,8 +228,12 @@ def unconstrained(
         prepared.torque_scales,
         found.shares,
     )
-    deviations, degrees = shape.joined(found.deviations, found.degrees)
-    return replace(found, covariance=found.covariance + shape.covariance, deviations=deviations, degrees=degrees)
+    return _joined(found, shape)
+
+
+def _joined(found: Fit, doubt: ShapeUncertainty) -> Fit:
+    deviations, degrees = doubt.joined(found.deviations, found.degrees)
+    return replace(found, covariance=found.covariance + doubt.covariance, deviations=deviations, degrees=degrees)
 
 
 def _with_known_shape(

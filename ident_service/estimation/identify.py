@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from ident_service.estimation.least_squares import (
 )
 from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
 from ident_service.estimation.spectra import remarks_on_noise
+from ident_service.estimation.torque_constants import require_known_load
 from ident_service.estimation.uncertainty import Verdict, negligible, verdicts
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters, remarks_on_angles
@@ -191,6 +192,8 @@ def identify(
     custom: CustomFunction | None = None,
     solver: str | None = None,
     again: bool = False,
+    step: Callable[[str, float], None] = lambda words, share: None,
+    torque_constants: bool = False,
 ) -> Estimate:
     """Identify an arm from recordings.
 
@@ -203,10 +206,12 @@ def identify(
         custom: the function that the configuration's `constraints.custom` names, loaded by `load_custom`.
         solver: of the problems that are posed in cvxpy, those with `custom` and the second opinion.
         again: whether to solve the constrained problem a second time.
+        step: called with what is being done and the share of the time that is over, from 0 to 1, as a rule.
+        torque_constants: whether to identify those of the motors with the parameters; needs a known payload.
 
     Raises:
-        UsageError: unknown method, no recordings, the same recording twice, no prior where one is asked for, or a
-            solver that is not installed or has nothing to solve.
+        UsageError: unknown method, no recordings, the same recording twice, no prior where one is asked for, a solver
+            that is not installed or has nothing to solve, or torque constants without a known payload.
         CustomError: `custom` raises, returns what is not convex, or contradicts the conditions.
         RecordingError: a recording does not fit the arm or cannot be used.
         SolverError: the solver stopped without an optimum.
@@ -214,13 +219,21 @@ def identify(
     wanted = method or model.config.identification.method
     _check(wanted, recordings, validation)
     _check_convex(model, set_name, custom, solver, again=again)
+    if torque_constants:
+        require_known_load(recordings, model)
     base = base_parameters(model.chain, model.layout)
     sets = {name: feasible_set(name, base.names, model.config) for name in _SETS}
     kind: FeasibleSetName = model.config.feasible_set if set_name is None or set_name == "none" else set_name
     conditions = sets[kind]
 
-    prepared = prepare(recordings, model, base, conditions, validation)
+    constants: Literal["described", "unconstrained", "feasible"] = "described"
+    if torque_constants:
+        constants = "unconstrained" if set_name == "none" else "feasible"
+    step("choosing filter, delay and friction", 0.01)
+    prepared = prepare(recordings, model, base, conditions, validation, torque_constants=constants)
+    step("estimating without conditions", 0.45)
     found = unconstrained(wanted, recordings, prepared, base, conditions)
+    step("estimating inside the feasible set", 0.85)
     unseen = [(recording, _validation_equations(recording, prepared, base)) for recording in validation]
     prior = _prior(prepared.model, found, base, conditions)
     test = feasibility_test(found.fit.beta, base, conditions)

@@ -35,7 +35,7 @@ _RANK_TOLERANCE = 1e-10
 
 @dataclass(frozen=True)
 class ShapeUncertainty:
-    """Uncertainty of base parameters by the doubt about the friction's shape.
+    """Uncertainty of base parameters by the doubt about the friction's shape, or about torque constants.
 
     Attributes:
         covariance: to be added to theirs, shape (base, base), SI units.

@@ -46,8 +46,10 @@ from ident_service.fleet.population import (
     variance_shares,
 )
 from ident_service.fleet.reduction import (
+    REDUCED,
     FleetRequest,
     Reduced,
+    Step,
     Tell,
     absolute_url,
     connected,
@@ -85,13 +87,16 @@ from ident_service.results.parameter_file import write_parameters
 from ident_service.results.run_folder import PARAMETERS, write_manifest, write_results
 
 
-def identify_fleet(request: FleetRequest, folder: Path, tell: Tell = lambda _: None) -> FleetResult:
+def identify_fleet(
+    request: FleetRequest, folder: Path, tell: Tell = lambda _: None, step: Step = lambda words, share: None
+) -> FleetResult:
     """Identify a fleet and write the results.
 
     Args:
         request: what is asked for.
         folder: where results go; an earlier result there is replaced as a whole.
         tell: called with a line at each step.
+        step: called with what is being done and how much of all is done, from 0 to 1.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid, or the folder holds anything else.
@@ -105,8 +110,8 @@ def identify_fleet(request: FleetRequest, folder: Path, tell: Tell = lambda _: N
     for arm, _ in listed.whose.values():
         _require_file_name(arm)
     with connected(request, tell) as client:
-        reduced = reduce_fleet(client, request, listed, tell)
-        result, written, splits = _analysed(client, request, reduced, folder, tell)
+        reduced = reduce_fleet(client, request, listed, tell, step)
+        result, written, splits = _analysed(client, request, reduced, folder, tell, step)
     with staging_beside(folder) as staging:
         _write(staging, result, written, splits, request)
         _require_replaceable(folder)
@@ -142,7 +147,7 @@ _SUMMARY = "summary.json"
 
 
 def _analysed(
-    client: Client, request: FleetRequest, reduced: Reduced, folder: Path, tell: Tell
+    client: Client, request: FleetRequest, reduced: Reduced, folder: Path, tell: Tell, step: Step
 ) -> tuple[FleetResult, dict[str, tuple[Files, dict[str, Any]]], dict[str, tuple[Files, Files]]]:
     described, arms = reduced.described, reduced.arms
     groups = described.groups
@@ -154,6 +159,7 @@ def _analysed(
     def between(arm: str, count: int) -> Array | None:
         return None if reduced.trees[arm].by_recording else shares.recordings / count
 
+    step("fitting arms", REDUCED)
     tell(f"{len(arms)} arms: each alone, and all together")
     store = Store(absolute_url(request.store))
 
@@ -187,6 +193,7 @@ def _analysed(
     scatter = scatter_of(arms, groups)
     changes = change_points(arms, fits, groups, scatter)
     depending = dependences(arms, groups, scatter)
+    step("estimates inside the feasible set", 0.9)
     tell("estimates inside the feasible set, with their proofs")
     files_of: dict[str, Any] = {}
     config = load_arm(request.arm).model_dump_json()

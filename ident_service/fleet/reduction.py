@@ -47,6 +47,9 @@ from ident_service.fleet.storage import Source, Store, find
 
 _Result = TypeVar("_Result")
 Tell = Callable[[str], None]
+Step = Callable[[str, float], None]
+REDUCED = 0.7
+"""Share of the time of an identification of a fleet that the reduction of its recordings takes, as a rule."""
 
 PIECE_BYTES: Final = 256 * 2**20  # of a file, beyond which it is cut into pieces of time
 MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
@@ -274,7 +277,13 @@ def list_recordings(request: FleetRequest) -> Listed:
     return Listed(config, sources, {source.url: named(source.url) for source in sources})
 
 
-def reduce_fleet(client: Client, request: FleetRequest, listed: Listed, tell: Tell) -> Reduced:
+def reduce_fleet(
+    client: Client,
+    request: FleetRequest,
+    listed: Listed,
+    tell: Tell,
+    step: Step = lambda words, share: None,
+) -> Reduced:
     """Reduce recordings and merge those of each arm.
 
     Args:
@@ -282,6 +291,7 @@ def reduce_fleet(client: Client, request: FleetRequest, listed: Listed, tell: Te
         request: what to reduce.
         listed: its recordings.
         tell: called with a line at each step.
+        step: called with what is being done and how much of all is done, from 0 to 1.
 
     Raises:
         UsageError, ConfigError: the request or the description is not valid, or workers have other versions.
@@ -299,7 +309,7 @@ def reduce_fleet(client: Client, request: FleetRequest, listed: Listed, tell: Te
         for number in range(count)
     ]
     reduced = Reduced(described, pilot)
-    outcomes = _mapped(client, parts, described, store, tell)
+    outcomes = _mapped(client, parts, described, store, tell, step)
     seen: dict[tuple[str, str], str] = {}
     for outcome in outcomes:
         source, row = outcome.part.source, outcome.row
@@ -395,7 +405,9 @@ def _settled(
     )
 
 
-def _mapped(client: Client, parts: Sequence[Part], described: Described, store: Store, tell: Tell) -> list[Outcome]:
+def _mapped(
+    client: Client, parts: Sequence[Part], described: Described, store: Store, tell: Tell, step: Step
+) -> list[Outcome]:
     """Return the outcome of each part, in their order."""
     outcomes: list[Outcome | None] = [None] * len(parts)
     groups = [range(k, min(k + _LOOKED_UP, len(parts))) for k in range(0, len(parts), _LOOKED_UP)]
@@ -417,12 +429,13 @@ def _mapped(client: Client, parts: Sequence[Part], described: Described, store: 
         text = "ended every worker that read it, most likely for want of memory; give workers more with --memory"
         return Outcome(part, None, Problem(part.source.url, part.label, "worker", text))
 
-    step = max(len(new) // 10, 1)
+    every = max(len(new) // 10, 1)
     for count, (number, outcome) in enumerate(in_order(client, reduce_recording, tasks, died), 1):
         if outcome.problem is not None and outcome.problem.kind == "version":
             raise UsageError(outcome.problem.message)
         outcomes[new[number]] = outcome
-        if count % step == 0 or count == len(new):
+        step("reducing recordings", REDUCED * count / len(new))
+        if count % every == 0 or count == len(new):
             tell(f"{count} of {len(new)} recordings reduced")
     return [outcome for outcome in outcomes if outcome is not None]
 

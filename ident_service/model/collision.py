@@ -62,6 +62,23 @@ class Scene:
     contacts: tuple[tuple[tuple[int, int], ...], ...]
 
 
+def link_bodies(model: ArmModel) -> list[Body]:
+    """Return the solids of base and links: of the configuration, for links without any there of the URDF.
+
+    Raises:
+        ModelError: a link that does not exist, or a mesh where capsules are needed.
+    """
+    chain, config = model.chain, model.config
+    _check_names(model)
+    links = [body for name, capsules in config.geometry.items() for body in _link(chain, name, capsules)]
+    return links + urdf_solids(config.kinematics, chain, frozenset(config.geometry))
+
+
+def surroundings(model: ArmModel) -> list[Body]:
+    """Return the obstacles of the workspace, and the half spaces outside the box that the arm must stay in."""
+    return [*_obstacles(model.config.workspace), *_inside(model.config.workspace)]
+
+
 def scene(model: ArmModel) -> Scene:
     """Return the bodies of the configuration and, for links without geometry there, of the URDF.
 
@@ -70,10 +87,7 @@ def scene(model: ArmModel) -> Scene:
         MotionRefused: surroundings, but no body that could touch them.
     """
     chain, config = model.chain, model.config
-    _check_names(model)
-    links = [body for name, capsules in config.geometry.items() for body in _link(chain, name, capsules)]
-    links += urdf_solids(config.kinematics, chain, frozenset(config.geometry))
-    around = [*_obstacles(config.workspace), *_inside(config.workspace)]
+    links, around = link_bodies(model), surroundings(model)
     bodies = (*links, *around)
     if around and not links:
         raise MotionRefused(

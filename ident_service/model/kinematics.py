@@ -18,10 +18,25 @@ def frame_origins(chain: Chain, position: Array) -> Array:
         [m], shape (postures, 1 + 2 joints, 3): the base, then of every joint its own frame's and its link frame's.
     """
     origins = np.zeros((len(position), 1 + 2 * chain.joints, 3))
-    for k, (R, p) in enumerate(_joint_poses(chain, position)):
+    for k, (R, p) in enumerate(joint_poses(chain, position)):
         origins[:, 1 + 2 * k] = p
         origins[:, 2 + 2 * k] = p + R @ chain.link_translation[k]
     return origins
+
+
+def joint_frames(chain: Chain, position: Array) -> tuple[Array, Array]:
+    """Return orientation and origin of every joint frame in the base frame, where its link's solids stand still.
+
+    Args:
+        chain: the mechanism.
+        position: [rad or m], shape (postures, joints).
+
+    Returns:
+        Joint frame to base frame, shape (postures, joints, 3, 3), and its origin in the base frame [m], shape
+        (postures, joints, 3).
+    """
+    poses = joint_poses(chain, position)
+    return np.stack([R for R, _ in poses], axis=1), np.stack([p for _, p in poses], axis=1)
 
 
 def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
@@ -35,13 +50,13 @@ def link_poses(chain: Chain, position: Array) -> tuple[Array, Array]:
         Link frame to base frame, shape (postures, joints, 3, 3), and its origin in the base frame [m], shape
         (postures, joints, 3).
     """
-    poses = _joint_poses(chain, position)
+    poses = joint_poses(chain, position)
     turns = [R @ chain.link_rotation[k] for k, (R, _) in enumerate(poses)]
     places = [p + R @ chain.link_translation[k] for k, (R, p) in enumerate(poses)]
     return np.stack(turns, axis=1), np.stack(places, axis=1)
 
 
-def _joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
+def joint_poses(chain: Chain, position: Array) -> list[tuple[Array, Array]]:
     """Return per joint its rotation to the base frame, shape (postures, 3, 3), and origin [m], (postures, 3)."""
     postures = len(position)
     poses: list[tuple[Array, Array]] = []

@@ -84,12 +84,13 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     return LikelyBodies(delta, _drives(model, delta), "geometry" if guessed else "prior", names)
 
 
-def with_urdf_bodies(model: ArmModel) -> ArmModel:
-    """Return the model with every body of its URDF as its prior, also those that no real link could have."""
+def with_file_bodies(model: ArmModel) -> ArmModel:
+    """Return the model with every body of its URDF or MJCF as its prior, also those that no real link could have."""
     kinematics = model.config.kinematics
-    if kinematics.urdf is None:
+    file = kinematics.urdf or kinematics.mjcf
+    if file is None:
         return model
-    bodies = read_mechanism(kinematics.urdf, "urdf", kinematics).bodies
+    bodies = read_mechanism(file, "mjcf" if kinematics.urdf is None else "urdf", kinematics).bodies
     prior = np.zeros(model.layout.size)
     for link in range(model.layout.joints):
         prior[model.layout.inertial(link)] = bodies[link]

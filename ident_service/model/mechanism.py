@@ -12,6 +12,7 @@ import json
 import math
 import re
 import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -126,6 +127,24 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
     except expat.ExpatError as error:
         raise ModelError(f"{name}: not a {kind.upper()} that can be read: {error}") from None
     counter.finish()
+
+
+def parse_xml(text: str) -> ET.Element:
+    """Return the elements of a file that was counted, names with undeclared prefixes as they are.
+
+    Tools of simulators add attributes such as `drake:acceleration`, and often do not declare their prefixes.
+
+    Raises:
+        ModelError: not well-formed.
+    """
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate("utf-8")
+    parser.StartElementHandler = lambda tag, attributes: builder.start(tag, attributes)
+    parser.EndElementHandler = builder.end
+    try:
+        parser.Parse(text.encode("utf-8", "surrogatepass"), True)
+    except expat.ExpatError as error:
+        raise ModelError(f"not well-formed XML: {error}") from None
+    return builder.close()
 
 
 def require_urdf(file: TextFile) -> None:

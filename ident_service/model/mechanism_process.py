@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -59,10 +58,9 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
     found: dict[str, Mimic] = {}
     if "mimic" not in file.text:
         return found
-    try:
-        robot = ET.fromstring(file.text)  # noqa: S314 - entities were refused before
-    except ET.ParseError as error:
-        raise ModelError(f"not well-formed XML: {error}") from None
+    from ident_service.model.mechanism import parse_xml  # which loads what no MJCF needs
+
+    robot = parse_xml(file.text)
     # Numbers were checked by pinocchio's reader.
     for joint in robot.findall("joint"):
         if (mimic := joint.find("mimic")) is not None:

@@ -10,7 +10,7 @@ when it cannot read one of them, and knows no capsules. Where links sit is pinoc
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET  # only writes here; reading goes through pinocchio after a check
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -20,26 +20,29 @@ from ident_service.config.motion_design import BASE
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.mechanism import read_mechanism
+from ident_service.model.mechanism import parse_xml, read_mechanism
 from ident_service.model.parameter_layout import about_center, joint_drives
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, rotation_rpy
 
 BASE_LINK = "base_link"
 
 
-def urdf_text(model: ArmModel, delta: Array | None) -> str:
+def urdf_text(model: ArmModel, delta: Array | None, visible: Sequence[Body] = ()) -> str:
     """Return the arm as URDF text.
 
     Args:
         model: the mechanism and its limits.
         delta: link parameters, shape (layout.size,); without them the file has kinematics only.
+        visible: solids of base and links that viewers draw; a capsule becomes a cylinder and two spheres, since most
+            readers of URDF know none.
 
     Raises:
         ModelError: a link without positive mass, which URDF cannot express.
     """
     robot = ET.Element("robot", name=model.config.name)
     root = _root_name(model)
-    ET.SubElement(robot, "link", name=root)
+    base = ET.SubElement(robot, "link", name=root)
+    _write_visuals(base, visible, WORLD)
     inertials = None if delta is None else _inertials(model, delta)
     chain, layout = model.chain, model.layout
     for k, name in enumerate(chain.names):
@@ -51,6 +54,7 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
             ET.SubElement(inertial, "mass", value=repr(mass))
             entries = {key: repr(float(inertia[i, j])) for key, (i, j) in _ENTRIES.items()}
             ET.SubElement(inertial, "inertia", entries)
+        _write_visuals(link, visible, k)
         settings = model.config.joints.get(name, Joint())
         bounded = settings.position is not None or not chain.revolute[k]
         kind = ("revolute" if bounded else "continuous") if chain.revolute[k] else "prismatic"
@@ -78,6 +82,42 @@ def urdf_text(model: ArmModel, delta: Array | None) -> str:
             ET.SubElement(joint, "dynamics", damping=repr(damping), friction=repr(friction))
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
+
+
+def _write_visuals(link: ET.Element, visible: Sequence[Body], joint: int) -> None:
+    for body in visible:
+        if body.joint == joint:
+            for rotation, center, tag, sizes in _primitives(body.solid):
+                visual = ET.SubElement(link, "visual")
+                ET.SubElement(visual, "origin", xyz=_numbers(center), rpy=_numbers(roll_pitch_yaw(rotation)))
+                ET.SubElement(ET.SubElement(visual, "geometry"), tag, sizes)
+                # The colour with every use: some readers look up names only where they were defined on the top level.
+                material = ET.SubElement(visual, "material", name="ident_base" if joint == WORLD else "ident_link")
+                ET.SubElement(material, "color", rgba="0.35 0.38 0.42 1" if joint == WORLD else "0.85 0.6 0.25 1")
+
+
+def _primitives(solid: Solid) -> Iterator[tuple[Array, Array, str, dict[str, str]]]:
+    """Yield rotation, centre [m], tag and attributes of the shapes of URDF that make up a solid of a link."""
+    if isinstance(solid, Capsule):
+        radius, along = repr(float(solid.radius)), solid.end - solid.start
+        length = float(np.linalg.norm(along))
+        yield np.eye(3), solid.start, "sphere", {"radius": radius}
+        if length > 0.0:
+            yield np.eye(3), solid.end, "sphere", {"radius": radius}
+            middle = 0.5 * (solid.start + solid.end)
+            yield rotation_to(along / length), middle, "cylinder", {"radius": radius, "length": repr(length)}
+    elif isinstance(solid, Box):
+        yield solid.rotation, solid.center, "box", {"size": _numbers(2.0 * solid.half)}
+    elif isinstance(solid, Cylinder):
+        sizes = {"radius": repr(float(solid.radius)), "length": repr(2.0 * float(solid.half_length))}
+        yield solid.rotation, solid.center, "cylinder", sizes
+
+
+def rotation_to(direction: Array) -> Array:
+    """Return a rotation that takes the z axis to a direction of length one, shape (3, 3)."""
+    first = np.cross(np.eye(3)[int(np.argmin(np.abs(direction)))], direction)
+    first = first / np.linalg.norm(first)
+    return np.column_stack([first, np.cross(direction, first), direction])
 
 
 _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
@@ -142,7 +182,7 @@ def urdf_solids(kinematics: Kinematics, chain: Chain, skip: frozenset[str]) -> l
     frames = read_mechanism(file, "urdf", kinematics).frames
     bodies = []
     # Entities were refused when the chain was read from the same text.
-    for link in ET.fromstring(file.text).iter("link"):  # noqa: S314
+    for link in parse_xml(file.text).iter("link"):
         elements = link.findall("collision")
         if not elements:
             continue

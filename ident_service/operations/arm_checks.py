@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from drivers.arm import Arm
 from drivers.axis_status import AxisStatus
@@ -27,7 +27,7 @@ from ident_service.motion.ticket import Check, Measure, Ticket, Verdict, ticket_
 from ident_service.registry.state_folder import arm_folder, control_path
 from ident_service.results.manifest import write_atomically
 
-_TITLES = {
+TITLES: Final = {
     "configuration": "the description is complete",
     "motion_fits": "the motion was made for it",
     "motion_proven": "the motion keeps all limits (proof)",
@@ -41,6 +41,7 @@ _TITLES = {
     "direction": "direction and scale of every joint",
     "watchdog": "drives stop when the host is silent",
 }
+"""Titles of the preflight's checks, by their codes."""
 _WORDS = {
     Verdict.PASSED: "ok",
     Verdict.FAILED: "FAILED",
@@ -86,8 +87,8 @@ def ticket_text(ticket: Ticket, *, every_measure: bool = False) -> str:
 
 
 def _check_lines(check: Check, every_measure: bool) -> list[str]:
-    lines = [f"  {_WORDS[check.verdict]:<10} {_TITLES[check.code]}"]
-    shown = list(check.measures) if every_measure else [one for one in [_nearest(check)] if one is not None]
+    lines = [f"  {_WORDS[check.verdict]:<10} {TITLES[check.code]}"]
+    shown = list(check.measures) if every_measure else [one for one in [nearest_measure(check)] if one is not None]
     if check.verdict is Verdict.PASSED or every_measure:
         lines += [f"{'':13}{one}" for one in shown]
     if check.reason:
@@ -97,7 +98,7 @@ def _check_lines(check: Check, every_measure: bool) -> list[str]:
     return lines
 
 
-def _nearest(check: Check) -> Measure | None:
+def nearest_measure(check: Check) -> Measure | None:
     """Return the measure that is nearest to its limit."""
 
     def room(one: Measure) -> float:

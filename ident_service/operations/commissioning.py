@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm import Arm
-from drivers.clock import Clock
+from drivers.clock import Clock, utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
@@ -23,6 +23,7 @@ from ident_service.estimation.least_squares import torque_error
 from ident_service.estimation.plausibility import remarks_on_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
+from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
@@ -32,7 +33,7 @@ from ident_service.motion.command_channel import StopCondition
 from ident_service.motion.run import RunReport, run
 from ident_service.motion.run_plan import ExcitationPlan
 from ident_service.motion.state_machine import State
-from ident_service.operations.identification import unusable_because
+from ident_service.operations.identification import Step, unusable_because
 from ident_service.operations.recordings import recording_quality
 from ident_service.recordings.cached_recording import CachedRecording
 from ident_service.recordings.open import open_recording
@@ -44,6 +45,7 @@ from sim_backend.arm import SimulatedArm, Truth
 from sim_backend.remote_arm import RemoteArm
 
 _BLOCK = 4096
+_MOTIONS = 0.75  # share of a commissioning's time that its motions take, as a rule
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,7 @@ class Commissioning:
         runs: how the two motions went.
         score: against the truth.
         unusable: why the estimate must not be used; empty where nothing says so.
+        warnings: what is wrong with the recordings, in words.
     """
 
     folder: Path
@@ -141,6 +144,7 @@ class Commissioning:
     runs: tuple[RunReport, RunReport]
     score: Score
     unusable: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def record_motion(
@@ -168,12 +172,13 @@ def record_motion(
         "excitation.json": motion.to_json().encode(),
     }
     metadata = {"arm": model.config.name, "arm_sha256": model.config.sha256, "motion": motion.name}
-    description = urdf_text(model, model.prior)
+    description = urdf_text(model, model.prior, visible_bodies(model))
+    metadata["clock"] = "virtual" if arm.clock.lock_step else "monotonic"
     recorder = RecorderProcess(
         path,
         model.chain.names,
         description,
-        arm.clock.utc_offset_ns,
+        utc_offset_of_recording_ns(arm.clock),
         attachments,
         metadata,
         lock_step=arm.clock.lock_step,
@@ -193,6 +198,32 @@ def require_clear_from_home(model: ArmModel, motion: Excitation) -> None:
     plan.legs(model, limits.home, limits)
 
 
+def _counted(
+    stop_requested: Callable[[], bool], rate: float, planned: Excitation, before: float, each: float, step: Step
+) -> Callable[[], bool]:
+    """Return `stop_requested`, which is asked every cycle, with a step told every quarter of a second of the motion.
+
+    Args:
+        stop_requested: as it is.
+        rate: cycles per second.
+        planned: the motion.
+        before: share of all motions that is over before this one.
+        each: share of all that one second of motion is.
+        step: told.
+    """
+    cycles, every = 0, max(round(0.25 * rate), 1)
+
+    def asked() -> bool:
+        nonlocal cycles
+        cycles += 1
+        if cycles % every == 0:
+            seconds = min(cycles / rate, planned.duration)
+            step(f"{planned.name} motion", _MOTIONS * before + each * seconds)
+        return stop_requested()
+
+    return asked
+
+
 def simulate(
     config: ArmConfig,
     folder: Path,
@@ -203,6 +234,7 @@ def simulate(
     custom: CustomFunction | None = None,
     clock: Clock | None = None,
     tell: Tell = lambda _: None,
+    step: Step = lambda words, share: None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Commissioning:
     """Commission the simulated arm of a configuration, and score the result against its true parameters.
@@ -216,6 +248,7 @@ def simulate(
         custom: the function that its `constraints.custom` names.
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
+        step: called with what is being done and how much of all is done, from 0 to 1.
         stop_requested: asked every cycle.
 
     Raises:
@@ -233,7 +266,8 @@ def simulate(
     motions = [first, excitation(model, "validation")]
     for planned in motions[1:]:  # the first is checked when it begins; a later refusal would waste it
         require_clear_from_home(model, planned)
-    reports, observed = [], list[Truth]()
+    reports, observed = list[RunReport](), list[Truth]()
+    whole = sum(planned.duration for planned in motions)
     with atomic_folder(folder) as staging:
         paths = [staging / f"{planned.name}.mcap" for planned in motions]
         for planned, path in zip(motions, paths, strict=True):
@@ -242,26 +276,41 @@ def simulate(
             arm = make_arm(config, clock)
             if isinstance(arm, SimulatedArm | RemoteArm):
                 arm.observer = observed.append
-            report = record_motion(arm, model, planned, path, stop_requested)
+            driven = sum(one.duration for one in motions[: len(reports)])
+            asked = _counted(stop_requested, config.control.rate, planned, driven / whole, _MOTIONS / whole, step)
+            report = record_motion(arm, model, planned, path, asked)
             if report.state is not State.DONE:
                 # After a requested stop the arm must not move again.
                 raise ArmError(f"{planned.name} motion: stopped on request; nothing was kept")
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
         tell("identifying")
+        step("identifying", _MOTIONS)
         recordings = [CachedRecording(open_recording(path, model.chain.names)) for path in paths]
-        estimate = identify(model, recordings[:1], recordings[1:], set_name=set_name, custom=custom)
+        estimate = identify(
+            *(model, recordings[:1], recordings[1:]),
+            set_name=set_name,
+            custom=custom,
+            step=lambda words, share: step(words, _MOTIONS + 0.6 * share * (1.0 - _MOTIONS)),
+        )
+        step("scoring, and writing the report", _MOTIONS + 0.6 * (1.0 - _MOTIONS))
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         unusable = unusable_because(estimate, found)
-        write_results(staging, estimate, unusable=unusable, described=config if described is None else described)
-        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
         warnings += [line for one, seen in found for line in remarks_on_limits(one.path.name, seen.joints, model)]
         warnings += estimate.remarks
+        write_results(
+            staging,
+            estimate,
+            {"warnings": warnings},
+            unusable,
+            described=config if described is None else described,
+        )
+        write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
-    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable)
+    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable, tuple(warnings))
 
 
 def score_document(scored: Score) -> dict[str, object]:

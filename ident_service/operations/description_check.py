@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 from drivers.can.bus_load import Budget
-from ident_service.config.load import config_error, load_arm
-from ident_service.config.motion_limits import motion_limits
-from ident_service.config.quantities import ParameterTable
-from ident_service.errors import ModelError, MotionRefused, ParameterError
+from ident_service.config.arm import ArmConfig, Joint
+from ident_service.config.load import config_error, load_arm, located
+from ident_service.config.motion_limits import NEEDED, motion_limits
+from ident_service.config.quantities import ParameterTable, did_you_mean
+from ident_service.errors import ConfigError, ModelError, MotionRefused, ParameterError, Problem
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
+from ident_service.motion.arm_factory import GROUP
 from ident_service.operations.fieldbus import bus_lines, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
@@ -28,16 +31,21 @@ class CheckedDescription:
     Attributes:
         model: of its arm.
         budget: of its buses; None for an arm without drives on CAN.
-        gains: how stable they are; None for an arm that can be identified but not moved.
-        after_stop: what follows a stop, or why nothing may move; None likewise.
-        falling: joints that gravity moves when their drives are off.
+        gains: how stable they are; None for an arm without limits or gains.
+        after_stop: what follows a stop; None where nothing may move, or for an arm without a model.
+        objections: why the arm cannot be moved, each at its place in the file; none where it can be, and where the
+            description has no driver and does not ask for it.
+        missing: limits and gains that a motion would need, by joint, of an arm without a driver.
         warnings: what is allowed but probably a mistake, in words.
+        falling: joints that gravity moves when their drives are off.
     """
 
     model: ArmModel
     budget: Budget | None
     gains: StabilityReport | None
-    after_stop: StopSecuring | str | None
+    after_stop: StopSecuring | None
+    objections: tuple[Problem, ...] = ()
+    missing: tuple[Problem, ...] = ()
     warnings: tuple[str, ...] = ()
     falling: tuple[str, ...] = ()
 
@@ -49,8 +57,8 @@ class CheckedDescription:
 
     @property
     def good(self) -> bool:
-        """Return whether there are no objections to the gains or to what follows a stop."""
-        return (self.gains is None or self.gains.stable) and not isinstance(self.after_stop, str)
+        """Return whether nothing stands against what the description is for: identification, or motion."""
+        return not self.objections
 
 
 def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescription:
@@ -61,29 +69,69 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         upload: whether somebody has sent it (`load_arm`).
 
     Raises:
-        ConfigError: every mistake in it, each with line and column; also for an invalid mechanism, and for a bus
-            budget that does not fit.
+        ConfigError: every mistake in it, each with line and column; also for an invalid mechanism, a driver that is
+            not installed, and for a bus budget that does not fit.
     """
     config = load_arm(arm, upload=upload)
+    _require_driver(arm, config)
     try:
         model = arm_model(config)
-    except (ModelError, ParameterError) as error:
+    except ParameterError as error:
+        _require_names(arm, arm_model(config.model_copy(update={"prior": None, "payload": None})), config, ("prior",))
+        raise config_error(arm, ("prior",), str(error)) from None
+    except ModelError as error:
         raise config_error(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
-        _require_names(arm, model, where)
+        _require_names(arm, model, config, where)
     budget = require_budget(arm, model.config)
     warnings = remarks_on_angles(base_parameters(model.chain, model.layout))
+    if missing := _missing(arm, model):
+        checked = CheckedDescription(model, budget, None, None, warnings=warnings)
+        # An arm without a driver is identified from recordings, and needs none of them.
+        return replace(checked, missing=missing) if config.driver is None else replace(checked, objections=missing)
+    limits = motion_limits(model.config)
+    objections: list[Problem] = []
+    follows: StopSecuring | None = None
     try:
-        limits = motion_limits(model.config)
-    except MotionRefused:  # an arm that is only identified needs none
-        return CheckedDescription(model, budget, None, None, warnings)
-    try:
-        follows: StopSecuring | str | None = None if model.prior is None else after_stop(model, limits)
+        follows = None if model.prior is None else after_stop(model, limits)
     except MotionRefused as refusal:
-        follows = str(refusal)
+        # Its remedies are several keys; the joints are where brakes would stand.
+        objections.append(located(arm, ("control", "after_stop"), str(refusal)))
     falling = () if model.prior is None else falling_joints(model, limits)
+    if model.prior is None and config.driver is not None:
+        remedy = "give `prior`, or a URDF or MJCF with the masses of its links"
+        objections.append(
+            located(arm, ("kinematics",), f"kinematics: computed torque needs a model of the links; {remedy}")
+        )
     gains = stability(model, limits, delay_of(model.config))
-    return CheckedDescription(model, budget, gains, follows, warnings, falling)
+    for words in gains.objections():
+        joint = words.partition(":")[0]
+        where = ("joints", joint, "kp") if joint in config.joints else ("control", "rate")
+        remedy = "lower kp and kd, or raise control.rate or control.velocity_cutoff"
+        objections.append(located(arm, where, f"gains: {words}; {remedy}"))
+    return CheckedDescription(model, budget, gains, follows, tuple(objections), (), warnings, falling)
+
+
+def _missing(arm: str | Path, model: ArmModel) -> tuple[Problem, ...]:
+    """Return the limits and gains that a motion needs and a description lacks, a joint at a time."""
+    found = []
+    for name in model.chain.names:
+        joint = model.config.joints.get(name, Joint())
+        if lacking := [key for key in NEEDED if getattr(joint, key) is None]:
+            what = f"joints.{name}: a motion needs {', '.join(lacking)}"
+            found.append(located(arm, ("joints", name), f"{what}; `ident new` guesses them from a mechanism"))
+    return tuple(found)
+
+
+def _require_driver(arm: str | Path, config: ArmConfig) -> None:
+    """Refuse a kind of driver that nothing registers on this computer."""
+    if config.driver is None:
+        return
+    kinds = sorted(entry.name for entry in entry_points(group=GROUP))
+    if config.driver.kind not in kinds:
+        near = did_you_mean(config.driver.kind, kinds) or "; install the package that brings it, or take one of these"
+        known = ", ".join(kinds)
+        raise config_error(arm, ("driver", "kind"), f"no driver is called {config.driver.kind!r}; known: {known}{near}")
 
 
 def _place(message: str) -> tuple[str, ...]:
@@ -99,47 +147,68 @@ def _place(message: str) -> tuple[str, ...]:
     return (next((key for words, key in about.items() if words in message), "kinematics"),)
 
 
-def _require_names(arm: str | Path, model: ArmModel, where: tuple[str, ...]) -> None:
-    """Check that a simulated plant's parameters are those of this arm."""
-    section: Any = model.config
+def _require_names(arm: str | Path, model: ArmModel, config: ArmConfig, where: tuple[str, ...]) -> None:
+    """Refuse names in a table of parameters that this arm does not have, each at its place."""
+    section: Any = config
     for key in where:
         section = getattr(section, key, None)
-    if isinstance(section, ParameterTable):
-        try:
-            model.layout.vector(section)
-        except ParameterError as error:
-            raise config_error(arm, where, str(error)) from None
+    if not isinstance(section, ParameterTable):
+        return
+    known = model.layout.names
+    problems = [
+        located(
+            arm,
+            (*where, name),
+            f"{'.'.join(where)}: parameters this arm does not have: {name}"
+            + (did_you_mean(name, known) or f"; it has {known[0]} ... {known[-1]}"),
+        )
+        for name in section.names
+        if name not in known
+    ]
+    if problems:
+        raise ConfigError(problems)
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:
     """Return a checked description as JSON values."""
     config, report = checked.model.config, checked.gains
     gains = None if report is None else {"stable": report.stable, "objections": report.objections()}
+    movable = checked.good and not checked.missing
     return {
         "arm": config.name,
         "sha256": config.sha256,
         "problems": [],
+        "good": checked.good,
+        "movable": movable,
+        "objections": [f"{one.line}:{one.column}: {one.message}" for one in checked.objections],
+        "missing": [f"{one.line}:{one.column}: {one.message}" for one in checked.missing],
         "warnings": list(checked.warnings),
         "payload": None if config.payload is None else config.payload.model_dump(mode="json"),
         "stability": None if report is None or gains is None else asdict(report) | gains,
-        "after_stop": checked.after_stop.value if isinstance(checked.after_stop, StopSecuring) else None,
-        "objection": checked.after_stop if isinstance(checked.after_stop, str) else None,
+        "after_stop": None if checked.after_stop is None else checked.after_stop.value,
+        "objection": "; ".join(one.message for one in checked.objections) or None,
         "falling": list(checked.falling),
         "assumed_brakes": list(checked.assumed_brakes) if checked.after_stop is StopSecuring.BRAKE else [],
     }
 
 
 def description_text(arm: str, checked: CheckedDescription) -> str:
-    """Format a checked description as text; `arm` as the user named it."""
+    """Format a checked description as text, the verdict first; `arm` as the user named it."""
     model = checked.model
-    head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: good\n"
+    verdict = "good"
+    if checked.missing:
+        verdict = "good for identification from recordings; it cannot be moved"
+    if checked.objections:
+        verdict = "CANNOT MOVE"
+    head = f"{arm}: {model.config.name}, {model.chain.joints} joints, {model.layout.size} parameters: {verdict}\n"
+    head += "".join(f"  {one}\n" for one in (*checked.objections, *checked.missing))
     if (payload := model.config.payload) is not None:
         unknown = "; no prior, so no model has it" if model.prior is None else ""
         head += f"payload: {payload.words}{unknown}\n"
     head += "".join(f"WARNING: {line}\n" for line in checked.warnings)
     head += "" if checked.budget is None else bus_lines(checked.budget)
     if checked.gains is None:
-        return head + "gains: not checked; limits or gains are missing, so this arm can be identified but not moved\n"
+        return head + "gains: not checked, because limits or gains are missing\n"
     return head + _after_stop_text(checked) + _gains_text(checked.gains)
 
 
@@ -157,9 +226,7 @@ def _after_stop_text(checked: CheckedDescription) -> str:
         StopSecuring.HOLD: "held until a person confirms that the arm is supported (`ident supported`)",
         StopSecuring.LOWER: "lowered until it rests",
     }
-    if follows is None:
-        return ""
-    return f"after a stop: {words[follows]}\n" if isinstance(follows, StopSecuring) else f"CANNOT MOVE: {follows}\n"
+    return "" if follows is None else f"after a stop: {words[follows]}\n"
 
 
 def _gains_text(report: StabilityReport) -> str:
@@ -169,7 +236,7 @@ def _gains_text(report: StabilityReport) -> str:
     cycles = "one cycle" if report.delay_cycles == 1 else f"{report.delay_cycles} cycles"
     lines = [
         f"gains at {1.0 / report.period:g} Hz with {cycles} of delay: "
-        + ("stable" if report.stable else "NOT STABLE ENOUGH; lower kp and kd, or raise the rate or the cut-off"),
+        + ("stable" if report.stable else "NOT STABLE ENOUGH"),
         f"  {'joint':<{width}} {'gain margin':>12} {'delay margin':>13}",
         *(f"  {one.joint:<{width}} {one.gain_margin:>12.2f} {1e3 * one.delay_margin:>10.2f} ms" for one in joints),
     ]
@@ -177,4 +244,4 @@ def _gains_text(report: StabilityReport) -> str:
         lines.append("  without a prior, each joint is checked by itself")
     else:
         lines.append(f"  all joints together: spectral radius {report.coupled_radius:.6f}, below 1 is stable")
-    return "\n".join([*lines, *(f"  {words}" for words in report.objections()), ""])
+    return "\n".join([*lines, ""])

@@ -1,39 +1,67 @@
-"""Judge an uploaded description as a separate program; `judge_apart` runs it within limits.
+"""Judge an uploaded description, or write one from an uploaded URDF, as a separate program within limits.
 
-The daemon has loaded the description by then, within the limits of size; this process does the computations on its
-model.
+The daemon has loaded a description by then, within the limits of size; this process does the computations on its
+model. Of a URDF it has looked at nothing.
 """
 
 from __future__ import annotations
 
+import re
 import sys
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any, Final
 
+from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, IdentError, ModelError, Problem
 from ident_service.model.limited_process import answer_within, run_limited_process
 
 MOST_MEMORY: Final = 2 * 2**30  # bytes of address space
 MOST_SECONDS: Final = 20  # s of CPU time; ordinary arms take one
+_NEW_SECONDS: Final = 60  # s of CPU time; ordinary arms take five
 _DEADLINE = 60.0  # s
+_MODULE: Final = "ident_service.operations.description_process"
+_NEW = "new"  # the word for the second thing
 
 
 def judge_apart(path: Path) -> dict[str, Any]:
     """Judge an uploaded description in a separate process.
 
     Returns:
-        `arm`, `sha256`, `stable`, `objections` and `text`.
+        `arm`, `sha256`, `good`, `stable`, `objections` and `text`.
 
     Raises:
         ConfigError: its mistakes.
         ModelError: any other error of it, or judging it takes too long or crashes.
     """
     try:
-        answer = run_limited_process("ident_service.operations.description_process", path, _DEADLINE)
+        answer = run_limited_process(_MODULE, path, _DEADLINE)
     except ModelError as error:
         raise ModelError(f"{path.name}: {error}") from None
     if (problems := answer.get("problems")) is not None:
         raise ConfigError([Problem(Path(where), line, column, said) for where, line, column, said in problems])
+    if (error_text := answer.get("error")) is not None:
+        raise ModelError(error_text)
+    return answer
+
+
+def describe_apart(path: Path, name: str) -> dict[str, Any]:
+    """Write a first description of an uploaded URDF in a separate process.
+
+    Args:
+        path: of the URDF, its meshes beside it.
+        name: of the arm.
+
+    Returns:
+        `description` (YAML), `files` that it names, name to text, and `guessed`, what to look at.
+
+    Raises:
+        ModelError: there is no arm in it, or it takes too long or crashes.
+    """
+    try:
+        answer = run_limited_process(_MODULE, path, 3.0 * _DEADLINE, _NEW, name)
+    except ModelError as error:
+        raise ModelError(f"{path.name}: {error}") from None
     if (error_text := answer.get("error")) is not None:
         raise ModelError(error_text)
     return answer
@@ -53,13 +81,50 @@ def _document(path: str) -> dict[str, Any]:
         "arm": checked.model.config.name,
         "sha256": checked.model.config.sha256,
         "stable": None if gains is None else gains.stable,
-        "objections": [] if gains is None else list(gains.objections()),
+        "good": checked.good,
+        "objections": [f"{one.line}:{one.column}: {one.message}" for one in checked.objections],
         "text": description_text(Path(path).name, checked),
     }
 
 
+def _new_document(source: Path, name: str) -> dict[str, Any]:
+    from ident_service.operations.new_description import new_description
+
+    place = source.parent / "described"
+    try:
+        _require_own_meshes(source)
+        place.mkdir()
+        path, guessed = new_description(source, place / f"{name}.yaml", name)
+        files = {one.name: one.read_text(encoding="utf-8") for one in sorted(place.iterdir()) if one != path}
+        named = {file: text for file, text in files.items() if file == source.name}
+        return {"description": path.read_text(encoding="utf-8"), "files": named, "guessed": list(guessed)}
+    except (IdentError, OSError, UnicodeError) as error:
+        return {"error": str(error).replace(f"{place}/", "").replace(f"{source.parent}/", "")}
+
+
+def _require_own_meshes(source: Path) -> None:
+    """Let the meshes that a URDF names be those beside it, whatever path it gives them: nothing else is read.
+
+    Raises:
+        ModelError: not a URDF, or larger than one is.
+    """
+    from ident_service.model.mechanism import count_mechanism
+
+    text = source.read_text(encoding="utf-8")
+    count_mechanism(TextFile(name=source.name, text=text), "urdf")
+    try:
+        robot = ET.fromstring(text)  # noqa: S314 - counted just now
+    except ET.ParseError as error:
+        raise ModelError(f"{source.name}: not well-formed XML: {error}") from None
+    for mesh in robot.iter("mesh"):
+        mesh.set("filename", re.split(r"[/\\]", mesh.get("filename", ""))[-1])
+    source.write_text(ET.tostring(robot, encoding="unicode"), encoding="utf-8")
+
+
 def main(words: list[str]) -> int:
-    """Judge the description file that the first argument names."""
+    """Judge the description file that the first argument names, or describe the URDF there."""
+    if words[1:2] == [_NEW]:
+        return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(words[0]), words[2]))
     return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: _document(words[0]))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ident_service.config.arm import ArmConfig, Method
 from ident_service.config.load import config_error, folder_of, load_arm, load_recording_format
+from ident_service.config.payload import Payload
 from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
@@ -29,6 +30,7 @@ from ident_service.estimation.plausibility import (
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
 from ident_service.operations.recordings import (
+    known_payloads,
     open_together,
     own_formats,
     recording_quality,
@@ -41,6 +43,9 @@ from ident_service.results.manifest import replacing_folder, require_replaceable
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
 
+Step = Callable[[str, float], None]
+"""Is told what is being done, and how much of all is done, from 0 to 1."""
+
 
 @dataclass(frozen=True)
 class Request:
@@ -52,6 +57,8 @@ class Request:
         validation: to judge on; likewise.
         columns: a YAML file with the keys of the arm's `recording` section, instead of it.
         columns_of: such a file for one recording each, of those above.
+        payloads: a YAML file with the keys of a description's section `payload` for recordings with a known load.
+        torque_constants: whether to identify those of the motors jointly with the parameters.
         cut_standstill: whether to leave out standstill at the ends of every recording.
         method: estimator, the arm's when None.
         set_name: feasible set, the arm's when None.
@@ -70,6 +77,8 @@ class Request:
     validation: tuple[Path, ...] = ()
     columns: Path | None = None
     columns_of: Mapping[Path, Path] = field(default_factory=dict)
+    payloads: Mapping[Path, Path] = field(default_factory=dict)
+    torque_constants: bool = False
     cut_standstill: bool = False
     method: Method | None = None
     set_name: SetName | None = None
@@ -103,7 +112,10 @@ class IdentificationResult:
 
 
 def identify_files(
-    request: Request, folder: Path, tell: Callable[[str], None] = lambda _: None
+    request: Request,
+    folder: Path,
+    tell: Callable[[str], None] = lambda _: None,
+    step: Step = lambda words, share: None,
 ) -> IdentificationResult:
     """Identify an arm from files and write the results.
 
@@ -111,6 +123,8 @@ def identify_files(
         request: what is asked for.
         folder: where results go; an earlier result there is replaced as a whole.
         tell: called with a line at each step that takes longer.
+        step: called with what is being done and how much of all is done, from 0 to 1; shares are those of an arm of
+            seven joints on a minute of data.
 
     Raises:
         UsageError, ConfigError: the request or the arm's description is not valid, or the folder holds anything
@@ -129,16 +143,23 @@ def identify_files(
         forms = dict.fromkeys(paths, config.recording) | forms
         untrimmed = config.recording.model_copy(update={"trim": (0.0, 0.0)})
         model = arm_model(config.model_copy(update={"recording": untrimmed}))
-    opened = open_together(paths, model, forms)
+    step("reading recordings", 0.0)
+    loads = known_payloads(request.payloads, paths, model)
+    opened = open_together(paths, model, forms, payloads=loads)
     recordings = opened.recordings[: len(request.recordings)]
     validation = opened.recordings[len(request.recordings) :]
     for recording in (*recordings, *validation):
         start, end = removed_standstill(recording)
         if start or end:
             tell(f"{recording.path.name}: standstill left out, {start:.2f} s at the start and {end:.2f} s at the end")
-    found = [(recording, recording_quality(recording, model)) for recording in opened.recordings]
+    found = list[tuple[Recording, Quality]]()
+    for count, recording in enumerate(opened.recordings):
+        step(f"looking at {recording.path.name}", 0.1 + 0.1 * count / len(opened.recordings))
+        found.append((recording, recording_quality(recording, model)))
     warnings = opened.remarks
     warnings += tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
+    # Replicates take 0.05 s each, reduction a third of the rest; neither is known better before.
+    estimated = 0.8 / (1.0 + 0.005 * request.replicates + 0.3 * request.essential)
     try:
         estimate = identify(
             model,
@@ -149,6 +170,8 @@ def identify_files(
             custom=custom,
             solver=request.solver,
             again=request.second_opinion,
+            step=lambda words, share: step(words, 0.2 + share * (estimated - 0.2)),
+            torque_constants=request.torque_constants,
         )
     except CustomError as error:
         raise config_error(request.arm, CUSTOM, str(error)) from error
@@ -162,13 +185,20 @@ def identify_files(
         warnings += remarks_on_limits(recording.path.name, seen.joints, model)
     warnings += estimate.remarks
     unusable = unusable_because(estimate, found)
-    more: dict[str, Any] = {"recording_quality": [_quality_document(recording, seen) for recording, seen in found]}
+    more: dict[str, Any] = {
+        "recording_quality": [_quality_document(recording, seen) for recording, seen in found],
+        "warnings": list(warnings),
+        **_known_loads(loads),
+    }
     if request.replicates:
+        step("bootstrap", estimated)
         tell(f"bootstrap of {request.replicates} replicates")
         more["bootstrap"] = _bootstrap(estimate, request.replicates)
     if request.essential:
+        step("essential parameters", 0.7)
         tell("essential parameters")
         more["essential"] = _essential(estimate)
+    step("writing results and report", 0.8)
     with replacing_folder(folder) as staging:
         files = write_results(staging, estimate, more, unusable, described, opened.torque)
         if request.sdpa:
@@ -250,6 +280,13 @@ def _quality_document(recording: Recording, seen: Quality) -> dict[str, Any]:
             {"joint": joint.name, "saturated": joint.saturated, "standstill": joint.standstill} for joint in seen.joints
         ],
     }
+
+
+def _known_loads(loads: Mapping[Path, Payload]) -> dict[str, Any]:
+    if not loads:
+        return {}
+    said = [{"recording": path.name, **load.model_dump(mode="json")} for path, load in loads.items()]
+    return {"known_payloads": said}
 
 
 def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,8 @@ from pydantic import ValidationError
 
 from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Design
-from ident_service.config.motion_design import Obstacle as ConfiguredObstacle
 from ident_service.config.motion_limits import motion_limits
-from ident_service.errors import UsageError
+from ident_service.errors import UsageError, plain_mistake
 from ident_service.estimation.equations import equations
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import Designed, complete_task, design_motion, family
@@ -28,9 +26,9 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
-from ident_service.model.kinematics import branches, frame_origins
 from ident_service.model.regressor import joint_regressor
 from ident_service.motion.clearance import touching_stop
+from ident_service.operations.arm_pictures import postures
 from ident_service.operations.motion_preview import Preview, preview, preview_document, preview_text, recorded_noise
 from ident_service.operations.recordings import open_together
 from ident_service.preflight.stability import delay_of, stability
@@ -38,7 +36,7 @@ from ident_service.recordings.adapters import overlap
 from ident_service.results.manifest import atomic_folder, require_place, write_atomically
 from ident_service.results.motion_figures import MotionTraces, joints_over_time
 from ident_service.results.parameter_file import read_parameters
-from ident_service.results.posture_figure import Box, Closest, Plane, Postures, Rod, stick_figure
+from ident_service.results.posture_figure import Closest, Postures, stick_figure
 
 DRAWINGS = ("joints.svg", "arm.svg")
 _SAMPLES, _POSTURES = 6000, 400
@@ -79,50 +77,14 @@ def _traces(seen: Preview) -> MotionTraces:
 
 
 def _postures(seen: Preview) -> Postures:
-    path, model = seen.excitation.path, seen.model
+    path, nearest = seen.excitation.path, seen.proof.clearance
     time = np.linspace(0.0, path.distinct[-2 if len(path.distinct) > 2 else -1][1], _POSTURES)
-    closest: Closest | None = None
-    nearest = seen.proof.clearance
-    if nearest is not None and nearest.pair is not None and nearest.time is not None:
-        time = np.unique(np.append(time, nearest.time))
-        first, _, second = nearest.pair.partition(" - ")
-        closest = Closest(int(np.searchsorted(time, nearest.time)), (first, second), nearest.sampled)
-    workspace = model.config.workspace
-    box: Array | None = None
-    if workspace.inside is not None:
-        ranges = (workspace.inside.x, workspace.inside.y, workspace.inside.z)
-        box = np.array([pair if pair is not None else (-np.inf, np.inf) for pair in ranges]).T
-    return Postures(
-        frames=frame_origins(model.chain, path.at(time)[0]),
-        times=time,
-        branches=branches(model.chain),
-        obstacles=tuple(_solid(name, obstacle) for name, obstacle in workspace.obstacles.items()),
-        workspace=box,
-        closest=closest,
-    )
-
-
-def _solid(name: str, obstacle: ConfiguredObstacle) -> Box | Plane | Rod:
-    if obstacle.half_space is not None:
-        normal = np.array(obstacle.half_space.normal)
-        length = float(np.linalg.norm(normal))
-        return Plane(name, normal / length, obstacle.half_space.offset / length)
-    if obstacle.capsule is not None:
-        return Rod(name, np.array([obstacle.capsule.start, obstacle.capsule.end]), obstacle.capsule.radius)
-    if obstacle.box is None:
-        raise AssertionError("an obstacle is one solid")
-    box = obstacle.box
-    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * np.array(box.size)
-    return Box(name, corners @ _turned(box.rpy).T + np.array(box.center))
-
-
-def _turned(rpy: tuple[float, float, float]) -> Array:
-    """Return the rotation by roll about x, pitch about y and yaw about z of the base, in this order, shape (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(z @ y @ x)
+    if nearest is None or nearest.pair is None or nearest.time is None:
+        return postures(seen.model, path, time)
+    time = np.unique(np.append(time, nearest.time))
+    first, _, second = nearest.pair.partition(" - ")
+    closest = Closest(int(np.searchsorted(time, nearest.time)), (first, second), nearest.sampled)
+    return postures(seen.model, path, time, closest)
 
 
 MOTION, SEARCH, PREVIEW, DOCUMENT = "motion.json", "search.json", "preview.txt", "preview.json"
@@ -300,7 +262,7 @@ def _changed(design: Design, changes: dict[str, Any]) -> Design:
     try:
         return Design.model_validate(design.model_dump() | changes)
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
+        wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors())
         raise UsageError(f"design: {wrong}") from None
 
 

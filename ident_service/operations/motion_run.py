@@ -29,6 +29,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
+from drivers.clock import utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import (
     ArmError,
@@ -43,6 +44,7 @@ from ident_service.errors import (
 from ident_service.estimation.target import Target
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath
+from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.urdf import urdf_text
@@ -73,11 +75,13 @@ class ProcessResult:
         report: of a run that was done or stopped, else empty.
         error: kind, message, and code of a fault; else empty.
         code: exit code, None while it runs.
+        taken: whether the process has had the arm.
     """
 
     report: dict[str, Any]
     error: dict[str, str]
     code: int | None = None
+    taken: bool = False
 
     @property
     def heard(self) -> bool:
@@ -255,6 +259,7 @@ class _Watch:
 
     def _take(self, said: dict[str, Any]) -> None:
         if "pid" in said:
+            self.ending.taken = True
             with suppress(UsageError):  # it died at once, as the next read will show
                 self._controls = ControlFile.reach(self._path)
         self.ending.report = said.get("report", self.ending.report)
@@ -398,6 +403,7 @@ def run_motion(
     log_frames: bool = False,
     begin: Callable[[], None] = lambda: None,
     tell: Callable[[str], None] = lambda _: None,
+    moved: Callable[[float], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
     asked_ns: int | None = None,
     until: Target | None = None,
@@ -415,6 +421,7 @@ def run_motion(
         log_frames: whether every frame of the fieldbus is kept in `can.log`, too, in candump's format.
         begin: called when all checks that do not need the arm have passed, and the folder exists.
         tell: called with each state that is entered.
+        moved: called several times a second with how long the arm has been driven, in its own time [s].
         stop_requested: asked several times a second.
         asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
             was asked for since then keeps it from beginning.
@@ -452,13 +459,14 @@ def run_motion(
     if excitation is not None:
         attachments["excitation.json"] = excitation.encode()
     metadata = {"arm": config.name, "arm_sha256": config.sha256, "motion": name, "speed": repr(speed)}
+    metadata["clock"] = "virtual" if clock.lock_step else "monotonic"
     recording = folder / "run.mcap"
-    description = urdf_text(model, model.prior)
+    description = urdf_text(model, model.prior, visible_bodies(model))
     recorder = RecorderProcess(
         recording,
         model.chain.names,
         description,
-        clock.utc_offset_ns,
+        utc_offset_of_recording_ns(clock),
         attachments,
         metadata,
         lock_step=clock.lock_step,
@@ -477,7 +485,12 @@ def run_motion(
         "speed": speed,
         "log_frames": log_frames,
     }
-    started = False
+    started, ending = False, None
+
+    def watched() -> bool:
+        moved(recorder.written / config.control.rate)
+        return stop_requested()
+
     try:
         write_ticket(folder / "ticket.json", ticket)
         for file, content in attachments.items():
@@ -489,10 +502,11 @@ def run_motion(
         with recorder, reaching or nullcontext():
             started = True
             finish = (lambda: False) if reaching is None else reaching.reached
-            ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, stop_requested, finish)
+            ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, watched, finish)
             ending.raise_for(faults)
     except BaseException as error:
-        if started and not (isinstance(error, MotionRefused) and not faults.latched()):
+        refused = isinstance(error, MotionRefused) or (ending is not None and ending.heard and not ending.taken)
+        if started and not (refused and not faults.latched()):
             _keep(folder, error)
         else:
             shutil.rmtree(folder, ignore_errors=True)

@@ -10,7 +10,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ident_service.config.load import load_recording_format
+from ident_service.config.load import load_payload, load_recording_format
+from ident_service.config.payload import Payload
 from ident_service.config.recording import RecordingFormat, disagreements, mismatched_units
 from ident_service.errors import RecordingError, UsageError
 from ident_service.estimation.spectra import EDGE, USUAL
@@ -71,6 +72,7 @@ def open_together(
     model: ArmModel,
     forms: Mapping[Path, RecordingFormat] = MappingProxyType({}),
     torque: Torque | None = None,
+    payloads: Mapping[Path, Payload] = MappingProxyType({}),
 ) -> OpenedRecordings:
     """Open recordings for one estimate, with the same kind of torque in all that ident recorded.
 
@@ -82,12 +84,13 @@ def open_together(
         model: the arm, whose `identification.torque` may demand one of them.
         forms: how each file is laid out, where not as the description says.
         torque: that must be used, in place of the description's.
+        payloads: known load of each recording that has one, beside that of the description.
 
     Raises:
         UsageError, RecordingError: as `open_for`; a recording lacks the torque that is demanded.
     """
     asked = torque or model.config.identification.torque
-    found = [open_for_arm(path, model, forms.get(path), asked) for path in paths]
+    found = [open_for_arm(path, model, forms.get(path), asked, payloads.get(path)) for path in paths]
     kinds = [torque_in(recording) for recording in found]
     remarks = tuple(
         f"{recording.path}: left out from {recording.ended:.6g} s after its first sample on: the motion was stopped,"
@@ -104,7 +107,9 @@ def open_together(
         )
         for place, kind in enumerate(kinds):
             if kind == "measured":
-                found[place] = open_for_arm(paths[place], model, forms.get(paths[place]), "commanded")
+                found[place] = open_for_arm(
+                    paths[place], model, forms.get(paths[place]), "commanded", payloads.get(paths[place])
+                )
         kinds = ["commanded" if kind == "measured" else kind for kind in kinds]
     return OpenedRecordings(tuple(found), " and ".join(dict.fromkeys(kinds)), remarks)
 
@@ -119,7 +124,11 @@ def torque_in(recording: Recording) -> str:
 
 
 def open_for_arm(
-    path: Path, model: ArmModel, form: RecordingFormat | None = None, torque: Torque | None = None
+    path: Path,
+    model: ArmModel,
+    form: RecordingFormat | None = None,
+    torque: Torque | None = None,
+    payload: Payload | None = None,
 ) -> Recording:
     """Open a recording, or a range of one, for an arm.
 
@@ -129,6 +138,7 @@ def open_for_arm(
         form: how this file is laid out, and what to trim; as the arm's description says when None. Its `trim` counts
             where it is not the description's, which whatever reads the recording leaves out.
         torque: that is to be read, in place of the description's.
+        payload: known load that the arm carried, beside that of the description.
 
     Raises:
         UsageError: no such file, or no such range.
@@ -139,7 +149,9 @@ def open_for_arm(
     # Cached, because quality, friction, equations and evidence each read the recording.
     torque = torque or model.config.identification.torque
     whole = open_recording(file, model.chain.names, fmt=form, transmission=gears, torque=torque)
-    recording: Recording = CachedRecording(whole)
+    cached = CachedRecording(whole)
+    cached.payload = payload
+    recording: Recording = cached
     if isinstance(whole, McapRecording | MeasuredRecording) and (ended := _ended(whole, recording)) is not None:
         # A range that a person asks for beyond this end is empty, and the error says so.
         recording = RangeRecording(recording, 0.0, ended)
@@ -202,6 +214,33 @@ def own_formats(
         if wrong:
             raise UsageError(f"{file}: {'; '.join(wrong)}")
         found |= dict.fromkeys(named, form)
+    return found
+
+
+def known_payloads(files: Mapping[Path, Path], recordings: Sequence[Path], model: ArmModel) -> dict[Path, Payload]:
+    """Read the files of known payloads.
+
+    Args:
+        files: of each recording that has one: YAML with the keys of a description's section `payload`.
+        recordings: all that are read, as they were named.
+        model: the arm.
+
+    Returns:
+        The payload of each recording that has one, by the name it was given with.
+
+    Raises:
+        UsageError: no such recording, or a link that the arm does not have.
+        ConfigError: mistakes in a file.
+    """
+    found: dict[Path, Payload] = {}
+    for wanted, file in files.items():
+        named = [path for path in recordings if wanted in (path, file_and_range(path)[0])]
+        if not named:
+            raise UsageError(f"--payload {wanted}={file}: {wanted} is none of the recordings")
+        payload = load_payload(file)
+        if payload.link is not None and payload.link not in model.chain.names:
+            raise UsageError(f"{file}: link: {payload.link!r} is none of {', '.join(model.chain.names)}")
+        found |= dict.fromkeys(named, payload)
     return found
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ident_service.config.recording import Transmission
 from ident_service.errors import RecordingError
-from ident_service.recordings.cached_recording import Memory, memory_of
+from ident_service.recordings.cached_recording import Memory, memory_of, payload_of
 from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.quality import STANDSTILL
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Recording, cut
@@ -63,6 +63,7 @@ class RangeRecording:
         self.whole: Recording = whole.whole if isinstance(whole, RangeRecording) else whole
         kept = memory_of(self.whole)
         self.memory = None if kept is None else Memory(kept.max_bytes)
+        self.payload = payload_of(self.whole)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
         """Read the samples in order; see `Recording.blocks`. Blocks at the ends are shorter.

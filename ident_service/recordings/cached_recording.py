@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
+from ident_service.config.payload import Payload
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Recording, Stamps, cut, join
 
 MAX_BYTES: Final = 128 << 20  # a quarter of an hour of seven joints at 1 kHz
@@ -38,8 +39,18 @@ def memory_of(recording: Recording) -> Memory | None:
     return found if isinstance(found, Memory) else None
 
 
+def payload_of(recording: Recording) -> Payload | None:
+    """Return the known load that the arm carried in a recording, or a range of one; None for none."""
+    found = getattr(recording, "payload", None)
+    return found if isinstance(found, Payload) else None
+
+
 class CachedRecording:
-    """Cache another recording behind the same protocol; one larger than a bound is read from its file every time."""
+    """Cache another recording behind the same protocol; one larger than a bound is read from its file every time.
+
+    Attributes:
+        payload: known load that the arm carried, beside that of its description; None for none.
+    """
 
     def __init__(self, whole: Recording, max_bytes: int = MAX_BYTES) -> None:
         """Wrap `whole`, and cache at most `max_bytes` of its samples."""
@@ -52,6 +63,7 @@ class CachedRecording:
         self._whole, self._max_bytes = whole, max_bytes
         self._kept: Block | None = None
         self.memory = Memory(max_bytes)
+        self.payload: Payload | None = None
 
     @property
     def torn(self) -> bool:

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from ident_service.errors import RecordingError
 from ident_service.recordings import mcap_records as mcap
-from ident_service.recordings.mcap_reader import Layout, PayloadError, event
+from ident_service.recordings.mcap_reader import Event, Layout, PayloadError, event
 from ident_service.recordings.recording import Matrix, Stamps
 
 MOST_BYTES: Final = 1 << 20
+MOST_EVENTS: Final = 500
 _HEAD: Final = struct.Struct("<BQ")
-_STATES, _COMMANDS, _EVENTS = "/joint_states", "/joint_commands", "/events"
+_STATES, _COMMANDS, _TORQUES, _EVENTS = "/joint_states", "/joint_commands", "/joint_torques", "/events"
 _EXCITING = "exciting"  # value of `State.EXCITING` in `motion/state_machine.py`
 
 
@@ -36,12 +37,15 @@ class Samples:
         position: measured [rad or m], shape (samples, joints).
         torque: commanded, after clipping [N m or N], shape (samples, joints).
         reference: position that was asked for [rad or m], shape (samples, joints).
+        measured: torque that drives measured [N m or N], NaN where none was told, shape (samples, joints); None where
+            the recording has none in these cycles.
     """
 
     stamp_ns: Stamps
     position: Matrix
     torque: Matrix
     reference: Matrix
+    measured: Matrix | None = None
 
 
 class RecordingFollower:
@@ -51,6 +55,7 @@ class RecordingFollower:
         ended: whether the recording's data has come to its end.
         joint_names: in the order of the columns; empty before the first sample.
         exciting_ns: when the motion itself began [ns since 1970 in UTC]; None before.
+        events: lines that were logged so far, at most `MOST_EVENTS`, stamps in ns since 1970 in UTC.
     """
 
     def __init__(self, path: Path) -> None:
@@ -65,6 +70,7 @@ class RecordingFollower:
         self._position = len(mcap.MAGIC)
         self.ended, self.joint_names = False, tuple[str, ...]()
         self.exciting_ns: int | None = None
+        self.events: list[Event] = []
 
     def read(self, most: int = MOST_BYTES) -> Samples | None:
         """Return the next samples, from `most` bytes of the file or one record; None where no new record is complete.
@@ -75,6 +81,7 @@ class RecordingFollower:
         stamps: list[int] = []
         states: list[bytes] = []
         commands: list[bytes] = []
+        torques: list[bytes] = []
         while not stamps and not self.ended:
             try:
                 records = self._records(os.pread(self._stream.fileno(), most, self._position))
@@ -86,12 +93,14 @@ class RecordingFollower:
                 if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                     self.ended = True
                     break
-                self._sort(opcode, record, stamps, states, commands)
+                self._sort(opcode, record, stamps, states, commands, torques)
         whole = min(len(states), len(commands))
         if not whole:
             return None
         try:
-            return self._decoded(stamps[:whole], states[:whole], commands[:whole])
+            # One for every cycle, or none: what is between cannot be told which cycle it is of.
+            measured = torques[:whole] if len(torques) == len(states) else []
+            return self._decoded(stamps[:whole], states[:whole], commands[:whole], measured)
         except (PayloadError, ValueError) as error:
             raise RecordingError(self._path, f"is no recording of ours: {error}") from None
 
@@ -118,7 +127,15 @@ class RecordingFollower:
         self._position += position
         return found
 
-    def _sort(self, opcode: int, record: bytes, stamps: list[int], states: list[bytes], commands: list[bytes]) -> None:
+    def _sort(
+        self,
+        opcode: int,
+        record: bytes,
+        stamps: list[int],
+        states: list[bytes],
+        commands: list[bytes],
+        torques: list[bytes],
+    ) -> None:
         try:
             if opcode == Opcode.CHUNK:
                 run = mcap.expand(record)
@@ -134,12 +151,16 @@ class RecordingFollower:
                     states.append(payload)
                 elif topic == _COMMANDS:
                     commands.append(payload)
-                elif topic == _EVENTS and self.exciting_ns is None and event(payload, 0).message == _EXCITING:
-                    self.exciting_ns = stamp
+                elif topic == _TORQUES:
+                    torques.append(payload)
+                elif topic == _EVENTS and len(self.events) < MOST_EVENTS:
+                    self.events.append(event(payload, 0))
+                    if self.exciting_ns is None and self.events[-1].message == _EXCITING:
+                        self.exciting_ns = stamp
         except (mcap.TornError, mcap.TooLargeError, struct.error) as error:
             raise RecordingError(self._path, str(error)) from None
 
-    def _decoded(self, stamps: list[int], states: list[bytes], commands: list[bytes]) -> Samples:
+    def _decoded(self, stamps: list[int], states: list[bytes], commands: list[bytes], torques: list[bytes]) -> Samples:
         state, command = Layout.parse(states[0]), Layout.parse(commands[0])
         if state.position is None or state.effort is None or command.position is None:
             raise PayloadError("a position or a torque is missing")
@@ -151,7 +172,15 @@ class RecordingFollower:
             state.columns(of_states, state.position, order),
             state.columns(of_states, state.effort, order),
             command.columns(of_commands, command.position, order),
+            self._measured(torques, order) if torques else None,
         )
+
+    @staticmethod
+    def _measured(torques: list[bytes], order: NDArray[np.intp]) -> Matrix:
+        layout = Layout.parse(torques[0])
+        if layout.effort is None:
+            raise PayloadError("a measured torque is missing")
+        return layout.columns(_rows(torques), layout.effort, order)
 
 
 def _rows(payloads: list[bytes]) -> NDArray[np.uint8]:

@@ -23,7 +23,16 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
 from ident_service.recordings import mcap_records as mcap
 from ident_service.recordings.files import require_file, sha256
-from ident_service.recordings.mcap_writer import CYCLE, ENCAPSULATION, JOINT_STATE, LOG, METADATA_NAME, STRING
+from ident_service.recordings.mcap_writer import (
+    CYCLE,
+    DIFFERENCE,
+    ENCAPSULATION,
+    JOINT_STATE,
+    LOG,
+    METADATA_NAME,
+    STRING,
+    VELOCITY,
+)
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Stamps, assemble
 
 _LITTLE_ENDIAN_CDR: Final = b"\x00\x01"
@@ -478,7 +487,8 @@ class McapRecording:
         self._decoder = JointStateDecoder(
             layout.names if wanted is None else wanted,
             others=wanted is not None,
-            velocity=_has_velocity(layout, payload),
+            # What the writer made of the positions is nothing that was measured.
+            velocity=self.metadata.get(VELOCITY) != DIFFERENCE and _has_velocity(layout, payload),
         )
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:

@@ -10,12 +10,19 @@ A chunk ends before it passes 64 KiB or 100 ms of sample time and is handed to t
 process that is killed loses less than 0.2 s. While it grows the file is called `<path>.partial`; `finish` gives it its
 name. Messages are stamped in UTC, the monotonic stamp plus `utc_offset_ns`, which stands in the metadata record
 `ident`; that record is written at the start and again, with the verdict `complete`, at the end (the last one counts).
+
+The channels say what quality of service a replay is to offer, so that `ros2 bag play` latches `/robot_description`. The
+record `rosbag2` without content tells rosbag2 that the policies are numbers, as before version 9 of its metadata.
+
+Where a drive tells no velocity, `/joint_states` has the difference of successive positions behind a low-pass filter
+of first order, and the metadata key `velocity` says so. It is for people who look: readers here take it for none.
 """
 
 from __future__ import annotations
 
 import os
 import struct
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -93,10 +100,32 @@ TOPICS: Final[dict[str, str]] = {
     "/joint_states": JOINT_STATE,
     "/joint_commands": JOINT_STATE,
     "/joint_torques": JOINT_STATE,
+    "/joint_encoders": JOINT_STATE,
     "/cycle": CYCLE,
     "/events": LOG,
     "/robot_description": STRING,
 }
+
+# Numbers of rmw's enumerations: keep last, reliable, volatile or transient local, automatic liveliness; a time of
+# zero means none.
+_QOS: Final = """\
+- history: 1
+  depth: {depth}
+  reliability: 1
+  durability: {durability}
+  deadline: {{sec: 0, nsec: 0}}
+  lifespan: {{sec: 0, nsec: 0}}
+  liveliness: 1
+  liveliness_lease_duration: {{sec: 0, nsec: 0}}
+  avoid_ros_namespace_conventions: false
+"""
+_TRANSIENT_LOCAL, _VOLATILE = 1, 2
+_LATCHED: Final = frozenset({"/robot_description"})
+
+
+def _offered_qos(topic: str) -> str:
+    latched = topic in _LATCHED
+    return _QOS.format(depth=1 if latched else 10, durability=_TRANSIENT_LOCAL if latched else _VOLATILE)
 
 
 ENCAPSULATION: Final = b"\x00\x01\x00\x00"
@@ -167,13 +196,13 @@ def encode_log(utc_ns: int, level: int, name: str, message: str) -> bytes:
 
 
 class JointStateEncoder:
-    """Encode sensor_msgs/msg/JointState of always the same joints, with an empty frame_id."""
+    """Encode sensor_msgs/msg/JointState of always the same joints and frame."""
 
-    def __init__(self, joint_names: Sequence[str]) -> None:
+    def __init__(self, joint_names: Sequence[str], frame_id: str = "") -> None:
         self._joints = len(joint_names)
         builder = CdrBuilder()
         builder.stamp(0)
-        builder.string("")
+        builder.string(frame_id)
         builder.uint32(self._joints)
         for name in joint_names:
             builder.string(name)
@@ -185,7 +214,7 @@ class JointStateEncoder:
         self._count_aligned = struct.pack("<I4x", self._joints)
         effort = CdrBuilder()
         effort.stamp(0)
-        effort.string("")
+        effort.string(frame_id)
         effort.uint32(self._joints)
         for name in joint_names:
             effort.string(name)
@@ -279,11 +308,14 @@ class CycleEncoder:
 
 
 METADATA_NAME: Final = "ident"
+VELOCITY: Final = "velocity"  # key of the metadata record
+DIFFERENCE: Final = "position_difference"  # its value where the drives told no velocity
+_LOW_PASS_S: Final = 1.0 / (2.0 * np.pi * 20.0)  # of a cut-off at 20 Hz: an encoder's step in 1 ms is 0.1 rad/s
 CHUNK_BYTES: Final = 64 * 1024
 CHUNK_NS: Final = 100_000_000
 
 _RECORD_HEAD: Final = 31  # what MCAP puts before each message's payload
-_RESERVED: Final = frozenset({"utc_offset_ns", "torque_hold", "software", "complete"})
+_RESERVED: Final = frozenset({"utc_offset_ns", "torque_hold", "software", "complete", VELOCITY})
 _MEDIA_TYPES: Final = {".json": "application/json", ".yaml": "application/yaml", ".yml": "application/yaml"}
 
 Vector = NDArray[np.float64]
@@ -294,12 +326,41 @@ class _McapWriter(Protocol):
 
     def start(self, profile: str) -> None: ...
     def register_schema(self, name: str, encoding: str, data: bytes) -> int: ...
-    def register_channel(self, topic: str, message_encoding: str, schema_id: int) -> int: ...
+    def register_channel(self, topic: str, message_encoding: str, schema_id: int, metadata: dict[str, str]) -> int: ...
     def add_message(self, channel_id: int, log_time: int, data: bytes, publish_time: int, sequence: int) -> None: ...
     def add_metadata(self, name: str, data: dict[str, str]) -> None: ...
     def add_attachment(self, create_time: int, log_time: int, name: str, media_type: str, data: bytes) -> None: ...
     def flush(self) -> None: ...
     def finish(self) -> None: ...
+
+
+class _VelocityEstimate:
+    """Differentiate positions as they come."""
+
+    def __init__(self) -> None:
+        self._stamp_ns = 0
+        self._position: Vector | None = None
+        self._velocity: Vector = np.zeros(0)
+
+    def at(self, stamp_ns: int, position: Vector) -> Vector:
+        """Return the velocity [rad/s or m/s], shape (joints,), zero at the first position."""
+        if self._position is None:
+            self._velocity = np.zeros(len(position))
+        elif (step := (stamp_ns - self._stamp_ns) * 1e-9) > 0.0:
+            share = step / (step + _LOW_PASS_S)
+            self._velocity += share * ((position - self._position) / step - self._velocity)
+        self._stamp_ns, self._position = stamp_ns, np.array(position)
+        return self._velocity
+
+
+def root_link(urdf: str) -> str:
+    """Return the link of a URDF that no joint carries, empty where the text has none."""
+    try:
+        robot = ET.fromstring(urdf)  # noqa: S314 - written by this package, or by the caller for its own file
+    except ET.ParseError:
+        return ""
+    carried = {child.get("link") for child in robot.iterfind("joint/child")}
+    return next((name for link in robot.iterfind("link") if (name := link.get("name", "")) not in carried), "")
 
 
 class RecordingWriter:
@@ -348,7 +409,9 @@ class RecordingWriter:
         self._attachments = dict(attachments or {})
         self._description = encode_string(robot_description)
         self._utc_offset_ns = utc_offset_ns
-        self._states = JointStateEncoder(self.joint_names)
+        self._states = JointStateEncoder(self.joint_names, root_link(robot_description))
+        self._estimate: _VelocityEstimate | None = None
+        self._sampled = False
         self._cycles = CycleEncoder(len(self.joint_names))
         self._file: IO[bytes] | None = None
         self._described = False
@@ -381,8 +444,12 @@ class RecordingWriter:
                 name: self._mcap.register_schema(name, "ros2msg", text) for name, text in sorted(DEFINITIONS.items())
             }
             self._channels = {
-                topic: self._mcap.register_channel(topic, "cdr", schemas[name]) for topic, name in TOPICS.items()
+                topic: self._mcap.register_channel(
+                    topic, "cdr", schemas[name], {"offered_qos_profiles": _offered_qos(topic)}
+                )
+                for topic, name in TOPICS.items()
             }
+            self._mcap.add_metadata("rosbag2", {"serialized_metadata": ""})
             self._mcap.add_metadata(METADATA_NAME, {**self._metadata, "complete": "false"})
             for name, data in self._attachments.items():
                 media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
@@ -402,21 +469,28 @@ class RecordingWriter:
             error.add_note(f"the recording could not be finished either: {second}")
 
     def sample(self, cycle: Cycle) -> None:
-        """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle` and, where drives measure, `/joint_torques`.
+        """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle`, and what drives measure beside.
 
         Raises:
             RecordingNotWritten: the file cannot be written.
             ValueError: an array of another shape.
         """
+        if not self._sampled:
+            self._sampled = True
+            if cycle.velocity is None:
+                self._estimate_velocity()
+        velocity = cycle.velocity if self._estimate is None else self._estimate.at(cycle.stamp_ns, cycle.position)
         utc_ns = cycle.stamp_ns + self._utc_offset_ns
-        state = self._states.encode(utc_ns, cycle.position, cycle.velocity, cycle.torque)
-        command = self._states.encode(utc_ns, cycle.reference_position, cycle.reference_velocity, None)
+        state = self._states.encode(utc_ns, cycle.position, velocity, cycle.torque)
+        command = self._states.encode(utc_ns, cycle.reference_position, cycle.reference_velocity, cycle.torque)
         timing = self._cycles.encode(
             utc_ns, cycle.cycle, cycle.lateness_ns, cycle.compute_ns, cycle.valid, cycle.age, cycle.lost
         )
         messages = [("/joint_states", state), ("/joint_commands", command), ("/cycle", timing)]
         if cycle.measured_torque is not None:
             messages.append(("/joint_torques", self._states.encode_effort(utc_ns, cycle.measured_torque)))
+        if cycle.joint_position is not None:
+            messages.append(("/joint_encoders", self._states.encode(utc_ns, cycle.joint_position, None, None)))
         self._add(cycle.stamp_ns, messages, sequence=cycle.cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> None:
@@ -445,6 +519,15 @@ class RecordingWriter:
                 os.fsync(folder)
             finally:
                 os.close(folder)
+
+    def _estimate_velocity(self) -> None:
+        """Say before the first sample that velocities are none of the drives', also in a file that is cut off later."""
+        if self._file is None:
+            raise RecordingError(self.path, "is not open for writing")
+        self._estimate = _VelocityEstimate()
+        self._metadata[VELOCITY] = DIFFERENCE
+        with self._writing():
+            self._mcap.add_metadata(METADATA_NAME, {**self._metadata, "complete": "false"})
 
     def _add(self, stamp_ns: int, messages: Sequence[tuple[str, bytes]], sequence: int | None = None) -> None:
         if self._file is None:

@@ -29,7 +29,7 @@ from ident_service.errors import RecordingError
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recorder_main import IGNORED, RecorderReport
-from ident_service.recordings.ring_buffer import SLOTS, create_ring
+from ident_service.recordings.ring_buffer import SLOTS, WRITTEN, create_ring
 from ident_service.recordings.ring_sink import SHARE, RingSink, SinkEnds
 
 _START_S: Final = 60.0
@@ -138,6 +138,13 @@ class RecorderProcess:
         if self._ends is None:
             raise RecordingError(self.path, "is not being recorded")
         return self._ends
+
+    @property
+    def written(self) -> int:
+        """Return how many records the writer has put into the ring, whichever process that is; 0 once it is closed."""
+        if self._ends is None:
+            return 0
+        return int.from_bytes(os.pread(self._ends.ring, 8, 8 * WRITTEN), sys.byteorder)
 
     @property
     def overruns(self) -> int:

@@ -70,8 +70,8 @@ def know_shipped(db: Database) -> None:
 
 
 def arm_names(db: Database) -> list[Row]:
-    """Return name, source and description data of every arm."""
-    return db.rows("SELECT name, source, description, sha256, added, added_by FROM arms ORDER BY name")
+    """Return name, source, folder and description data of every arm."""
+    return db.rows("SELECT name, source, folder, description, sha256, added, added_by FROM arms ORDER BY name")
 
 
 def known_arm(db: Database, state: Path, name: str) -> KnownArm:
@@ -84,9 +84,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
     row = db.row("SELECT * FROM arms WHERE name = ?", name)
     if row is None:
         raise UnknownId(f"no arm {name!r} is known; see the list of arms")
-    path = shipped_arms().get(name) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
-    if path is None:
-        raise UsageError(f"the arm {name!r} was shipped with other software than this; upload its description")
+    path = description_path(state, row)
     try:
         config = load_arm(path)
     except (ConfigError, UsageError):
@@ -99,6 +97,18 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
             *(config.sha256, config.description, json.dumps(resources(config)), name),
         )
     return KnownArm(name, path, config, row["source"])
+
+
+def description_path(state: Path, row: Row) -> Path:
+    """Return the file of an arm's description, of its row in the registry (name, source, folder).
+
+    Raises:
+        UsageError: it came with other software.
+    """
+    path = shipped_arms().get(row["name"]) if row["source"] == "shipped" else state / row["folder"] / ARM_FILE
+    if path is None:
+        raise UsageError(f"the arm {row['name']!r} was shipped with other software than this; upload its description")
+    return path
 
 
 def add_arm(

@@ -247,7 +247,17 @@ CREATE TABLE deliveries (
 CREATE INDEX deliveries_by_next ON deliveries (next);
 """
 
-MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS, _DELIVERIES)
+_LABELS = """
+CREATE TABLE run_labels (
+    run TEXT PRIMARY KEY REFERENCES runs (id) ON DELETE CASCADE,
+    tags TEXT NOT NULL,                -- JSON list
+    note TEXT NOT NULL,
+    at REAL NOT NULL,
+    who TEXT NOT NULL
+) STRICT;
+"""
+
+MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS, _DELIVERIES, _LABELS)
 
 
 FILE: Final = "registry.sqlite"

@@ -9,6 +9,7 @@ a path before.
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -18,7 +19,7 @@ from typing import Any, Final
 
 from ident_service.errors import IdentError, ParameterError, UnknownId, UsageError
 from ident_service.motion.ending import ENDED
-from ident_service.registry.database import Database, Row
+from ident_service.registry.database import Database, Row, note
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
@@ -151,6 +152,52 @@ def recording_name(db: Database, run: str) -> str:
 def parameter_set(db: Database, run: str) -> Row | None:
     """Return the entry of the parameters that a run holds; None where it holds none."""
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
+
+
+LONGEST_NOTE: Final = 2000
+MOST_TAGS: Final = 16
+_TAG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:+-]{0,39}")
+
+
+def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str) -> Row:
+    """Give a run its tags and its note, in place of those that it had.
+
+    Args:
+        db: the registry.
+        run: id.
+        tags: words by which runs are found again; none takes them away.
+        words: the note; may be empty.
+        who: gives them.
+
+    Returns:
+        The labels (`run_labels`).
+
+    Raises:
+        UnknownId: no such run.
+        UsageError: too many tags, one that is no plain word, or too long a note.
+    """
+    known = str(known_run(db, run)["id"])
+    chosen = list(dict.fromkeys(tags))
+    if len(chosen) > MOST_TAGS:
+        raise UsageError(f"{len(chosen)} tags are too many; a run has {MOST_TAGS} at most")
+    if bad := [tag for tag in chosen if not _TAG.fullmatch(tag)]:
+        raise UsageError(f"{bad[0]!r}: a tag is one word of letters, digits and _ . : + -, 40 characters at most")
+    if len(words) > LONGEST_NOTE:
+        raise UsageError(f"the note has {len(words)} characters; {LONGEST_NOTE} at most")
+    with db.transaction():
+        db.write(
+            "INSERT INTO run_labels VALUES (?, ?, ?, ?, ?) ON CONFLICT (run) DO UPDATE SET "
+            "tags = excluded.tags, note = excluded.note, at = excluded.at, who = excluded.who",
+            *(known, json.dumps(chosen), words, time.time(), who),
+        )
+        note(db, who, "run labelled", known, tags=chosen, note=words)
+    return run_labels(db, known)[known]
+
+
+def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
+    """Return the labels of a run, or of all: per run its `tags`, `note`, and `who` gave them `at` what time."""
+    found = db.rows("SELECT * FROM run_labels WHERE ?1 IS NULL OR run = ?1", run)
+    return {row["run"]: {**row, "tags": json.loads(row["tags"])} for row in found}
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:

@@ -64,7 +64,7 @@ def revoke_token(db: Database, name: str, by: str) -> None:
     """
     with db.transaction():
         if not db.write("UPDATE tokens SET revoked = ? WHERE name = ? AND revoked IS NULL", time.time(), name):
-            raise UnknownId(f"no token {name!r} that could be revoked; `ident token list` names them")
+            raise UnknownId(f"no token {name!r} that could be revoked; `ident tokens` names them")
         note(db, by, "token revoked", name)
 
 

@@ -32,13 +32,13 @@ from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate
-from ident_service.estimation.least_squares import TorqueError
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions, parse_expression
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.notation import NOTATIONS, Notation, regrouped, translate
+from ident_service.results.assessment import error_document
 from ident_service.results.manifest import write_atomically
-from ident_service.results.summary import how_fitted, implausible_links
+from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
 
 def strict_json(text: str) -> Any:
@@ -259,7 +259,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
         SolverError: no proof was found where the solver should have led to one.
     """
     model, base = estimate.model, estimate.base
-    own = estimate.candidates[estimate.chosen]
+    errors = error_document(estimate)
     certificate = certify(estimate.beta, base, estimate.conditions, estimate.delta)
     options = model.config.identification
     document: dict[str, Any] = {
@@ -317,12 +317,13 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             "deviation": None if estimate.prepared.delay is None else estimate.prepared.delay.deviation,
         },
         "torque_scales": estimate.prepared.torque_scales.tolist(),
+        **torque_constants_document(estimate),
         **convex_document(estimate),
         "fit": {
             "samples": estimate.samples,
             "blocks": len(estimate.fitted.clusters),
             "condition_number": estimate.fit.condition_number if np.isfinite(estimate.fit.condition_number) else None,
-            **_errors(own.identification, model.chain.names),
+            **errors["fit"],
             "rows_and_filter": list(how_fitted(estimate)),
             "standstill_shares": estimate.standstill_shares.tolist(),
             "choices": [
@@ -331,10 +332,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             ],
         },
         "information": information_document(estimate.information),
-        "validation": [
-            {"recording": s.recording, "sha256": s.sha256, **_errors(s.error, model.chain.names)}
-            for s in own.validation
-        ],
+        "validation": errors["validation"],
         "provenance": {
             "recordings": [{"name": name, "sha256": digest} for name, digest in estimate.recordings],
             "software": f"ident-service {__version__}",
@@ -416,17 +414,6 @@ def _numbers(value: Any, joints: int) -> list[float]:
 
 def _perhaps(values: Array) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def _errors(error: TorqueError, names: tuple[str, ...]) -> dict[str, Any]:
-    rows = zip(names, error.joint_relative_percent, error.joint_rms, strict=True)
-    return {
-        "relative_error_percent": error.relative_percent,
-        "per_joint": [
-            {"joint": name, "relative_error_percent": float(relative), "rms": float(rms)}
-            for name, relative, rms in rows
-        ],
-    }
 
 
 def _commit() -> str | None:

@@ -17,6 +17,8 @@ from itertools import chain
 import numpy as np
 
 from ident_service.errors import UsageError
+from ident_service.model.chain import Chain
+from ident_service.model.kinematics import branches, frame_origins
 from ident_service.results.plots import STEPS, Array, Axes, Canvas, number, require_drawable, round_values
 
 
@@ -75,6 +77,7 @@ class Postures:
         workspace: lowest and highest corner of the box that the arm must stay in [m], shape (2, 3); infinite where it
             is open; or None.
         closest: the posture of smallest clearance, or None.
+        marked: points that stand out in every posture.
     """
 
     frames: Array
@@ -83,6 +86,7 @@ class Postures:
     obstacles: tuple[Box | Plane | Rod, ...] = ()
     workspace: Array | None = None
     closest: Closest | None = None
+    marked: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse postures that cannot be drawn.
@@ -100,8 +104,9 @@ class Postures:
             raise UsageError("cannot draw postures: their times must increase")
         if not self.branches or any(len(branch) < 2 for branch in self.branches):
             raise UsageError(f"cannot draw postures: a branch joins two points or more, unlike one of {self.branches}")
-        if not all(0 <= point < points for point in chain(*self.branches)):
-            raise UsageError(f"cannot draw postures: the {points} points do not include all of {self.branches}")
+        if not all(0 <= point < points for point in chain(*self.branches, self.marked)):
+            named = (*self.branches, self.marked) if self.marked else self.branches
+            raise UsageError(f"cannot draw postures: the {points} points do not include all of {named}")
         for obstacle in self.obstacles:
             _require_obstacle(obstacle)
         if self.workspace is not None:
@@ -294,6 +299,78 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
     return canvas.svg(title, about + (f" {words}." if words else ""))
 
 
+def spike_figure(mechanism: Chain, joint: int, time: float, residual: float, position: Array) -> str:
+    """Draw the posture in which a joint has its largest residual, with the joint marked, from the side and from above.
+
+    Args:
+        mechanism: of the arm.
+        joint: its number.
+        time: since the recording's first sample [s].
+        residual: of the joint [N m or N].
+        position: of all joints then [rad or m], shape (joints,).
+
+    Returns:
+        A self-contained SVG.
+    """
+    name, unit = mechanism.names[joint], "N m" if mechanism.revolute[joint] else "N"
+    frames = frame_origins(mechanism, position[None])
+    posture = Postures(frames, np.array([time]), branches(mechanism), marked=(1 + 2 * joint,))
+    return stick_figure(posture, f"{name}: residual of {number(residual, 3)} {unit} at {number(time, 4)} s")
+
+
+@dataclass(frozen=True)
+class Limb:
+    """Part of an arm: all points within `radius` [m] of the convex hull of `points` [m], shape (points, 3).
+
+    `shade` is its place among the shades of a drawing, 0 (at the base) to 1 (at the tool); `behind` says that all
+    others cover it, as bodies cover the line through their frames.
+    """
+
+    points: Array
+    radius: float
+    shade: float
+    behind: bool = False
+
+
+_TURN, _TILT = np.radians(-60.0), np.radians(18.0)
+_PICTURE_WIDTH, _PICTURE_HEIGHT, _PICTURE_MARGIN = 280.0, 210.0, 12.0
+
+
+def silhouette(limbs: Sequence[Limb], title: str) -> str:
+    """Draw an arm in one posture, from the side and somewhat above, as a small picture without scales.
+
+    Args:
+        limbs: parts of the arm, one at least.
+        title: what the picture is of.
+
+    Returns:
+        A self-contained SVG.
+    """
+    for limb in limbs:
+        require_drawable("part of an arm", limb.points, (len(limb.points), 3))
+    across = np.array([np.cos(_TURN), -np.sin(_TURN), 0.0])
+    away = np.array([np.sin(_TURN) * np.cos(_TILT), np.cos(_TURN) * np.cos(_TILT), -np.sin(_TILT)])
+    views = np.stack([across, np.cross(across, away)], axis=1)
+    views[:, 1] *= np.sign(views[2, 1])
+    flat = [limb.points @ views for limb in limbs]
+    low = np.min([points.min(axis=0) - limb.radius for points, limb in zip(flat, limbs, strict=True)], axis=0)
+    high = np.max([points.max(axis=0) + limb.radius for points, limb in zip(flat, limbs, strict=True)], axis=0)
+    room = np.array([_PICTURE_WIDTH, _PICTURE_HEIGHT]) - 2.0 * _PICTURE_MARGIN
+    scale = float((room / np.maximum(high - low, 1e-3)).min())
+    half = 0.5 * np.array([_PICTURE_WIDTH, _PICTURE_HEIGHT]) / scale
+    (left, bottom), (right, top) = 0.5 * (low + high) - half, 0.5 * (low + high) + half
+    canvas = Canvas(_PICTURE_WIDTH, _PICTURE_HEIGHT)
+    axes = Axes(0.0, 0.0, _PICTURE_WIDTH, _PICTURE_HEIGHT, left, right, bottom, top)
+    # What is farther away first; seen so, nearer parts cover it.
+    depths = [(not limb.behind, -float((limb.points @ away).mean())) for limb in limbs]
+    for place in sorted(range(len(limbs)), key=lambda number: depths[number]):
+        limb, points = limbs[place], flat[place]
+        outline = _hull(points)
+        shade = round((1.0 - limb.shade) * (STEPS - 2)) + 1
+        canvas.polygon(f"limb tone{shade}", axes.x(outline[:, 0]), axes.y(outline[:, 1]), 2.0 * limb.radius * scale)
+    return canvas.svg(title, f"{title}, seen from the side and somewhat above.")
+
+
 def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures, shown: Sequence[int]) -> None:
     i, j = view
     step = _grid(canvas, axes, view)
@@ -319,6 +396,8 @@ def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures,
         if closest.points is not None:
             (xa, xb), (ya, yb) = axes.x(closest.points[:, i]), axes.y(closest.points[:, j])
             canvas.line("closest gap", float(xa), float(ya), float(xb), float(yb))
+    for x, y in postures.frames[:, list(postures.marked)][..., [i, j]].reshape(-1, 2):
+        canvas.circle("dot", float(axes.x(x)), float(axes.y(y)), 5.0)
     for point in dict.fromkeys(branch[0] for branch in postures.branches):
         x, y = float(axes.x(postures.frames[0, point, i])), float(axes.y(postures.frames[0, point, j]))
         canvas.rectangle("base", x - 5, y - 5, 10, 10)

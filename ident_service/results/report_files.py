@@ -14,6 +14,7 @@ from typing import Literal
 from ident_service.errors import ParameterError, UsageError
 from ident_service.estimation.identify import Estimate
 from ident_service.recordings.recording import Recording
+from ident_service.results.assessment import Assessment, assess
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
 from ident_service.results.evidence.gathering import gather_evidence
@@ -95,7 +96,7 @@ def read_evidence_of(results: Results) -> Evidence:
     return evidence
 
 
-def make_report(folder: Path, out: Path | None = None) -> Path:
+def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment]:
     """Make the report of a folder of results again.
 
     Args:
@@ -103,7 +104,7 @@ def make_report(folder: Path, out: Path | None = None) -> Path:
         out: where the page goes; into the folder, whose manifest then names it, when None.
 
     Returns:
-        The page.
+        The page, and the assessment on top of it.
 
     Raises:
         UsageError, ParameterError, ConfigError: the folder is not what its manifest names, or has no evidence.
@@ -120,7 +121,7 @@ def make_report(folder: Path, out: Path | None = None) -> Path:
     write_atomically(path, page)
     if path.name == REPORT_PAGE and path.parent.samefile(folder):
         write_manifest(folder)
-    return path
+    return path, assess(results.parameters.content)
 
 
 def _others(sha256: Mapping[str, str]) -> dict[str, str]:

@@ -97,7 +97,8 @@ def write_results(
     if estimate.delta is not None:
         write_urdf(folder / URDF, estimate.model, estimate.delta)
         names.append(URDF)
-    write_atomically(folder / REPORT, summary(estimate, unusable, torque) + "\n" + parameter_table(estimate))
+    text = summary(estimate, unusable, torque, document.get("warnings", ()))
+    write_atomically(folder / REPORT, text + "\n" + parameter_table(estimate))
     write_verifier(folder)
     return [*names, REPORT, VERIFIER]
 

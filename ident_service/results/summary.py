@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
 from ident_service.config.arm import Identification
+from ident_service.estimation.equations import motors_of_torques
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW
+from ident_service.model.chain import Array
 from ident_service.model.likely_bodies import IN_WORDS, likely_bodies, lines_of
 from ident_service.model.parameter_layout import NO_STRIBECK
+from ident_service.results.assessment import Assessment, assess_estimate
 from ident_service.results.evidence.gathering import ellipsoid
 
 
@@ -63,17 +67,22 @@ def how_fitted(estimate: Estimate) -> tuple[str, ...]:
         *rows_and_filter(estimate.model.config.identification),
         f"Rows near standstill: multiplied in the fit by {weighed}, as their own residuals have it.",
         *(f"Chosen: {choice}." for choice in estimate.choices),
-        _noise_and_model(estimate),
+        noise_and_model(estimate.noise_deviations, np.diag(estimate.covariance)),
     )
 
 
-def _noise_and_model(estimate: Estimate) -> str:
-    """Describe how much of the deviations is noise and how much error of the model, as far as repetitions tell."""
-    if estimate.noise_deviations is None:
+def noise_and_model(noise: Array | None, variances: Array) -> str:
+    """Describe how much of the variances is noise and how much error of the model, as far as repetitions tell.
+
+    Args:
+        noise: standard deviations by what differs between repetitions of the motion, shape (base,); None where most of
+            the motion is not repeated.
+        variances: of the parameters, shape (base,); infinite or NaN where unknown.
+    """
+    if noise is None:
         return "Most of the motion is not repeated, so noise and model error cannot be separated."
-    variances = np.diag(estimate.covariance)
-    known = np.isfinite(variances) & (variances > 0.0)
-    share = np.clip(estimate.noise_deviations[known] ** 2 / variances[known], 0.0, 1.0)
+    known = np.isfinite(noise) & np.isfinite(variances) & (variances > 0.0)
+    share = np.clip(noise[known] ** 2 / variances[known], 0.0, 1.0)
     return (
         f"The motion is repeated: {np.median(share):.0%} of a parameter's variance is noise (median; "
         f"{share.min():.0%} to {share.max():.0%}), the rest is model error, which more periods do not reduce."
@@ -133,19 +142,23 @@ def implausible_links(estimate: Estimate) -> tuple[str, ...]:
     return tuple(found)
 
 
-def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "commanded") -> str:
-    """Describe an estimate in lines no wider than a terminal.
+def summary(
+    estimate: Estimate, unusable: Sequence[str] = (), torque: str = "commanded", warnings: Sequence[str] = ()
+) -> str:
+    """Describe an estimate in lines no wider than a terminal: verdict, reasons, a row per joint, then details.
 
     Args:
         estimate: to describe.
         unusable: why it must not be used; that comes first.
         torque: that the recordings give: `measured`, `commanded`, or `recorded` by another program.
+        warnings: what is wrong with the recordings, in words.
     """
-    names = estimate.model.chain.names
     own = estimate.candidates[estimate.chosen]
     columns = ["identification", *(score.recording for score in own.validation)]
     lines = [
-        *_refusal(unusable),
+        *assessment_lines(assess_estimate(estimate, unusable, warnings)),
+        "",
+        "Details",
         f"{estimate.model.config.name}: {estimate.base.size} base parameters of {len(estimate.base.names)} link "
         f"parameters, from {estimate.samples} samples of {torque} torque",
         f"condition number of the regressor: {estimate.fit.condition_number:.1f}",
@@ -161,13 +174,15 @@ def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "com
         verdict = "feasible" if candidate.margin > 0.0 else "infeasible"
         cells = [f"{whole.relative_percent:.3f}  {moving.relative_percent:.3f}" for whole, moving in _errors(candidate)]
         lines.append(_row(f"{mark} {candidate.name} ({verdict})", cells))
-    lines += ["", "per joint, the estimate marked *", _row("", columns)]
-    for k, name in enumerate(names):
-        cells = [
-            f"{whole.joint_relative_percent[k]:.2f}  {moving.joint_relative_percent[k]:.2f}"
-            for whole, moving in _errors(own)
-        ]
-        lines.append(_row(f"  {name}", cells))
+    if len(own.validation) > 1:
+        # The table on top has the worst of them.
+        lines += ["", "per joint, the estimate marked *", _row("", columns)]
+        for k, name in enumerate(estimate.model.chain.names):
+            cells = [
+                f"{whole.joint_relative_percent[k]:.2f}  {moving.joint_relative_percent[k]:.2f}"
+                for whole, moving in _errors(own)
+            ]
+            lines.append(_row(f"  {name}", cells))
     lines += ["", *wrapped(how_fitted(estimate))]
     lines += _preliminary_findings(estimate)
     counts = {word: estimate.verdicts.count(word) for word in ("identified", "weak", "unidentified")}
@@ -187,11 +202,34 @@ def summary(estimate: Estimate, unusable: Sequence[str] = (), torque: str = "com
     return "\n".join(lines) + "\n"
 
 
-def _refusal(unusable: Sequence[str]) -> list[str]:
-    if not unusable:
-        return []
-    paragraphs = [textwrap.fill(reason, 100, initial_indent="  - ", subsequent_indent="    ") for reason in unusable]
-    return ["DO NOT USE these parameters:", *paragraphs, ""]
+def assessment_lines(found: Assessment) -> list[str]:
+    """Return the verdict, its reasons and a row per joint, as lines for a terminal.
+
+    Args:
+        found: to be shown.
+    """
+    head = found.word.upper() + found.line[len(found.word) :]
+    if found.word == "do not use":
+        head = "DO NOT USE these parameters:"
+    lines = [*wrapped([head]), *(line for reason in found.reasons for line in _bullet(reason))]
+    if found.further:
+        lines += ["further:", *(line for reason in found.further for line in _bullet(reason))]
+    if not found.joints:
+        return lines
+    unseen = any(joint.unseen is not None for joint in found.joints)
+    heads = ["fitted", "moving", *(["unseen", "moving"] if unseen else []), "residual rms"]
+    width = max(len("torque error [%]"), *(len(joint.joint) for joint in found.joints))
+    lines += ["", f"{'torque error [%]':{width}s}" + "".join(f" {head:>14s}" for head in heads) + "  verdict"]
+    for joint in found.joints:
+        values = [joint.fitted, joint.fitted_moving, *([joint.unseen, joint.unseen_moving] if unseen else [])]
+        cells = ["" if value is None else f"{value:.2f}" for value in values]
+        cells.append("" if joint.residual is None else f"{joint.residual:.3g} {joint.unit}")
+        lines.append(f"{joint.joint:{width}s}" + "".join(f" {cell:>14s}" for cell in cells) + f"  {joint.word}")
+    return lines
+
+
+def _bullet(words: str) -> list[str]:
+    return textwrap.wrap(words, 100, initial_indent="  - ", subsequent_indent="    ")
 
 
 def _errors(candidate: Candidate) -> list[tuple[TorqueError, TorqueError]]:
@@ -218,9 +256,48 @@ def _preliminary_findings(estimate: Estimate) -> list[str]:
         lines.append(f"Stribeck velocity [rad/s or m/s]: {velocities}")
     if (prepared.torque_scales != 1.0).any():
         lines.append("measured torques multiplied by: " + " ".join(f"{value:.4g}" for value in prepared.torque_scales))
+    lines += _torque_constants(estimate)
     if estimate.prior is not None:
         lines.append(f"regularised towards the {estimate.prior.kind} prior with weight {estimate.prior.weight:g}")
     return ["", *lines] if lines else []
+
+
+def torque_constants_document(estimate: Estimate) -> dict[str, Any]:
+    """Return the torque constants of the motors as JSON values, where they were identified."""
+    found = estimate.prepared.torque_constants
+    if found is None:
+        return {}
+    names = estimate.model.chain.names
+    motors = enumerate(motors_of_torques(estimate.model))
+    return {
+        "torque_constants": [
+            {
+                "motor": number + 1,
+                "joints": [names[joint] for joint in np.flatnonzero(row)],
+                "factor": float(found.factors[number]),
+                "standard_deviation": None if np.isinf(found.deviations[number]) else float(found.deviations[number]),
+                "verdict": found.verdicts[number],
+            }
+            for number, row in motors
+        ]
+    }
+
+
+def _torque_constants(estimate: Estimate) -> list[str]:
+    found = estimate.prepared.torque_constants
+    if found is None:
+        return []
+    lines = ["torque that each motor gives for one by its description (multiply the torque_scale of its drive by it):"]
+    for one in torque_constants_document(estimate)["torque_constants"]:
+        whose = f"  motor {one['motor']} ({', '.join(one['joints'])}): "
+        if one["verdict"] == "unidentified":
+            lines.append(f"{whose}not shown by these recordings, taken as described")
+        else:
+            lines.append(f"{whose}{one['factor']:.4f} +- {one['standard_deviation']:.4f}  {one['verdict']}")
+    lines.append(
+        f"  error of the motors' torques with them {found.error_percent:.2f} %, without {found.error_before:.2f} %"
+    )
+    return lines
 
 
 def parameter_table(estimate: Estimate) -> str:

@@ -1,6 +1,6 @@
 """Inject faults into emulated drives: kinds, how they are written, and what each does to drives, arm and frames.
 
-`PUCK_FAULTS` says what each kind does. Where the simulated arm has a kind too, it is of the same name and means the
+`DRIVE_FAULTS` says what each kind does. Where the simulated arm has a kind too, it is of the same name and means the
 same, seen through a bus.
 """
 
@@ -18,7 +18,7 @@ from sim_backend.emulator.face import EmulatedDevice, Traffic
 from sim_backend.emulator.motor import Defects
 
 # Without a time of its own, a fault of one cycle lasts for one nominal period.
-PUCK_FAULTS: dict[str, FaultRule] = {
+DRIVE_FAULTS: dict[str, FaultRule] = {
     "lost_feedback": FaultRule("position frames do not come"),
     "delayed_feedback": FaultRule("position frames come late", "delay [s]", stays=True),
     "hidden_delay": FaultRule("old positions are sent as new", "delay [s]", stays=True),
@@ -62,11 +62,11 @@ class DriveFault:
     """Describe one fault to inject.
 
     Attributes:
-        kind: a key of `PUCK_FAULTS`.
+        kind: a key of `DRIVE_FAULTS`.
         drive: index of the drive; None for all.
         at: its beginning, from the moment it is counted from [s].
-        duration: how long [s]; None for one cycle or for good, as `PUCK_FAULTS` says.
-        size: quantity that `PUCK_FAULTS` defines.
+        duration: how long [s]; None for one cycle or for good, as `DRIVE_FAULTS` says.
+        size: quantity that `DRIVE_FAULTS` defines.
         offset: of a load, in the frame of the last link [m].
     """
 
@@ -87,7 +87,7 @@ class DriveFault:
         begins = start_ns + round(self.at * 1e9)
         if self.duration is not None:
             return begins, begins + max(1, round(self.duration * 1e9))
-        return begins, None if PUCK_FAULTS[self.kind].stays else begins + period_ns
+        return begins, None if DRIVE_FAULTS[self.kind].stays else begins + period_ns
 
 
 def configured(faults: Sequence[SimulatedFault], names: Sequence[str], period: float) -> tuple[DriveFault, ...]:
@@ -123,9 +123,9 @@ def parse_fault(text: str, names: Sequence[str]) -> DriveFault:
         DriverError: what is wrong with it, and what would be right.
     """
     kind, *words = text.split()[:16] or [""]
-    rule = PUCK_FAULTS.get(kind)
+    rule = DRIVE_FAULTS.get(kind)
     if rule is None:
-        raise DriverError(f"no fault is called {kind!r}; there are {', '.join(PUCK_FAULTS)}")
+        raise DriverError(f"no fault is called {kind!r}; there are {', '.join(DRIVE_FAULTS)}")
     fault = DriveFault(kind)
     given = set()
     for word in words:

@@ -63,7 +63,7 @@ def arm_on_bus(**bus: Any) -> ArmConfig:
     config = load_arm("planar2").model_dump()
     driver = {
         "kind": "canopen",
-        "eds": {"name": "puck.eds", "text": ""},
+        "eds": {"name": "emulated_drive.eds", "text": ""},
         "buses": [bus],
         "drives": [{"node": 1, **drive}, {"node": 2, **drive}],
     }

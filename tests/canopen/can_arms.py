@@ -7,7 +7,7 @@ from typing import Any
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.recording import Transmission
 
-EDS = "[FileInfo]\nFileName=puck.eds\n\n[DummyUsage]\nDummy0001=0\nDummy0003=1\n\n[6077]\nParameterName=Torque\n"
+EDS = "[FileInfo]\nFileName=emulated.eds\n\n[DummyUsage]\nDummy0001=0\nDummy0003=1\n\n[6077]\nParameterName=Torque\n"
 # Newton metres at the motor: FIELDBUS.md 1.1, counts of MT over counts per newton metre.
 MAX_TORQUE = (1.8, 1.8, 1.8, 1.6, 0.6, 0.6, 0.0916)
 RATED = (0.2, 0.2, 0.2, 0.2, 0.1, 0.1, 0.02)
@@ -28,7 +28,7 @@ def wam_driver(**changes: Any) -> CanopenDriver:
     drives = [
         {"node": k + 1, "rated_torque": RATED[k], "max_torque": MAX_TORQUE[k], "max_speed": 5000.0} for k in range(7)
     ]
-    content = {"kind": "canopen", "eds": {"name": "puck.eds", "text": EDS}, "drives": drives}
+    content = {"kind": "canopen", "eds": {"name": "emulated_drive.eds", "text": EDS}, "drives": drives}
     return CanopenDriver.model_validate({**content, **changes})
 
 

@@ -16,6 +16,6 @@ def arms(tmp_path: Path) -> Path:
     """The shipped arm descriptions, to extend or to spoil; with an EDS that can share torque frames."""
     folder = tmp_path / "configs"
     shutil.copytree(SHIPPED, folder)
-    if not (folder / "puck.eds").exists():
-        (folder / "puck.eds").write_text(EDS, encoding="utf-8")
+    if not (folder / "emulated_drive.eds").exists():
+        (folder / "emulated_drive.eds").write_text(EDS, encoding="utf-8")
     return folder

@@ -86,7 +86,7 @@ def canopen(tree: dict[str, Any], bus: dict[str, Any], seed: int, **driver: Any)
     drive = {"counts": 65536, "rated_torque": 0.1, "max_torque": 3.0, "max_speed": 6000.0}
     section = {
         "kind": "canopen",
-        "eds": str(CONFIGS / "puck.eds"),
+        "eds": str(CONFIGS / "emulated_drive.eds"),
         "buses": [bus],
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": seed, "truth": truth(), "torque_noise": TORQUE_NOISE},

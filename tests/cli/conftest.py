@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,15 @@ class Ended:
     code: int
     out: str
     err: str
+
+    @property
+    def next(self) -> list[str]:
+        """The words after `ident` of the command that its last line names."""
+        (line,) = [line for line in (self.out + self.err).splitlines() if line.startswith("next: ")]
+        assert (self.out or self.err).endswith(f"{line}\n")
+        words = shlex.split(line.removeprefix("next: "))
+        assert words[0] == "ident"
+        return words[1:]
 
     @property
     def json(self) -> dict[str, Any]:

@@ -108,6 +108,7 @@ TABLE: dict[str, tuple[tuple[str, Sequence[str]], ...]] = {
     "token add": (("token add {} --role viewer", ("''",)), ("token add ann --role {}", ("king",))),
     "token revoke": (("token revoke {}", NAMES),),
     "verify": (("verify {}", PARAMETERS), ("verify other.json --arm {}", ARMS)),
+    "view": (("view {} --save out/a.rrd", FOLDERS), ("view folder --recording {} --save out/a.rrd", RECORDINGS)),
     "watch": (("watch {}", (*ARMS, "wam7")),),
 }
 NOTHING_GIVEN = {"alarm list", "due list", "jobs list", "schedule list", "token list"}

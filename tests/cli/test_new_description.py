@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from model.test_locked_joints import PANDA, joint, link
@@ -21,11 +24,17 @@ from ident_service.errors import ModelError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model, control_model
 from ident_service.model.likely_bodies import perturbed_body
-from ident_service.model.outline import capsule_around
+from ident_service.model.outline import (
+    Outline,
+    arm_part,
+    capsule_around,
+    capsules_around,
+    read_source,
+    urdf_outline,
+)
 from ident_service.model.pinocchio_models import InverseDynamics, inertia_from_delta
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.trajectory import rest
-from ident_service.operations.new_description import arm_part
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -64,7 +73,12 @@ def test_a_stock_urdf_simulates_without_an_edit(
     assert main(["new", "stock/panda.urdf", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["description"] == "panda.yaml"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["panda.urdf", "panda.yaml", "stock"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "ident-arm.schema.json",
+        "panda.urdf",
+        "panda.yaml",
+        "stock",
+    ]
     config = load_arm(tmp_path / "panda.yaml")
     # The hand's fingers are held; the limits are the file's.
     assert len(config.joints) == 7
@@ -87,35 +101,189 @@ def test_a_stock_urdf_simulates_without_an_edit(
     assert np.abs(shares - 1.0).max() > 0.01
 
 
+MJCF = """<mujoco model="bench">
+  <compiler angle="degree" autolimits="true"/>
+  <default>
+    <default class="strong"><general forcerange="-60 60"/><joint armature="0.4"/></default>
+    <geom type="capsule" size="0.04"/>
+  </default>
+  <asset><mesh name="bar" file="bar.stl" scale="2 1 1"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1"/>
+    <body name="stand">
+      <geom type="box" size="0.1 0.1 0.05" pos="0 0 0.05"/>
+      <body name="upper" pos="0 0 0.3">
+        <joint name="shoulder" class="strong" axis="0 1 0" range="-100 100"/>
+        <inertial pos="0.15 0 0" mass="3" diaginertia="0.01 0.05 0.05"/>
+        <geom type="mesh" mesh="bar" pos="0.15 0 0"/>
+        <body name="lower" pos="0.4 0 0">
+          <joint name="elbow" axis="0 1 0" range="-120 120"/>
+          <inertial pos="0.15 0 0" mass="2" diaginertia="0.005 0.02 0.02"/>
+          <geom fromto="0.1 0 0 0.25 0 0"/>
+          <body name="wrist" pos="0.3 0 0">
+            <joint name="roll" axis="1 0 0" range="-170 170"/>
+            <inertial pos="0.02 0 0" mass="0.5" diaginertia="0.001 0.001 0.001"/>
+            <body name="left" pos="0.05 0.02 0"><joint name="left" type="slide" axis="0 1 0" range="0 0.03"/>
+              <inertial pos="0 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/></body>
+            <body name="right" pos="0.05 -0.02 0"><joint name="right" type="slide" axis="0 1 0" range="-0.03 0"/>
+              <inertial pos="0 0 0" mass="0.05" diaginertia="1e-5 1e-5 1e-5"/></body>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <equality><joint joint1="right" joint2="left" polycoef="0 -1 0 0 0"/></equality>
+  <actuator>
+    <general class="strong" joint="shoulder"/>
+    <motor joint="elbow" gear="20" ctrlrange="-1.5 1.5"/>
+    <position joint="roll" forcerange="-6 6"/>
+  </actuator>
+</mujoco>
+"""
+TABLE = """# A table arm of a data sheet. convention: standard
+# convention: standard
+joint, d [mm], a [mm], alpha [deg], lower [deg], upper [deg], velocity [deg/s], torque
+waist, 300, 0, 90, -170, 170, 150, 40
+shoulder, 0, 350, 0, -100, 100, 150, 60
+elbow, 0, 300, 0, -140, 140, , 25
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return the description that `ident new` makes of a mechanism, each made once."""
+    found: dict[str, Path] = {}
+
+    def make(name: str) -> Path:
+        if name not in found:
+            folder = tmp_path_factory.mktemp(name)
+            source = CONFIGS / f"{name}.urdf"
+            if name == "mjcf":
+                (folder / "bar.stl").write_bytes(box_stl(0.06, 0.03, 0.02))
+                (source := folder / "bench.xml").write_text(MJCF)
+            if name == "table":
+                (source := folder / "table.csv").write_text(TABLE)
+            assert main(["new", str(source), "--out", str(folder / "arm.yaml")]) == 0
+            found[name] = folder / "arm.yaml"
+        return found[name]
+
+    return make
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("arm", ["threelink", "ur10", "tx40", "kuka_lwr4"])
-def test_shipped_urdfs_simulate_without_an_edit(arm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slide of 0.3 m that a slow motion leaves at a standstill, joints so heavy that an encoder's count is a jump."""
-    monkeypatch.chdir(tmp_path)
-    assert main(["new", str(CONFIGS / f"{arm}.urdf"), "--out", "arm.yaml"]) == 0
-    assert main(["config", "check", "arm.yaml"]) == 0
-    assert main(["simulate", "arm.yaml", "--out", "run", "--state", "state"]) == 0
+@pytest.mark.parametrize("arm", ["threelink", "ur10", "mjcf", "table"])
+def test_urdf_mjcf_and_table_simulate_without_an_edit(
+    arm: str, made: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A slide of 0.3 m, joints so heavy that an encoder's count is a jump, an MJCF, and a table without masses."""
+    path = str(made(arm))
+    capsys.readouterr()
+    assert main(["config", "check", path]) == 0
+    assert capsys.readouterr().out.splitlines()[0].endswith(": good")
+    assert main(["simulate", path, "--out", str(tmp_path / "run"), "--state", str(tmp_path / "state")]) == 0
     scored = json.loads((tmp_path / "run" / "score.json").read_text())
-    assert scored["noise_free_torque_error_percent"] < 1.0
+    # Not a perfect model, and found all the same.
+    assert 1e-6 < scored["noise_free_torque_error_percent"] < 1.0
 
 
 @pytest.mark.slow
-def test_motions_are_faster_where_a_joint_would_stand_still(tmp_path: Path) -> None:
-    assert main(["new", str(CONFIGS / "threelink.urdf"), "--out", str(tmp_path / "arm.yaml")]) == 0
-    config = load_arm(tmp_path / "arm.yaml")
+def test_of_an_mjcf_come_limits_of_joints_and_actuators_bodies_and_meshes(made: Callable[[str], Path]) -> None:
+    config = load_arm(made("mjcf"))
+    assert (config.kinematics.tip, list(config.joints)) == ("wrist", ["shoulder", "elbow", "roll"])
+    assert [one.torque for one in config.joints.values()] == [60.0, 30.0, 6.0]
+    assert config.joints["elbow"].position == pytest.approx(np.radians([-120.0, 120.0]))
+    assert config.joints["shoulder"].drive_inertia == pytest.approx(0.4)
+    (bar,) = config.geometry["shoulder"]
+    assert sorted((bar.start[0], bar.end[0])) == pytest.approx([0.03, 0.27], abs=0.002)
+    assert config.geometry["elbow"][0].radius == pytest.approx(0.04, abs=1e-4)
+    assert "base" in config.geometry
+    prior = arm_model(config).prior
+    assert prior is not None
+    assert [prior[arm_model(config).layout.inertial(k)][-1] for k in range(3)] == pytest.approx([3.0, 2.0, 0.6])
+
+
+@pytest.mark.slow
+def test_of_a_table_come_limits_and_units_and_the_rest_is_guessed(made: Callable[[str], Path]) -> None:
+    text = made("table").read_text()
+    config = load_arm(made("table"))
+    assert config.kinematics.dh is not None
+    shoulder = config.kinematics.dh.joints["shoulder"]
+    assert (shoulder.a, config.kinematics.dh.joints["waist"].alpha) == pytest.approx((0.35, np.pi / 2))
+    assert config.joints["waist"].velocity == pytest.approx(np.radians(150.0))
+    assert [one.torque for one in config.joints.values()] == [40.0, 60.0, 25.0]
+    assert config.prior is not None
+    assert "bodies of waist, shoulder, elbow: rods; a DH table has none" in text
+    assert "elbow: velocity limit guessed" in text
+    # Each value says its unit, and where it is from.
+    assert "torque: 40.0 # N m; of table.csv\n" in text
+    assert "velocity: 2.0 # rad/s; guessed: the file has none\n" in text
+    # Editors find the schema beside it.
+    assert text.startswith("# yaml-language-server: $schema=ident-arm.schema.json\n")
+    schema = json.loads((made("table").parent / "ident-arm.schema.json").read_text())
+    assert list(jsonschema.Draft7Validator(schema).iter_errors(yaml.safe_load(text))) == []
+
+
+def test_a_table_in_yaml_is_the_same_table(tmp_path: Path) -> None:
+    (tmp_path / "table.csv").write_text(TABLE)
+    (tmp_path / "table.yaml").write_text(
+        "convention: standard\njoints:\n"
+        "  waist: {d: 0.3, alpha: 90 deg, lower: -170 deg, upper: 170 deg, velocity: 150 deg, torque: 40}\n"
+        "  shoulder: {a: 0.35, lower: -100 deg, upper: 100 deg, velocity: 150 deg, torque: 60}\n"
+        "  elbow: {a: 0.3, lower: -140 deg, upper: 140 deg, torque: 25}\n"
+    )
+    csv, yml = (read_source(tmp_path / f"table.{suffix}") for suffix in ("csv", "yaml"))
+    assert csv.table is not None
+    assert yml.table is not None
+    for name, row in csv.table.joints.items():
+        assert row.model_dump() == pytest.approx(yml.table.joints[name].model_dump())
+        assert csv.limits[name].position == pytest.approx(yml.limits[name].position)
+        assert (csv.limits[name].velocity or 0.0) == pytest.approx(yml.limits[name].velocity or 0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("t.csv", "a, alpha\n0.5, 0\n", "which convention is it? Give --convention standard"),
+        ("t.csv", "# convention: standard\na, aplha\n0.5, 0\n", "t.csv:2:1: column 2: 'aplha' is none of joint, type"),
+        ("t.csv", "# convention: standard\na [inch]\n5\n", "t.csv:2:1: column 1: unit 'inch' is none of rad, m"),
+        ("t.csv", "# convention: standard\na, d\n0.5\n", "t.csv:3:1: 1 values for 2 columns"),
+        ("t.csv", "# convention: standard\na\n0.5\nlong\n", "t.csv:4:1: j2: a: Input should be a valid number"),
+        ("t.csv", "# convention: standard\na\n500\n", "t.csv:3:1: j1: a: 500 m is longer than the link of any arm"),
+        ("t.yaml", "convention: odd\njoints: {j: {a: 1}}\n", "which convention is it?"),
+        ("t.yaml", "convention: standard\njoints: {j: {b: 1}}\n", "t.yaml:2:10: j: b: Extra inputs"),
+        ("t.yaml", "joints: [1]\n", "a DH table has `convention`, and under `joints` a row by joint name"),
+        ("t.yaml", "format: ident-arm\n", "is a description already; `ident config check"),
+        ("t.urdf.xacro", "<robot/>", "xacro t.urdf.xacro > t.urdf.urdf"),
+        ("t.txt", "", "give a URDF (.urdf), an MJCF (.xml) or a DH table (.csv, .yaml)"),
+        ("t.xml", "<mujoco><worldbody><body><joint type='odd'/></body></worldbody></mujoco>", "t.xml: not an MJCF"),
+    ],
+)
+def test_a_source_with_a_mistake_is_told_and_leaves_nothing(
+    name: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).write_text(text)
+    assert main(["new", str(tmp_path / name), "--out", str(tmp_path / "out" / "arm.yaml")]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_motions_are_faster_where_a_joint_would_stand_still(made: Callable[[str], Path]) -> None:
+    config = load_arm(made("threelink"))
     model = arm_model(config)
     for which in ("identification", "validation"):
         path = excitation(model, which).path
         pace = np.abs(path.at(np.linspace(0.0, path.duration, 2000))[1])
         assert ((pace > config.identification.reversal.speed).mean(axis=0) >= 0.3).all()
     assert config.joints["slide"].home == pytest.approx(0.15)  # its middle: zero is the end of its range
+    assert "torque: " in made("threelink").read_text()
+    assert " # N; of threelink.urdf" in made("threelink").read_text()  # a slide has a force
 
 
 @pytest.mark.slow
-def test_one_count_of_the_encoder_is_no_jump_of_the_torque(tmp_path: Path) -> None:
-    assert main(["new", str(CONFIGS / "ur10.urdf"), "--out", str(tmp_path / "arm.yaml")]) == 0
-    config = load_arm(tmp_path / "arm.yaml")
+def test_one_count_of_the_encoder_is_no_jump_of_the_torque(made: Callable[[str], Path]) -> None:
+    config = load_arm(made("ur10"))
     model, limits, period = control_model(arm_model(config)), motion_limits(config), 1.0 / config.control.rate
     assert model.prior is not None
     assert isinstance(config.driver, SimulatedDriver)
@@ -243,24 +411,46 @@ def test_a_file_that_holds_no_arm_leaves_nothing(
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["x.urdf"]
 
 
-def tree(*joints: tuple[str, str, str, str]) -> str:
+def tree(*joints: tuple[str, str, str, str], lengths: dict[str, float] | None = None) -> Outline:
+    """The outline of a URDF of these joints, each 0.1 m from the one before."""
     names = dict.fromkeys(name for _, parent, child, _ in joints for name in (parent, child))
     links = "".join(link(name, 1.0) for name in names)
-    return (
-        '<robot name="t">' + links + "".join(joint(n, k, p, c, "0 0 0.1 0 0 0") for n, p, c, k in joints) + "</robot>"
-    )
+    places = {name: f"0 0 {(lengths or {}).get(name, 0.1)} 0 0 0" for name, *_ in joints}
+    rows = "".join(joint(name, kind, parent, child, places[name]) for name, parent, child, kind in joints)
+    return urdf_outline(f'<robot name="t">{links}{rows}</robot>', Path())
+
+
+ARM = [(f"j{k}", f"l{k}", f"l{k + 1}", "revolute") for k in range(5)]
 
 
 def test_the_arm_is_the_longest_branch_and_ends_where_its_gripper_begins() -> None:
-    arm = [(f"j{k}", f"l{k}", f"l{k + 1}", "revolute") for k in range(5)]
-    assert arm_part(tree(*arm), "t", None, None) == {"urdf": "t"}
+    assert arm_part(tree(*ARM), "t", None, None) == {}
     fingers = [("f1", "l5", "f1", "prismatic"), ("f2", "l5", "f2", "prismatic")]
-    assert arm_part(tree(*arm, *fingers), "t", None, None)["tip"] == "l5"
+    assert arm_part(tree(*ARM, *fingers), "t", None, None)["tip"] == "l5"
     other = [(f"o{k}", "l0" if k == 0 else f"o{k}", f"o{k + 1}", "revolute") for k in range(3)]
-    assert arm_part(tree(*arm, *other), "t", None, None)["tip"] == "l5"
-    assert arm_part(tree(*arm), "t", "l1", "l3") == {"urdf": "t", "base": "l1", "tip": "l3"}
+    assert arm_part(tree(*ARM, *other), "t", None, None)["tip"] == "l5"
+    assert arm_part(tree(*ARM), "t", "l1", "l3") == {"base": "l1", "tip": "l3"}
     with pytest.raises(ModelError, match="--base"):
-        arm_part(tree(*arm, ("p", "elsewhere", "else", "revolute")), "t", None, None)
+        arm_part(tree(*ARM, ("p", "elsewhere", "else", "revolute")), "t", None, None)
+
+
+def test_a_hand_with_long_chains_of_short_fingers_is_no_part_of_the_arm() -> None:
+    fingers = [
+        (f"{hand}{k}", "l5" if k == 0 else f"{hand}{k}", f"{hand}{k + 1}", "revolute")
+        for hand in "abc"
+        for k in range(4)
+    ]
+    lengths = {f"{hand}{k}": 0.02 for hand in "abc" for k in range(4)}
+    assert arm_part(tree(*ARM, *fingers, lengths=lengths), "t", None, None)["tip"] == "l5"
+    # As long as the arm, they are no fingers: the first is the rest of the arm.
+    assert arm_part(tree(*ARM, *fingers), "t", None, None)["tip"] == "a4"
+
+
+def test_a_torso_that_carries_a_head_beside_the_arm_is_no_part_of_it() -> None:
+    torso = [("lift", "root", "l0", "prismatic"), ("head", "l0", "face", "revolute")]
+    assert arm_part(tree(*torso, *ARM), "t", None, None) == {"base": "l0", "tip": "l5"}
+    # Without a head, it is a joint of the arm like others.
+    assert arm_part(tree(torso[0], *ARM), "t", None, None) == {}
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -283,3 +473,48 @@ def test_a_capsule_encloses_its_points(seed: int, count: int) -> None:
     share = np.clip((points - start) @ way / max(way @ way, 1e-12), 0.0, 1.0)
     apart = np.linalg.norm(points - start - share[:, None] * way, axis=1)
     assert (apart <= capsule.radius + 5e-4).all()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 30))
+def test_capsules_enclose_every_triangle(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(count, 3, 3)) * rng.uniform(0.01, 0.5, size=3)
+    found = capsules_around(corners)
+    assert 1 <= len(found) <= 4
+    weights = rng.dirichlet(np.ones(3), size=(200,))
+    points = np.einsum("pk,pki->pi", weights, corners[rng.integers(0, count, 200)])
+    apart = []
+    for one in found:
+        start, way = np.array(one.start), np.subtract(one.end, one.start)
+        share = np.clip((points - start) @ way / max(way @ way, 1e-12), 0.0, 1.0)
+        apart.append(np.linalg.norm(points - start - share[:, None] * way, axis=1) - one.radius)
+    assert (np.min(apart, axis=0) <= 5e-4).all()
+
+
+def test_a_bent_link_is_enclosed_in_several_capsules_and_a_straight_one_in_one() -> None:
+    faces = np.frombuffer(box_stl(0.3, 0.03, 0.03)[84:], dtype=np.dtype([("n", "<12f4"), ("a", "<u2")]))["n"]
+    bar = np.array(faces.reshape(-1, 4, 3)[:, 1:], dtype=float)
+    upright = bar[..., [2, 1, 0]] + [0.3, 0.0, 0.3]
+    assert len(capsules_around(bar)) == 1
+    bent = capsules_around(np.concatenate([bar, upright]))
+    assert 2 <= len(bent) <= 4
+    assert max(one.radius for one in bent) < 0.1  # a single one has 0.2 m
+
+
+@pytest.mark.slow
+def test_placeholders_and_undeclared_prefixes_of_a_urdf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    urdf = BARS.replace('effort="87"', 'drake:acceleration="2.5" effort="1000"')
+    config, said = described(tmp_path, urdf, capsys)
+    assert "1000 at every joint of the file is more than 5 times what any of them needs" in said
+    assert all(one.torque is not None and one.torque < 200.0 for one in config.joints.values())
+    assert "guessed: the file's is of no drive" in (tmp_path / "bars.yaml").read_text()
+
+
+def test_an_arm_that_no_torque_rate_can_move_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    heavy = BARS.replace('effort="87"', 'effort="0"').replace('<mass value="1.0"/>', '<mass value="5000"/>')
+    (tmp_path / "bars.urdf").write_text(heavy)
+    assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 3
+    err = capsys.readouterr().err
+    assert "by its masses: friction alone would take" in err
+    assert "is the file in metres, radians and kilograms?" in err
+    assert not (tmp_path / "bars.yaml").exists()

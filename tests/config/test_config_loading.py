@@ -140,7 +140,7 @@ def test_real_time_is_no_part_of_a_motion_and_leaves_the_hash_of_who_does_not_de
     assert described.sha256 != plain.sha256
     assert described.motion_sha256 == plain.motion_sha256
     assert ArmConfig.model_validate(described.model_dump(mode="json", by_alias=True)) == described
-    with pytest.raises(ConfigError, match="less than or equal to 98"):
+    with pytest.raises(ConfigError, match="must be at most 98"):
         written(tmp_path, BASE + "realtime: {priority: 99}\n")  # that of the kernel's own threads
 
 

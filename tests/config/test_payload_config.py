@@ -43,10 +43,10 @@ def shipped(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("payload", "said"),
     [
-        ("payload: {mass: 0, center_of_mass: [0, 0, 0]}", "3:11: payload.mass: Input should be greater than 0"),
-        ("payload: {mass: -1, center_of_mass: [0, 0, 0]}", "3:11: payload.mass: Input should be greater than 0"),
-        ("payload: {mass: .nan, center_of_mass: [0, 0, 0]}", "3:11: payload.mass: Input should be a valid number"),
-        ("payload: {mass: 2500, center_of_mass: [0, 0, 0]}", "payload.mass: Input should be less than or equal to"),
+        ("payload: {mass: 0, center_of_mass: [0, 0, 0]}", "3:11: payload.mass: must be greater than 0 [kg]"),
+        ("payload: {mass: -1, center_of_mass: [0, 0, 0]}", "3:11: payload.mass: must be greater than 0 [kg]"),
+        ("payload: {mass: .nan, center_of_mass: [0, 0, 0]}", "3:11: payload.mass: must be a number [kg]"),
+        ("payload: {mass: 2500, center_of_mass: [0, 0, 0]}", "payload.mass: must be at most"),
         ("payload: {center_of_mass: [0, 0, 0]}", "3:1: payload: 'mass' is missing"),
         ("payload: {mass: 1}", "3:1: payload: 'center_of_mass' is missing"),
         ("payload: {mass: 1, center_of_mass: [0, 0, 120]}", "120 m is more than 3 m from the link's"),

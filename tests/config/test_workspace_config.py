@@ -44,8 +44,18 @@ def test_what_fits_is_accepted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "mark", "message"),
     [
-        ("  one: [{from", "  three: [{from", "three", "geometry: no joint 'three', and not 'base'"),
-        ("[two, base]", "[two, floor]", "floor", "workspace.may_touch: no joint 'floor', and not 'base'"),
+        (
+            "  one: [{from",
+            "  three: [{from",
+            "three",
+            "geometry: no joint 'three', and not 'base'; known are base, one, two",
+        ),
+        (
+            "[two, base]",
+            "[two, floor]",
+            "floor",
+            "workspace.may_touch: no joint 'floor', and not 'base'; known are base, one, two",
+        ),
         ("loss: [0.1, 0.2]", "loss: [0.1, 0.2, 0.3]", "loss", "supply.loss: 3 values for 2 joints"),
         ("margin: [0.1, 0.2]", "margin: [0.1]", "position_margin", "design.position_margin: 1 values for 2 joints"),
     ],

@@ -96,7 +96,7 @@ def test_errors_are_of_one_tree(
     assert said.startswith(
         f"ident: {client.url}: the token from $IDENT_TOKEN does not count there: it was revoked, or is"
     )
-    assert "`ident token add NAME --role operator`" in said
+    assert "`ident tokens add NAME --role operator`" in said
     assert "Bearer" not in said
     for token in (None, "ident_no"):  # in words that are no HTTP, either
         with (

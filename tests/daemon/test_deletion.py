@@ -233,7 +233,7 @@ def test_the_command_deletes_and_names(state: Path, commissioned: Path, capsys: 
     words = ["delete", "run", FIRST, "--state", str(state)]
     assert main(words) == 2
     said = f"the run {FIRST} is referred to by acceptance 1; to delete it all the same: "
-    assert capsys.readouterr().err == f"ident: {said}`ident delete run {FIRST} --anyway`\n"
+    assert capsys.readouterr().err == f"ident: {said}`ident runs delete {FIRST} --anyway`\n"
     assert main([*words, "--anyway", "--json", "--by", "ann"]) == 0
     assert json.loads(capsys.readouterr().out)["dependents"] == [{"kind": "acceptance", "id": "1", "becomes": "kept"}]
     with Database(state) as db:

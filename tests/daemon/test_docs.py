@@ -63,7 +63,7 @@ def test_every_command_is_understood() -> None:
     assert len(found) > 20
     for words in found:
         assert parser().parse_args(words).word, words
-    assert {words[0] for words in found} >= {"serve", "backup", "restore", "token", "delete", "prune", "stop"}
+    assert {words[0] for words in found} >= {"serve", "backup", "restore", "tokens", "runs", "prune", "stop"}
 
 
 def test_every_request_file_and_target_is_there(daemon: Asked) -> None:

@@ -23,9 +23,9 @@ from daemon.served import daemon_process
 from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
-from ident_service.cli.arguments import Parser
+from ident_service.cli.arguments import LOCAL_ONLY, Parser
 from ident_service.cli.output import lines_of
-from ident_service.cli.remote import LOCAL_ONLY, table
+from ident_service.cli.remote import table
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError
 from ident_service.registry.state_folder import fault_file
@@ -55,7 +55,8 @@ def test_every_verb_is_done_by_a_daemon_or_says_why_not() -> None:
     assert set(done) | set(LOCAL_ONLY) == set(verbs())
     assert not set(done) & set(LOCAL_ONLY)
     assert set(LOCAL_ONLY) == {
-        *("serve", "backup", "doctor", "driver test", "emulate", "import", "new", "restore", "token add"),
+        *("serve", "backup", "doctor", "driver test", "emulate", "import", "new", "restore", "tokens add", "view"),
+        *("completion", "schema"),
         *("bus import", "bus store", "bus restore", "bus report", "fleet status"),
     }
     assert all(len(why) > 10 for why in LOCAL_ONLY.values())
@@ -72,11 +73,13 @@ def test_verbs_of_this_machine_say_why(state: Path, capsys: pytest.CaptureFixtur
     for words in (
         ["serve"],
         ["import", "x"],
-        ["token", "add", "ann", "--role", "viewer"],
+        ["tokens", "add", "ann", "--role", "viewer"],
         ["emulate", "x"],
         ["doctor"],
     ):
-        assert main([*words, *server]) == 2
+        with pytest.raises(SystemExit) as refused:
+            main([*words, *server])
+        assert refused.value.code == 2
         said = capsys.readouterr().err
         assert next(why for word, why in LOCAL_ONLY.items() if " ".join(words).startswith(word)) in said
 
@@ -224,7 +227,7 @@ def test_verbs_are_done_by_a_daemon(
         assert done("accept", RUN, "--note", "good")["number"] == 1
         assert done("compare", "accepted:quick", other)["job"]["request"]["run"] == RUN
         kept = done("delete", "run", RUN, code=2)["error"]["message"]
-        assert kept.endswith(f"acceptance 1; to delete it all the same: `ident delete run {RUN} --anyway`")
+        assert kept.endswith(f"acceptance 1; to delete it all the same: `ident runs delete {RUN} --anyway`")
         assert done("accept", other, "--note", "better")["who"] == "owner"
         assert done("rollback", "quick", "--note", "back")["origin"] == 1
         assert done("prune", "--keep", 1)["deleted"] is False
@@ -249,7 +252,7 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
 ) -> None:
     body = on_a_bus()
     (tmp_path / "arm.yaml").write_text(body["description"])
-    (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+    (tmp_path / "emulated_drive.eds").write_text(body["files"]["emulated_drive.eds"])
     words = ["home", str(tmp_path / "arm.yaml"), "--zero", "--confirm", ON_A_BUS, "--lease-from-stdin"]
     reading, writing = os.pipe()
     os.write(writing, b"\n" if said is None else said)
@@ -356,7 +359,7 @@ def test_what_is_no_file_here_is_told_so_and_files_of_a_description_are_sent(
             assert re.search(r"monday.\w+: no such file here, and the daemon at http", capsys.readouterr().err)
         body = on_a_bus()
         (tmp_path / "arm.yaml").write_text(body["description"])
-        (tmp_path / "puck.eds").write_text(body["files"]["puck.eds"])
+        (tmp_path / "emulated_drive.eds").write_text(body["files"]["emulated_drive.eds"])
         assert main(["config", "check", str(tmp_path / "arm.yaml"), *server]) == 0
         broken = "format: ident-arm\nversion: 1\nname: broken\nkinematics: {urdf: broken.urdf}\n"
         (tmp_path / "arm.yaml").write_text(broken)

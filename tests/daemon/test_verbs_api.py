@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -133,8 +134,9 @@ def test_a_description_is_judged_and_not_kept(daemon: Asked, state: Path) -> Non
     assert (answer.status_code, answer.json()["arm"], answer.json()["stable"]) == (200, "unseen", True), answer.text
     assert "gain margin" in answer.json()["text"]
     answer = daemon.post(door, {"description": unstable_text()})
-    assert (answer.status_code, answer.json()["stable"]) == (200, False), answer.text
-    assert answer.json()["objections"]
+    assert (answer.status_code, answer.json()["stable"], answer.json()["good"]) == (200, False, False), answer.text
+    assert re.match(r"\d+:\d+: gains: ", answer.json()["objections"][0])
+    assert answer.json()["text"].splitlines()[0].endswith(": CANNOT MOVE")
     refusal(daemon.post(door, {"description": quick_text().replace("terms:", "termz:")}), 422, r"arm.yaml:\d+:\d+:")
     refusal(daemon.post(door, {"description": "x" * (8 * 2**20 + 1)}), 422)
     refusal(daemon.post(door, {"description": "x", "files": {"y": "z" * (8 * 2**20)}}), 400, "bytes at most")
@@ -143,6 +145,12 @@ def test_a_description_is_judged_and_not_kept(daemon: Asked, state: Path) -> Non
     assert daemon.get("/api/v1/arms/unseen").status_code == 404
     assert list((state / "descriptions").iterdir()) == []
     assert not [line for line in audit_log(daemon.service.db) if line["what"] == "arm added"]
+    # Who stores it is told the same.
+    objections = daemon.post(door, {"description": unstable_text()}).json()["objections"]
+    stored = daemon.post("/api/v1/arms", {"description": unstable_text()})
+    assert (stored.status_code, stored.json()["objections"]) == (201, objections), stored.text
+    again = daemon.post("/api/v1/arms", {"description": unstable_text()})
+    assert (again.status_code, again.json()["objections"]) == (201, None)
 
 
 def test_an_arm_is_zeroed_by_a_persons_word(daemon: Asked, state: Path) -> None:

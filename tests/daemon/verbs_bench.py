@@ -28,15 +28,15 @@ def on_a_bus() -> dict[str, Any]:
         "transmission": {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"},
         "driver": {
             "kind": "canopen",
-            "eds": "puck.eds",
+            "eds": "emulated_drive.eds",
             "buses": [{"interface": "lock_step", "channel": "bench"}],
             "drives": [drive | {"node": 1}, drive | {"node": 2}],
             "emulation": {"seed": 1},
             "zero": "at_home",
         },
     }
-    eds = (shipped_arms()["planar2"].parent / "puck.eds").read_text(encoding="utf-8")
-    return {"description": json.dumps(tree), "files": {"puck.eds": eds}}
+    eds = (shipped_arms()["planar2"].parent / "emulated_drive.eds").read_text(encoding="utf-8")
+    return {"description": json.dumps(tree), "files": {"emulated_drive.eds": eds}}
 
 
 def unstable_text() -> str:

@@ -63,11 +63,11 @@ def separate(**driver: Any) -> Bench:
 
 def canopen_config(**driver: Any) -> ArmConfig:
     """The bench behind two drives with gears of 1, on a bus in virtual time; a thousandth is 1 mN m or 1 mN."""
-    eds = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text()
+    eds = (Path(__file__).parents[2] / "configs" / "emulated_drive.eds").read_text()
     drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
     section = {
         "kind": "canopen",
-        "eds": {"name": "puck.eds", "text": eds},
+        "eds": {"name": "emulated_drive.eds", "text": eds},
         "buses": [{"interface": "lock_step", "channel": "bench"}],
         "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
         # An arm that is looked at, or reset, must not be moved by what it falls or slides on by.

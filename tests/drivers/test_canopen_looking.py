@@ -253,7 +253,7 @@ def test_a_slow_bus_is_asked_more_seldom(bitrate: int, rate: float) -> None:
     driver = CanopenDriver.model_validate(
         {
             "kind": "canopen",
-            "eds": {"name": "puck.eds", "text": ""},
+            "eds": {"name": "emulated_drive.eds", "text": ""},
             "buses": [{"bitrate": bitrate}],
             "drives": [drive | {"node": node} for node in range(1, 8)],
         }

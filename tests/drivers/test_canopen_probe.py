@@ -156,9 +156,9 @@ def test_a_file_that_is_broken_gets_a_report() -> None:
 
 
 def test_the_command_judges_files_without_a_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    eds = shipped_arms()["planar2"].parent / "puck.eds"
+    eds = shipped_arms()["planar2"].parent / "emulated_drive.eds"
     assert main(["bus", "probe", "wam7_canopen", "--eds", str(eds)]) == DONE
-    assert "puck.eds, node 1: emulated Barrett-style puck: can be driven, predicted" in capsys.readouterr().out
+    assert "emulated_drive.eds, node 1: emulated drive: can be driven, predicted" in capsys.readouterr().out
     (tmp_path / "none.eds").write_bytes(b"\xff\xfe no file of ours")
     assert main(["bus", "probe", "wam7_canopen", "--json", "--eds", str(eds), str(tmp_path / "none.eds")]) == VERDICT_NO
     document = json.loads(capsys.readouterr().out)

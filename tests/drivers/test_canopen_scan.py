@@ -237,11 +237,11 @@ def arm_file(folder: Path, *nodes: int) -> Path:
     shipped = shipped_arms()["planar2"]
     tree = {
         "extends": str(shipped),
-        "name": "pucks2",
+        "name": "drives2",
         "transmission": {"ratios": [40.0, 20.0], "drive_terms": "joints"},
         "driver": {
             "kind": "canopen",
-            "eds": str(shipped.parent / "puck.eds"),
+            "eds": str(shipped.parent / "emulated_drive.eds"),
             "buses": [{"interface": "virtual", "channel": f"scan-{folder.name}"}],
             "drives": [drive | {"node": node} for node in nodes],
         },
@@ -259,7 +259,7 @@ def test_the_command_scans_a_bus_of_python_can(tmp_path: Path, capsys: pytest.Ca
     thread.start()
     try:
         assert main(["bus", "scan", str(there)]) == DONE
-        assert capsys.readouterr().out.startswith("pucks2: every configured drive is there\n")
+        assert capsys.readouterr().out.startswith("drives2: every configured drive is there\n")
         assert main(["bus", "scan", str(other), "--json"]) == VERDICT_NO
     finally:
         end.set()

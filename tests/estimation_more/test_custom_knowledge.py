@@ -29,10 +29,8 @@ from ident_service.estimation.second_opinion import second_opinion
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.operations.identification import Request, identify_files
-from ident_service.recordings.open import open_recording
-from ident_service.results.evidence.gathering import gather_evidence
-from ident_service.results.parameter_file import ParameterFile, convex_document
-from ident_service.results.report.verdict import limitations
+from ident_service.results.assessment import assess
+from ident_service.results.parameter_file import convex_document
 from ident_service.results.summary import summary
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "extending.md"
@@ -241,12 +239,12 @@ def test_a_second_opinion_sees_a_wrong_first_one(setting: Setting) -> None:
     assert seen.torque_percent == pytest.approx(1.0, rel=0.1)
     assert seen.deviations > 1.0
     document = {"base_parameters": {}, "second_opinion": convex_document(replace(plain, second=seen))["second_opinion"]}
-    file = ParameterFile(plain.base, plain.beta, "pseudo_inertia", document)
-    evidence = gather_evidence(plain, [open_recording(setting.path)], [], "0" * 64, [])
-    assert "A second solution of the constrained problem predicts other torques" in " ".join(
-        limitations(evidence, file)
-    )
-    assert "THE TWO DIFFER" in summary(replace(plain, second=seen))
+    found = assess(document)
+    assert found.word == "do not use"
+    assert found.reasons[0] == "A second solution of the constrained problem predicts other torques: use neither."
+    differing = summary(replace(plain, second=seen))
+    assert "THE TWO DIFFER" in differing
+    assert differing.startswith("DO NOT USE")
     early = replace(seen, status="optimal_inaccurate")
     assert not early.conclusive
     assert "stopped early; try another --solver" in summary(replace(plain, second=early))

@@ -234,7 +234,7 @@ def readers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Reader]:
     config = load_arm("planar2")
     motion = json.loads(excitation(arm_model(config), "identification").to_json())
     described = json.loads(config.model_dump_json())
-    eds = (shipped_arms()["planar2"].parent / "puck.eds").read_text()
+    eds = (shipped_arms()["planar2"].parent / "emulated_drive.eds").read_text()
     recording = _mcap(tmp_path_factory.mktemp("fuzz") / "run.mcap")
 
     def text(kind: str, *good: str) -> Callable[[random.Random, bool], bytes]:

@@ -14,7 +14,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.canopen import CanopenDriver
 from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 
-EDS = (Path(__file__).parents[2] / "configs" / "puck.eds").read_text(encoding="utf-8")
+EDS = (Path(__file__).parents[2] / "configs" / "emulated_drive.eds").read_text(encoding="utf-8")
 
 
 class Tapped:
@@ -89,7 +89,7 @@ def weightless_config(**driver: Any) -> ArmConfig:
     drive = {"counts": 65536, "rated_torque": 1.0, "max_speed": 6000.0}
     section = {
         "kind": "canopen",
-        "eds": {"name": "puck.eds", "text": EDS},
+        "eds": {"name": "emulated_drive.eds", "text": EDS},
         "buses": [{"interface": "lock_step", "channel": "bench"}],
         "drives": [drive | {"node": 1, "max_torque": 10.0}, drive | {"node": 2, "max_torque": 5.0}],
         "emulation": {"truth": {"m1": 0.5, "Lxx1": 0.1, "Lyy1": 0.1, "Lzz1": 1.0, "m2": 1.0}},

@@ -22,7 +22,7 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.safety_monitor import MAX_AGE
-from sim_backend.emulator.faults import PUCK_FAULTS, DriveFault
+from sim_backend.emulator.faults import DRIVE_FAULTS, DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth
 
@@ -158,7 +158,7 @@ def bench_canopen_config(*, brakes: bool = True) -> ArmConfig:
         transmission={"ratios": [1.0, 1.0], "drive_terms": "joints"},
         driver={
             "kind": "canopen",
-            "eds": {"name": "puck.eds", "text": EDS},
+            "eds": {"name": "emulated_drive.eds", "text": EDS},
             "buses": [{"interface": "lock_step", "channel": "bench"}],
             "drives": [drive | {"node": 1, "max_torque": 30.0}, drive | {"node": 2, "max_torque": 15.0}],
             "emulation": {"truth": TRUTH},
@@ -178,7 +178,7 @@ def wam_canopen_config(buses: int = 1) -> ArmConfig:
 
 def of_joint(kind: str) -> bool:
     """Tell if a fault may be one drive's."""
-    return kind not in WIRE and PUCK_FAULTS[kind].of_joint
+    return kind not in WIRE and DRIVE_FAULTS[kind].of_joint
 
 
 @cache

@@ -22,7 +22,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from sim_backend.emulator.faults import PUCK_FAULTS, DriveFault
+from sim_backend.emulator.faults import DRIVE_FAULTS, DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth
 
@@ -148,7 +148,7 @@ def wam_puck_config() -> ArmConfig:
 
 def of_joint(kind: str) -> bool:
     """Tell if a fault may be one puck's."""
-    return kind not in WIRE and kind != "warning" and PUCK_FAULTS[kind].of_joint
+    return kind not in WIRE and kind != "warning" and DRIVE_FAULTS[kind].of_joint
 
 
 @cache

@@ -22,7 +22,7 @@ from test_fault_campaign import STATES
 
 from ident_service.motion.faults import FAULTS
 from ident_service.motion.state_machine import State
-from sim_backend.emulator.faults import PUCK_FAULTS
+from sim_backend.emulator.faults import DRIVE_FAULTS
 from sim_backend.emulator.motor import Power
 
 SEED = 11
@@ -94,7 +94,7 @@ def ends_as_it_can(case: Case, outcome: Outcome) -> None:
 
 def test_every_kind_of_fault_has_its_promise() -> None:
     shows_without_a_host_only = {"watchdog_ignored"}  # canopen_driver/test_driver_watchdogs.py
-    assert set(CANOPEN_PROMISES) == (set(PUCK_FAULTS) | set(WIRE)) - shows_without_a_host_only
+    assert set(CANOPEN_PROMISES) == (set(DRIVE_FAULTS) | set(WIRE)) - shows_without_a_host_only
     for promise in CANOPEN_PROMISES.values():
         assert promise.codes
         assert promise.codes <= set(FAULTS)

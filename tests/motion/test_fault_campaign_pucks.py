@@ -20,7 +20,7 @@ from test_fault_campaign import STATES
 
 from ident_service.motion.faults import FAULTS
 from ident_service.motion.state_machine import State
-from sim_backend.emulator.faults import PUCK_FAULTS
+from sim_backend.emulator.faults import DRIVE_FAULTS
 from sim_backend.emulator.motor import Power
 
 SEED = 12
@@ -46,7 +46,7 @@ def sample() -> list[Case]:
 
 def test_every_kind_of_fault_has_its_promise() -> None:
     # Pucks send no heartbeats; what shows without a host only is in tests/barrett.
-    assert set(PUCK_PROMISES) == (set(PUCK_FAULTS) | set(WIRE)) - {"watchdog_ignored", "heartbeat_lost"}
+    assert set(PUCK_PROMISES) == (set(DRIVE_FAULTS) | set(WIRE)) - {"watchdog_ignored", "heartbeat_lost"}
     for promise in PUCK_PROMISES.values():
         assert promise.codes <= set(FAULTS)
 

@@ -61,10 +61,19 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.fixture
-def reached(state: Path) -> Iterator[Reached]:
-    """A service of its own."""
-    with listening(state) as found:
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The state folder that the tests of a module share."""
+    folder = tmp_path_factory.mktemp("served") / "state"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("IDENT_STATE", str(folder))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def reached(place: Path) -> Iterator[Reached]:
+    """A service that the tests of a module share."""
+    with listening(place) as found:
         yield found
 
 
@@ -78,13 +87,17 @@ def browser() -> Iterator[Browser]:
         found.close()
 
 
-def log_in(browser: Browser, reached: Reached, token: str | None = None, *, scripts: bool = True) -> Page:
-    """A fresh browser, logged in through the page."""
-    context = browser.new_context(java_script_enabled=scripts, viewport={"width": 1280, "height": 900})
+def log_in(
+    browser: Browser, reached: Reached, token: str | None = None, *, scripts: bool = True, zone: str | None = None
+) -> Page:
+    """A fresh browser, logged in through the page, in a time zone."""
+    context = browser.new_context(
+        java_script_enabled=scripts, viewport={"width": 1280, "height": 900}, timezone_id=zone
+    )
     page = context.new_page()
     page.set_default_timeout(60_000)
-    page.goto(reached.url)
+    page.goto(f"{reached.url}/login?next=/audit")  # where nothing is drawn
     page.get_by_label("Token").fill(token or reached.token)
     page.get_by_role("button", name="Log in").click()
-    page.get_by_role("heading", name="Arms", level=1).wait_for()
+    page.get_by_role("heading", name="Who did what", level=1).wait_for()
     return page

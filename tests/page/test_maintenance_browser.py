@@ -174,26 +174,3 @@ def test_leaving_its_page_stops_the_arm_and_ends_it(browser: Browser, reached: R
     page.goto(f"{reached.url}/reidentifications/{row['id']}")
     expect(page.locator(".verdict")).to_contain_text("It ended without a verdict")
     expect(page.locator("#step-run")).to_contain_text("cancelled")
-
-
-@pytest.mark.parametrize("width", [1280, 400])
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_is_wider_than_the_window(browser: Browser, reached: Reached, width: int, scheme: str) -> None:
-    page = log_in(browser, reached)
-    page.set_viewport_size({"width": width, "height": 800})
-    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
-    make_due(page, reached)
-    page.get_by_label("at certain times").check()
-    page.get_by_label("Minute, hour").fill("0 25 * * *")
-    page.get_by_role("button", name="Add", exact=True).click()
-    expect(page.get_by_role("alert")).to_contain_text("bad hour in cron's five fields")
-    expect(page.get_by_label("Minute, hour")).to_have_value("0 25 * * *")
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    for address in ("/", f"/arms/{ARM}", f"/arms/{ARM}/maintenance"):
-        page.goto(reached.url + address)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width, address
-        expect(page.get_by_role("button", name="Stop all arms")).to_be_in_viewport(ratio=1.0)
-    page.goto(f"{reached.url}/arms/{ARM}")
-    page.get_by_role("button", name="Re-identify", exact=True).click()
-    expect(page.get_by_label("Type the arm's name")).to_be_visible()
-    assert page.evaluate("document.documentElement.scrollWidth") <= width

@@ -15,19 +15,19 @@ from ident_service.registry.state_folder import fault_file
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
 
 
-def test_lists_follow_what_happens(browser: Browser, reached: Reached, state: Path) -> None:
+def test_lists_follow_what_happens(browser: Browser, reached: Reached, place: Path) -> None:
     page = log_in(browser, reached)
     page.wait_for_load_state("load")
     loads = list[str]()
     page.on("load", lambda _: loads.append(page.url))
     main = page.locator("#main")
-    fault_file(state, "planar2").latch("overspeed", "too fast")
+    fault_file(place, "planar2").latch("overspeed", "too fast")
     expect(main).to_contain_text("1 fault", timeout=30_000)
-    add_arm(reached.service.db, state, "extends: planar2\nname: bench\n", {}, "test")
+    add_arm(reached.service.db, place, "extends: planar2\nname: bench\n", {}, "test")
     expect(main.get_by_role("link", name="bench", exact=True)).to_be_visible(timeout=30_000)
     # Whoever stands on a link there keeps it; what is missed comes when they leave.
     main.get_by_role("link", name="bench", exact=True).focus()
-    fault_file(state, "planar2").acknowledge("overspeed")
+    fault_file(place, "planar2").acknowledge("overspeed")
     page.wait_for_timeout(2000)
     expect(main.get_by_role("link", name="bench", exact=True)).to_be_focused()
     expect(main).to_contain_text("1 fault")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import time
@@ -11,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from urllib.parse import urlencode
 
+import numpy as np
 import pytest
 from daemon.conftest import URL, Asked, quick_text, serving
 from daemon.conftest import commissioned as commissioned
@@ -22,9 +24,12 @@ from ident_service.daemon.web.render import STATIC, mark, static
 from ident_service.operations.drift_alarms import Verdict, alarms
 from ident_service.operations.maintenance_schedule import DueRule, add_event, add_schedule, events, pending, schedules
 from ident_service.operations.run_archive import import_run
+from ident_service.recordings.open import open_recording
 from ident_service.registry import jobs as rows
+from ident_service.registry.runs import label_run
 from ident_service.registry.state_folder import arm_folder, fault_file
 from ident_service.registry.tokens import add_token
+from ident_service.results.manifest import write_manifest
 
 ARM = "quick"
 EVIL = "<script>alert('x')</script>\"'&"
@@ -45,6 +50,7 @@ def daemon(state: Path, commissioned: Path) -> Iterator[Asked]:
         assert answer.status_code == 201, answer.text
         arm_folder(state, ARM).mkdir(parents=True, exist_ok=True)
         fault_file(state, ARM).latch("FOLLOWING_ERROR", EVIL)
+        label_run(db, commissioned.name, ["belt"], EVIL, EVIL)
         rows.add_job(db, "j1", "run", ARM, {"kind": "run"}, [], "test", motion=True, run="none")
         rows.ended(db, "j1", "failed", EVIL)
         (state / "jobs" / "j1").mkdir(parents=True)
@@ -75,7 +81,8 @@ def enter(daemon: Asked, role: str) -> None:
 def addresses(commissioned: Path) -> list[str]:
     return ["/", f"/arms/{ARM}", "/arms/planar2", "/jobs", "/jobs/j1", "/runs", f"/runs?arm={ARM}",
             f"/runs/{commissioned.name}", "/audit", f"/arms/{ARM}/maintenance", "/arms/planar2/maintenance",
-            "/reidentifications/again"]  # fmt: skip
+            "/reidentifications/again", f"/runs?arm={ARM}&parameter=fc1", f"/arms/{ARM}/parameters",
+            "/arms/ur10"]  # fmt: skip
 
 
 class Reader(HTMLParser):
@@ -173,7 +180,7 @@ def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> N
             tried += 1
             answer = daemon.ask(method, route.path.format(**filled), headers=FORM)
             assert (answer.status_code, "/login" in answer.headers.get("location", "")) == (303, True), route.path
-    assert tried >= 30
+    assert tried >= 35
     for address in ("/new", f"/arms/{ARM}/move", f"/arms/{ARM}/accept", "/jobs/j1/cancel"):
         answer = daemon.post(address, content="a=b", headers=FORM)
         assert (answer.status_code, answer.headers["location"]) == (303, "/login?next=%2F"), address
@@ -337,10 +344,125 @@ def test_two_runs_are_compared(daemon: Asked, commissioned: Path, tmp_path: Path
 
 
 def test_scripts_and_styles_are_ours_and_kept(daemon: Asked) -> None:
-    for name in STATIC:
+    for name in static():
         answer = daemon.get(f"/static/{mark()}/{name}")
         assert (answer.status_code, answer.content) == (200, static()[name])
         assert "immutable" in answer.headers["cache-control"]
-    for content in static().values():
+    for content in (static()[name] for name in STATIC):
         assert not re.search(rb"https?://(?!www\.w3\.org/2000/svg)", content)
         assert b"innerHTML" not in content
+
+
+def test_the_list_says_what_an_arm_is_and_what_comes_next(daemon: Asked, commissioned: Path) -> None:
+    enter(daemon, "viewer")
+    cards = {
+        name: text
+        for text in daemon.get("/").text.split('<li class="card">')[1:]
+        if (name := (re.search(r'<h3><a href="/arms/([^"]+)">', text) or [""])[1])
+    }
+    assert '<span class="state simulated">simulated</span>' in cards["planar2"]
+    assert "real, canopen" in cards["wam7_canopen"]
+    assert "recordings only" in cards["ur10"]
+    assert "acknowledge the fault" in cards[ARM]
+    assert f'href="/runs/{commissioned.name}"' in cards[ARM]
+    assert f'src="/arms/{ARM}/picture.svg' in cards[ARM]
+    answer = daemon.get(f"/arms/{ARM}/picture.svg")
+    assert answer.headers["content-type"] == "image/svg+xml"
+    assert answer.text.count("<polygon") >= 3  # base and two links
+    assert "script" not in answer.text
+    assert answer.headers["content-security-policy"].startswith("default-src 'none'")
+
+
+def test_an_arm_with_recordings_only_begins_at_identify(daemon: Asked) -> None:
+    enter(daemon, "operator")
+    page = daemon.get("/arms/ur10").text
+    steps = re.findall(r'<li class="step (\w+)" id="step-(\w+)"', page)
+    assert steps == [
+        ("done", "description"), ("next", "identify"), ("open", "report"), ("open", "accept"), ("open", "export"),
+    ]  # fmt: skip
+    assert 'value="home"' not in page
+    assert "State at rest" not in page
+    assert "State at rest" in daemon.get("/arms/planar2").text
+
+
+def test_a_motion_is_confirmed_knowing_its_length_speed_and_reach(daemon: Asked) -> None:
+    enter(daemon, "operator")
+    fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
+
+    def shown(kind: str, speed: float) -> str:
+        answer = daemon.post(f"/arms/{ARM}/confirm", content=f"kind={kind}&speed={speed}", headers=FORM)
+        assert (answer.status_code, complaints(answer.text)) == (200, [])
+        return re.sub(r"<[^>]+>|\s+", " ", answer.text)
+
+    # Four periods of five seconds; two links of half a metre.
+    assert re.search(r"Length\s+20 s, and \d s from home", shown("run", 1.0))
+    assert re.search(r"Length\s+40 s", shown("run", 0.5))
+    assert re.search(r"Reach\s+joints and tool come up to 1 m from", shown("rehearse", 0.2))
+    whole, half = (re.search(r"moves at up to ([\d.]+) m/s", shown("run", speed)) for speed in (1.0, 0.5))
+    assert whole is not None
+    assert half is not None
+    assert float(half[1]) == pytest.approx(0.5 * float(whole[1]), rel=0.1)
+    assert "shoulder" in shown("run", 1.0)
+    picture = daemon.get(f"/arms/{ARM}/motion.svg")
+    assert "side view" in picture.text
+    assert "top view" in picture.text
+
+
+def test_a_run_gets_tags_and_a_note(daemon: Asked, commissioned: Path) -> None:
+    enter(daemon, "operator")
+    where = f"/runs/{commissioned.name}"
+    answer = daemon.post(f"{where}/labels", content="tags=warm,+belt+warm&note=after+lunch", headers=FORM)
+    assert (answer.status_code, answer.headers["location"]) == (303, f"{where}#labels")
+    line = next(one for one in daemon.get("/api/v1/runs").json() if one["id"] == commissioned.name)
+    assert (line["tags"], line["note"]) == (["warm", "belt"], "after lunch")
+    assert "after lunch" in daemon.get("/runs?tag=warm").text
+    assert "after lunch" in daemon.get("/runs?text=LUNCH").text
+    assert "after lunch" not in daemon.get("/runs?tag=cold").text
+    for bad in ("tags=<b>", f"note={'x' * 2001}", f"tags={'+'.join(f't{k}' for k in range(17))}"):
+        answer = daemon.post(f"{where}/labels", content=bad, headers=FORM)
+        assert (answer.status_code, complaints(answer.text)) == (400, []), bad
+    assert daemon.get(f"/api/v1{where}").json()["tags"] == ["warm", "belt"]
+    answer = daemon.post("/runs/none/labels", content="tags=a", headers=FORM)
+    assert answer.status_code == 404
+
+
+def test_a_recording_is_thinned_for_display(daemon: Asked, commissioned: Path) -> None:
+    enter(daemon, "viewer")
+    answer = daemon.get(f"/api/v1/runs/{commissioned.name}/series?name=identification.mcap")
+    assert answer.status_code == 200, answer.text
+    told = answer.json()
+    assert told["joints"] == ["shoulder", "elbow"]
+    assert 200 < len(told["time"]) <= 1500
+    assert told["time"] == sorted(set(told["time"]))
+    recording = open_recording(commissioned / "identification.mcap")
+    blocks = list(recording.blocks())
+    position = np.concatenate([block.position for block in blocks])
+    stamps = np.concatenate([block.stamp_ns for block in blocks])
+    at = np.interp(told["time"], (stamps - stamps[0]) * 1e-9, position[:, 1])
+    np.testing.assert_allclose(told["position"][1], at, atol=2e-4)
+    assert np.abs(told["error"][0]).max() > np.abs(np.subtract(told["reference"][0], told["position"][0])).max() - 1e-6
+    states = [one["message"] for one in told["events"] if one["kind"] == "state"]
+    assert states[-1] == "done"
+    assert told["begins"] > 0.0
+    assert daemon.get(f"/api/v1/runs/{commissioned.name}/series?name=arm.json").status_code in (400, 422)
+    assert daemon.get(f"/api/v1/runs/{commissioned.name}/series?name=none.mcap").status_code == 404
+
+
+def test_parameters_are_trended_against_the_accepted_set(daemon: Asked, commissioned: Path, tmp_path: Path) -> None:
+    second = tmp_path / "later-run"
+    shutil.copytree(commissioned, second)
+    document = json.loads((second / "parameters.json").read_text())
+    table = document["base_parameters"]
+    place = table["expressions"].index("fc2")
+    table["values"][place] += 10.0 * table["standard_deviations"][place]
+    (second / "parameters.json").write_text(json.dumps(document))
+    write_manifest(second)
+    import_run(daemon.service.db, daemon.service.state, second, "test")
+    enter(daemon, "viewer")
+    page = daemon.get(f"/arms/{ARM}/parameters").text
+    first = page.split("<tbody>")[1].split("</tr>")[0]
+    assert ">fc2</th>" in first  # the largest change comes first
+    sigma = re.findall(r'data-value="([\d.]+)"', first)[-1]
+    assert float(sigma) == pytest.approx(10.0 / np.sqrt(2.0), rel=1e-6)
+    shown = daemon.get(f"/runs?arm={ARM}&parameter=fc2").text
+    assert shown.count(" ± ") == 2

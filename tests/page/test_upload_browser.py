@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 
 def test_a_file_goes_up_in_pieces_and_can_be_identified_from(
-    browser: Browser, reached: Reached, state: Path, tmp_path: Path
+    browser: Browser, reached: Reached, place: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "run of monday.csv"
     rows = "".join(f"{k * 1e-3:.3f},0.1,0.2,1.0,2.0\n" for k in range(450_000))
@@ -42,8 +42,8 @@ def test_a_file_goes_up_in_pieces_and_can_be_identified_from(
     page.wait_for_url("**/runs/*")
     assert offsets == [0, 4 * 2**20, 4 * 2**20, 8 * 2**20]
     run = page.url.rpartition("/")[2]
-    assert (state / "runs" / run / "run_of_monday.csv").read_bytes() == file.read_bytes()
-    assert (state / "runs" / run / "columns.yaml").read_text() == COLUMNS
+    assert (place / "runs" / run / "run_of_monday.csv").read_bytes() == file.read_bytes()
+    assert (place / "runs" / run / "columns.yaml").read_text() == COLUMNS
     # What is wrong behind the header is told by the job that reads it.
     page.get_by_role("button", name="Identify").click()
     page.get_by_role("link", name="Back to planar2").wait_for()

@@ -222,7 +222,8 @@ def test_the_command_says_no_where_people_look(tmp_path: Path, capsys: pytest.Ca
     assert said.startswith("DO NOT USE these parameters:\n  - the torque, or the position, may have the wrong sign")
     assert (tmp_path / "out" / "report.txt").read_text().startswith("DO NOT USE")
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Do not use these parameters: the torque, or the position" in page
+    assert ">Do not use: " in page
+    assert "<li>the torque, or the position, may have the wrong sign" in page
     content = json.loads((tmp_path / "out" / "parameters.json").read_text())
     assert "wrong sign" in content["unusable"][0]
     assert main([*words, "--json"]) == 3

@@ -80,7 +80,7 @@ def made(
     validation = [unseen] if validate else []
     estimate = identify(arm, [fitted], validation, set_name=set_name)
     folder.mkdir()
-    write_results(folder, estimate)
+    write_results(folder, estimate, {"warnings": list(warnings)})
     write_report(folder, estimate, [fitted], validation, warnings)
     write_manifest(folder)
     results = read_results(folder)

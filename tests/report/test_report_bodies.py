@@ -11,8 +11,9 @@ from report.conftest import Made
 from results.svg import Svg
 
 from ident_service.model.kinematics import frame_origins, link_poses
+from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.evidence.gathering import bounds_of, ellipsoid, posed
-from ident_service.results.report.figures import Figure, body_figures, ellipse
+from ident_service.results.report.figures import Figure, bodies_words, body_figures, ellipse
 
 
 def inertial_of(mass: float, center: np.ndarray, about_center: np.ndarray) -> np.ndarray:
@@ -103,29 +104,51 @@ def test_a_bound_belongs_to_the_parameter_that_presses_against_it(good: Made) ->
         assert names == ((name,) if first.endswith("2") and not first.startswith(("I", "f")) else ())
 
 
-def test_an_ellipsoid_larger_than_the_picture_is_named_and_not_drawn(good: Made) -> None:
+def with_ellipsoids(made: Made, first: np.ndarray, center: np.ndarray | None = None) -> Evidence:
+    """The evidence with other half axes of the first link's body, and perhaps another centre."""
+    posed_ = made.evidence.posed
+    assert posed_ is not None
+    one, other = posed_.bodies
+    kept = replace(one, axes=first, center=one.center if center is None else center)
+    bodies = (kept, replace(other, axes=0.05 * np.eye(3)))
+    return replace(made.evidence, posed=replace(posed_, bodies=bodies))
+
+
+def test_an_ellipsoid_larger_than_any_picture_is_named_and_not_drawn(good: Made) -> None:
+    joint, flat, small = good.evidence.joints[0], np.diag([2.0, 2.0, 1800.0]), 0.05 * np.eye(3)
+    words = bodies_words(with_ellipsoids(good, 0.0005 * np.eye(3)))
+    assert "Too small to be seen (shorter than 0.0" in words
+    assert f"the ellipsoid of {joint}." in words
+    fitting = with_ellipsoids(good, small)
+    assert "not drawn" not in bodies_words(fitting)
+    assert "Too small" not in bodies_words(fitting)
+    words = bodies_words(with_ellipsoids(good, flat))
+    assert f"and not drawn: the ellipsoid of {joint} (3600 m). It is one body of many" in words
+    assert "--prior" in words
+    for whole, figure in zip(body_figures(fitting), body_figures(with_ellipsoids(good, flat)), strict=True):
+        assert len(svg_of(whole).points("polygon", "body")) == 2
+        assert len(svg_of(figure).points("polygon", "body")) == 1
+        assert "--prior" in figure.description
+
+
+@pytest.mark.parametrize("size", [0.02, 0.3, 0.6, 0.9])
+def test_no_ellipsoid_is_cut_off(good: Made, size: float) -> None:
     posed_ = good.evidence.posed
     assert posed_ is not None
-    joint, bodies = good.evidence.joints[0], posed_.bodies
-    small, flat = 0.05 * np.eye(3), np.diag([2.0, 2.0, 1800.0])
-
-    def drawn(first: np.ndarray) -> list[Figure]:
-        axes = zip(bodies, (first, small), strict=True)
-        kept = tuple(replace(body, axes=own) for body, own in axes)
-        return body_figures(replace(good.evidence, posed=replace(posed_, bodies=kept)))
-
-    for figure in drawn(0.0005 * np.eye(3)):
-        assert "Too small to be seen (shorter than 0.0" in figure.caption
-        assert f"the ellipsoid of {joint}." in figure.caption
-    for fitting, figure in zip(drawn(small), drawn(flat), strict=True):
-        outlines = svg_of(fitting).points("polygon", "body")
-        assert len(outlines) == 2
-        assert "not drawn" not in fitting.caption
-        assert "Too small" not in fitting.caption
-        (kept,) = svg_of(figure).points("polygon", "body")
-        np.testing.assert_array_equal(kept, outlines[1])
-        assert f"and not drawn: the ellipsoid of {joint} (3600 m). It is one body of many" in figure.caption
-        assert "--prior" in figure.description
+    extent = float(np.ptp(posed_.points, axis=0).max())
+    axes = extent * np.diag([0.3 * size, size, size])
+    for center in (None, posed_.points[-1] + 0.8 * extent):
+        for figure in body_figures(with_ellipsoids(good, axes, center)):
+            svg = svg_of(figure)
+            (frame,) = svg.all("rect", "frame")
+            left, top, width, height = (float(frame.get(key, "")) for key in ("x", "y", "width", "height"))
+            outlines = svg.points("polygon", "body")
+            assert len(outlines) == 2
+            for points in (*outlines, *svg.points("polyline", "posture step7")):
+                assert left < points[:, 0].min()
+                assert points[:, 0].max() < left + width
+                assert top < points[:, 1].min()
+                assert points[:, 1].max() < top + height
 
 
 def svg_of(figure: Figure) -> Svg:

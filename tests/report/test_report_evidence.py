@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from estimation.synthetic import waves
 from report.conftest import Made
+from results.svg import Svg
 
 from ident_service.errors import ParameterError, UsageError
 from ident_service.results.evidence.evidence import Evidence
@@ -22,6 +24,7 @@ from ident_service.results.evidence.file import (
     unpacked_mask,
     write_evidence,
 )
+from ident_service.results.posture_figure import spike_figure
 from ident_service.results.report_files import read_evidence_of
 from ident_service.results.run_folder import read_results, write_manifest
 
@@ -53,11 +56,6 @@ def test_evidence_comes_back(good: Made, tmp_path: Path) -> None:
     assert evidence_document(again)["conditions"] == evidence_document(good.evidence)["conditions"]
     for name in ("parameters_sha256", "joints", "bounds", "chosen", "warnings", "revolute"):
         assert getattr(again, name) == getattr(good.evidence, name)
-    for one, other in zip(again.estimates, good.evidence.estimates, strict=True):
-        assert one.moving_joints == other.moving_joints
-    moving = good.estimate.candidates[good.estimate.chosen]
-    expected = [moving.moving.joint_relative_percent, moving.validation[0].moving.joint_relative_percent]
-    np.testing.assert_array_equal(again.estimates[again.chosen].moving_joints, expected)
     for one, other in zip(again.recordings, good.evidence.recordings, strict=True):
         np.testing.assert_allclose(one.time, other.time, rtol=0, atol=1e-9)
         for a, b in zip(one.joints, other.joints, strict=True):
@@ -65,6 +63,32 @@ def test_evidence_comes_back(good: Made, tmp_path: Path) -> None:
             np.testing.assert_array_equal(a.standstill, b.standstill)
         for s, t in zip(one.spectra, other.spectra, strict=True):
             np.testing.assert_allclose(s.density, t.density, rtol=1e-3)
+
+
+def test_spikes_are_the_largest_residuals_of_joints_in_motion(alone: Made, tmp_path: Path) -> None:
+    (fitted,) = alone.evidence.recordings
+    for k, (joint, spike) in enumerate(zip(fitted.joints, fitted.spikes, strict=True)):
+        assert spike is not None
+        residual = np.where(joint.standstill, 0.0, joint.residual[0])
+        at = int(np.argmax(np.abs(residual)))
+        assert spike.residual == pytest.approx(residual[at], rel=1e-3)
+        assert spike.time == pytest.approx(fitted.time[at], abs=fitted.width)
+        text = spike_figure(alone.model.chain, k, spike.time, spike.residual, spike.position)
+        assert len(text) < 20_000  # so that a report has room for one of each joint
+        drawn = Svg.of(text)
+        drawn.require_sound()
+        assert drawn.title.startswith(f"{alone.model.chain.names[k]}: residual of ")
+        assert len(drawn.all("circle", "dot")) == 2  # the joint, in both views
+        # The posture is that of the motion then.
+        expected = waves(1, alone.model.chain.joints).derivative(np.array([spike.time]), 0)[0]
+        np.testing.assert_allclose(spike.position, expected, atol=1e-3)
+    # Files of earlier versions have none.
+    document = evidence_document(alone.evidence)
+    for one in document["recordings"]:
+        del one["spikes"]
+    path = tmp_path / "earlier.json"
+    path.write_text(json.dumps(document))
+    assert read_evidence(path).recordings[0].spikes == ()
 
 
 def test_traces_are_the_recording_and_the_estimate(alone: Made) -> None:
@@ -134,6 +158,8 @@ Change = Callable[[dict[str, Any]], object]
         (lambda c: c["recordings"][0]["joints"][0]["torque"].update(step=1e300), "an array of numbers up to"),
         (lambda c: c["friction"][0]["curve_torque"].__setitem__(0, 1e13), "a number of 1e\\+13"),
         (lambda c: c["recordings"][0]["spectra"][0]["log_density"].update(low=1e9), "a density beyond any"),
+        (lambda c: c["recordings"][0]["spikes"].pop(), "has 1 spikes, not 2"),
+        (lambda c: c["recordings"][0]["spikes"][0]["position"].pop(), "is not of 2 joints"),
         (lambda c: c["timing"][0].update(rate=0.0), "rate"),
     ],
 )

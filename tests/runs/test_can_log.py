@@ -14,37 +14,37 @@ from ident_service.config.load import shipped_arms
 
 
 @pytest.fixture
-def pucks_arm(tmp_path: Path) -> Path:
+def drives_arm(tmp_path: Path) -> Path:
     """Two joints whose axes point along gravity, on emulated drives; a motion of two seconds."""
     shipped = shipped_arms()["planar2"]
     motion = {"kind": "seeded", "seed": 1, "base_frequency": 0.5, "harmonics": 3, "periods": 1}
     drive = {"rated_torque": 0.5, "max_torque": 10.0, "max_speed": 3000.0}
     tree = {
         "extends": str(shipped),
-        "name": "pucks2",
+        "name": "drives2",
         "gravity": [0.0, 0.0, -9.81],
         "motions": {"identification": motion, "validation": dict(motion)},
         "transmission": {"ratios": [40.0, 20.0], "drive_terms": "joints"},
         "driver": {
             "kind": "canopen",
-            "eds": str(shipped.parent / "puck.eds"),
+            "eds": str(shipped.parent / "emulated_drive.eds"),
             "buses": [{"interface": "lock_step"}],
             "drives": [drive | {"node": 1}, drive | {"node": 2}],
         },
     }
-    path = tmp_path / "pucks2.yaml"
+    path = tmp_path / "drives2.yaml"
     path.write_text(yaml.safe_dump(tree))
     return path
 
 
 @pytest.mark.slow
 def test_every_frame_of_a_run_is_in_its_folder(
-    pucks_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drives_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state, folder = ["--state", str(tmp_path / "state")], tmp_path / "run"
-    assert main(["check", str(pucks_arm), "--confirm", "pucks2", *state]) == DONE
+    assert main(["check", str(drives_arm), "--confirm", "drives2", *state]) == DONE
     capsys.readouterr()
-    assert main(["run", str(pucks_arm), "--out", str(folder), "--can-log", "--json", *state]) == DONE
+    assert main(["run", str(drives_arm), "--out", str(folder), "--can-log", "--json", *state]) == DONE
     report = json.loads(capsys.readouterr().out)["report"]
     frames = read_session(folder / "can.log")
     assert report["frames_logged"] == f"{len(frames)} frames"

@@ -26,17 +26,17 @@ def config(tmp_path: Path) -> ArmConfig:
     drive = {"rated_torque": 1.0, "max_torque": 10.0, "max_speed": 3000.0}
     tree = {
         "extends": str(shipped_arms()["planar2"]),
-        "name": "pucks2",
+        "name": "drives2",
         "gravity": [0.0, 0.0, -9.81],
         "transmission": {"ratios": [40.0, 20.0], "drive_terms": "joints"},
         "driver": {
             "kind": "canopen",
-            "eds": str(shipped_arms()["planar2"].parent / "puck.eds"),
+            "eds": str(shipped_arms()["planar2"].parent / "emulated_drive.eds"),
             "buses": [{"interface": "lock_step"}],
             "drives": [drive | {"node": 1}, drive | {"node": 2}],
         },
     }
-    path = tmp_path / "pucks2.yaml"
+    path = tmp_path / "drives2.yaml"
     path.write_text(yaml.safe_dump(tree))
     return load_arm(path)
 

@@ -38,20 +38,20 @@ def written(folder: Path, homes: tuple[float | None, ...] = (0.3, -0.2), **drive
     section = {
         "kind": "canopen",
         "zero": "at_home",
-        "eds": str(planar.parent / "puck.eds"),
+        "eds": str(planar.parent / "emulated_drive.eds"),
         "buses": [{"interface": "lock_step"}],
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": 1, "truth": truth},
     }
     tree = {
         "extends": str(planar),
-        "name": "pucks2",
+        "name": "drives2",
         "control": {"rate": 500, "velocity_cutoff": 30},
         "joints": {joint: GAINS | {"home": home} for joint, home in zip(("shoulder", "elbow"), homes, strict=True)},
         "transmission": GEARS,
         "driver": section | driver,
     }
-    path = folder / "pucks2.yaml"
+    path = folder / "drives2.yaml"
     path.write_text(yaml.safe_dump(tree))
     return path
 
@@ -74,8 +74,8 @@ def state(tmp_path: Path) -> Path:
 
 
 def sure(question: str) -> str:
-    assert "pucks2" in question
-    return "pucks2"
+    assert "drives2" in question
+    return "drives2"
 
 
 def lead(behind: LockStepArm, position: np.ndarray) -> None:
@@ -91,7 +91,7 @@ def test_a_person_who_says_so_makes_the_arm_usable(config: ArmConfig, behind: Lo
     assert not found.usable
     assert found.unreachable == ""
     assert "drives 1, 2 do not know where the arm stands" in found.zero_lost
-    assert any("`ident set-home pucks2`" in step for step in found.steps), found.steps
+    assert any("`ident set-home drives2`" in step for step in found.steps), found.steps
     assert not any("Check power" in step for step in found.steps), found.steps
     done = set_home(config, state, sure)
     assert [(one.joint, one.position, one.unit) for one in done.posture] == [
@@ -171,7 +171,9 @@ def test_latched_faults_are_said(config: ArmConfig, behind: LockStepArm, state: 
     behind.settle(behind.clock.now_ns() + 100_000_000)
     found = recover(config, state)
     assert "drives 2 do not know" in found.zero_lost
-    acknowledged = next(k for k, step in enumerate(found.steps) if "`ident acknowledge pucks2 drive_restarted`" in step)
+    acknowledged = next(
+        k for k, step in enumerate(found.steps) if "`ident acknowledge drives2 drive_restarted`" in step
+    )
     zeroed = next(k for k, step in enumerate(found.steps) if "`ident set-home" in step)
     assert acknowledged < zeroed < len(found.steps) - 1
     done = set_home(config, state, sure)
@@ -186,18 +188,18 @@ def test_the_command_moves_nothing_and_says_the_posture(
 ) -> None:
     path = written(tmp_path)
     words = ["home", str(path), "--zero", "--state", str(state)]
-    assert main([*words, "--confirm", "pucks2"]) == 0
+    assert main([*words, "--confirm", "drives2"]) == 0
     said = capsys.readouterr().out
     assert "nothing will move" in said
     assert "elbow at -0.2 rad (-11.5 degrees)" in said
-    assert main([*words, "--json", "--confirm", "pucks2"]) == 0
+    assert main([*words, "--json", "--confirm", "drives2"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["posture"][1] == {"joint": "elbow", "position": -0.2, "unit": "rad"}
     assert document["faults"] == []
     for more in ((), ("--json",), ("--confirm", "pucks")):
         assert main([*words, *more]) == 3
     assert main([*words, "--out", str(tmp_path / "run")]) == 2
-    assert main(["home", str(path), "--confirm", "pucks2", "--state", str(state)]) == 2
+    assert main(["home", str(path), "--confirm", "drives2", "--state", str(state)]) == 2
     shutil.rmtree(state)
     assert main(["home", "planar2", "--zero", "--confirm", "planar2", "--state", str(state)]) == 2
     assert "needs no home" in capsys.readouterr().err

@@ -139,7 +139,7 @@ def test_an_interface_that_is_removed_has_gone(link: Link, vcan: str) -> None:
 def test_a_full_transmit_queue_is_told(link: Link, vcan: str, neighbour: Neighbour) -> None:
     # A queue without room for a single frame: each is refused with ENOBUFS, as by an adapter that nobody acknowledges.
     command("tc", "qdisc", "add", "dev", vcan, "root", "pfifo", "limit", "0")
-    with pytest.raises(BusError, match="the transmit queue is full: nobody acknowledges") as caught:
+    with pytest.raises(BusError, match="the transmit queue is full: no node acknowledges") as caught:
         link.send(Frame(0x080))
     assert caught.value.kind == "full"
     command("tc", "qdisc", "del", "dev", vcan, "root")

@@ -22,6 +22,7 @@ import pytest
 from ident_service.config.barrett import BarrettDriver
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm, shipped_arms
+from ident_service.errors import ArmFault
 from ident_service.estimation.identify import identify
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
@@ -32,6 +33,10 @@ from ident_service.recordings.open import open_recording
 
 pytestmark = pytest.mark.timeout(900)
 PATIENCE = 300.0  # s, for a machine that emulates another one and has more to do
+
+TRIES = 4
+# What a stall of the machine, or of the one that emulates it, ends in; such a motion is run again.
+STALLS = ("late_cycles", "repeated_warnings", "bus_silent", "feedback_gone", "drive_watchdog", "8250h")
 
 ARM = """
 extends: {planar2}
@@ -120,14 +125,22 @@ def test_a_motion_over_a_real_bus_identifies_the_arm(
     planar2 = shipped_arms()["planar2"]
     path, recording = tmp_path / "arm.yaml", tmp_path / "identification.mcap"
     section = CANOPEN if kind == "canopen" else PUCKS
-    driver = section.format(eds=planar2.parent / "puck.eds", interface=interface, channel=can_interface)
+    driver = section.format(eds=planar2.parent / "emulated_drive.eds", interface=interface, channel=can_interface)
     path.write_text(ARM.format(planar2=planar2, driver=driver) + (OF_PUCKS if kind == "barrett" else ""))
     config = load_arm(path)
     model = arm_model(config)
     motion = excitation(model, "identification")
     ready = "node 2: pre operational" if kind == "canopen" else "safety, node 10: IDLE"
-    with emulated(path, ready) as drives:
-        report = record_motion(make_arm(config), model, motion, recording)
+    for left in reversed(range(TRIES)):
+        recording.unlink(missing_ok=True)
+        try:
+            with emulated(path, ready) as drives:
+                report = record_motion(make_arm(config), model, motion, recording)
+            break
+        except ArmFault as fault:
+            print(f"{interface}: {fault}")
+            if not (left and any(code in str(fault) for code in STALLS)):
+                raise
     print(f"{interface}: {report}\ndrives: {drives}")
     assert report.state is State.DONE
     assert drives["at_rest"] is True

@@ -1,8 +1,8 @@
 """Serve the routes about access tokens: list them, revoke one.
 
 Tokens are not made over HTTP: whoever got hold of an operator's token could make others, which would outlive its
-revocation. Making one is an act at the state folder (`ident token add`). Revoking over HTTP is safe: it cannot lock out
-a person at the state folder.
+revocation. Making one is an act at the state folder (`ident tokens add`). Revoking over HTTP is safe: it cannot lock
+out a person at the state folder.
 """
 
 from __future__ import annotations

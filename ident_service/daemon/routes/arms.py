@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,6 +17,7 @@ from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.responses import (
     PAGES,
     AcceptanceAnswer,
+    AddedArmAnswer,
     ArmAnswer,
     ArmLine,
     AskedAnswer,
@@ -97,14 +98,20 @@ def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
 
 
 @router.post("/arms", status_code=201, responses=failures(409))
-def add_arm(service: Serving, who: Operator, body: NewArm) -> ArmAnswer:
-    """Add an arm by its description; sending the same one again changes nothing."""
+def add_arm(service: Serving, who: Operator, body: NewArm) -> AddedArmAnswer:
+    """Add an arm by its description; sending the same one again changes nothing.
+
+    It may be one that can be identified and not moved; `objections` say why it cannot.
+    """
     text, files = body.description, body.files
+    judged: dict[str, Any] = {}
     with service.checks.place():
         added = known.add_arm(
-            *(service.db, service.state, text, files, who.name), replace=body.replace, judge=judge_apart
+            *(service.db, service.state, text, files, who.name),
+            replace=body.replace,
+            judge=lambda path: judged.update(judge_apart(path)),
         )
-    return _arm(service, added.name)
+    return AddedArmAnswer(**_arm(service, added.name).model_dump(), objections=judged.get("objections"))
 
 
 @router.get("/arms/{arm}")

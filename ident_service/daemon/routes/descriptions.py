@@ -1,22 +1,26 @@
-"""Serve the routes that check a description without storing it, and show an arm's home posture.
+"""Serve the routes that check or begin a description without storing it, and show an arm's home posture.
 
 Modules that compute with mechanisms are imported only in the request, so that the service starts without them.
 """
 
 from __future__ import annotations
 
+from base64 import b64decode
 from dataclasses import asdict
-from typing import Literal
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Literal
 
 from fastapi import APIRouter
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.config.load import load_arm
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
 from ident_service.daemon.errors import failures
-from ident_service.daemon.jobs.requests import ArmName
+from ident_service.daemon.jobs.requests import ArmName, FileName
 from ident_service.daemon.routes.arms import Description
-from ident_service.operations.description_process import judge_apart
+from ident_service.errors import UsageError
+from ident_service.operations.description_process import describe_apart, judge_apart
 from ident_service.registry.arms import known_arm, uploaded
 
 router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
@@ -25,12 +29,13 @@ router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
 class DescriptionAnswer(BaseModel):
     """Description without mistakes.
 
-    `stable` is null for an arm that can be identified but not moved; `objections` say what is wrong with the gains,
-    `text` is all of it for a person.
+    `objections` say why the arm cannot be moved, each with line and column; `good` is whether there are none. `stable`
+    is of the gains, null where they or limits are missing; `text` is all of it for a person.
     """
 
     arm: str
     sha256: str
+    good: bool
     stable: bool | None
     objections: list[str]
     text: str
@@ -42,6 +47,40 @@ class HomeJoint(BaseModel):
     joint: str
     position: float
     unit: Literal["rad", "m"]
+
+
+class NewDescription(BaseModel):
+    """URDF of an arm, by name, with its meshes: each file's content in base 64. The arm gets `name`."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: ArmName
+    urdf: FileName
+    files: Annotated[dict[FileName, str], Field(min_length=1, max_length=64)]
+
+
+class NewDescriptionAnswer(BaseModel):
+    """First description of an arm, to be read and corrected: `guessed` says what the URDF did not tell.
+
+    `files` are those that it names; they are sent with it when the arm is added.
+    """
+
+    description: str
+    files: dict[str, str]
+    guessed: list[str]
+
+
+@router.post("/descriptions/new")
+def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescriptionAnswer:
+    """Write a first description of an arm from its URDF and meshes; nothing is kept."""
+    if body.urdf not in body.files:
+        raise UsageError(f"{body.urdf!r} is not among the files; send the URDF with its meshes")
+    with service.checks.place(), TemporaryDirectory(prefix="ident-new-") as place:
+        for name, content in body.files.items():
+            try:
+                (Path(place) / name).write_bytes(b64decode(content, validate=True))
+            except ValueError:
+                raise UsageError(f"{name!r}: its content is not base 64") from None
+        return NewDescriptionAnswer(**describe_apart(Path(place) / body.urdf, body.name))
 
 
 @router.post("/descriptions/check")

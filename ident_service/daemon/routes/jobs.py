@@ -247,6 +247,8 @@ def job_answer_document(service: Service, row: Row) -> JobAnswer:
     progress = None if found is None else _named(asdict(found), service, row)
     moves = bool(row["motion"]) and (row["state"] == "running" or untold(row))
     held = moves and held_arm(service.state, str(row["arm"]))
+    if held and progress is not None:  # it ends when a person says so
+        progress |= {"fraction": None, "remaining": None}
     if row["state"] == "queued" and (before := service.engine.live.waits_for(row["id"])) is not None:
         other = service.db.row("SELECT arm FROM jobs WHERE id = ? AND motion", before)
         shown["detail"] = f"waits for {before}"

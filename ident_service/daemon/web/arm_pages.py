@@ -13,21 +13,33 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from fastapi import APIRouter, Response
+from markupsafe import Markup
 
 from ident_service import __version__
 from ident_service.config.arm import ArmConfig
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import status_of
-from ident_service.daemon.jobs.requests import MOVES, ArmName
+from ident_service.daemon.jobs.commands import JOBS
+from ident_service.daemon.jobs.outcome import said
+from ident_service.daemon.jobs.requests import MOVES, ArmName, Id
 from ident_service.daemon.maintenance.reidentification import (
     known_reidentification,
     reidentifications,
     require_comparable,
 )
 from ident_service.daemon.routes import arms, jobs
+from ident_service.daemon.web.arm_facts import (
+    ArmFacts,
+    arm_facts,
+    extent,
+    facts_of,
+    home_svg,
+    joint_facts,
+    motion_svg,
+)
 from ident_service.daemon.web.forms import Form, PageRoute, seen
 from ident_service.daemon.web.reidentification_pages import compared
-from ident_service.daemon.web.render import page
+from ident_service.daemon.web.render import page, picture, when
 from ident_service.errors import IdentError, MotionRefused, UsageError
 from ident_service.motion.command_channel import in_use
 from ident_service.motion.ticket import Verdict, read_ticket
@@ -61,6 +73,7 @@ TITLES: Final = {
 
 
 _MAKE_RUNS: Final = ("rehearse", "run", "identify")
+_WITHOUT_ARM: Final = ("description", "identify", "report", "accept", "export")  # steps of one with recordings only
 
 
 @dataclass(frozen=True)
@@ -72,7 +85,7 @@ class Step:
         title: for people.
         state: `next` for exactly one step, unless a job of a step is under way, which then is `busy`; `skipped` for a
             rehearsal that a run went without.
-        words: result so far, in words.
+        words: result so far, in words, or in words and times.
         link: page of the job that is doing it now.
     """
 
@@ -89,7 +102,7 @@ class Ladder:
 
     Attributes:
         steps: in order.
-        run: id of the newest run on the arm that came to its end.
+        run: id of the newest run on the arm that came to its end; of an arm with recordings only, its newest recording.
         identified: id of the newest identification of that run.
         accepted: the current acceptance.
         exported: id of the job that exported the accepted parameters.
@@ -124,9 +137,9 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
         for one in rows.jobs(db, arm=arm, most=500)
         if one["created"] >= since and one["run"] not in made and not _deleted(one, there)
     ]
-    run = _newest(jobs, "run")
-    identification = next((job for job in jobs if _identifies(job, run)), None)
-    run_id, identified = _made(run), _made(identification)
+    movable = config.driver is not None
+    run_id = _made(_newest(jobs, "run")) if movable else _newest_recording(db, arm, since)
+    identified = _made(next((job for job in jobs if _identifies(job, run_id)), None))
     reported = identified is not None and (state / REPORTS / f"{identified}.html").is_file()
     acts = acceptances(state, arm)
     accepted = acts[-1] if acts else None
@@ -150,7 +163,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
             else "slowly, while you hold a key; recommended before a run",
         ),
         "run": (run_id is not None, run_id or "nothing recorded yet"),
-        "identify": (identified is not None, identified or "no parameters from the newest run yet"),
+        "identify": (identified is not None, identified or _nothing_identified(run_id, movable=movable)),
         "report": (reported, "made" if reported else "not made yet"),
         "accept": (took, _accepted(accepted)),
         "export": (took and exported is not None, "made" if exported else "nothing exported of what is accepted"),
@@ -171,6 +184,9 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
             return "skipped" if key == "rehearse" and rehearsed is None else "done"
         return "next" if key == upcoming and not busy else "open"
 
+    if not movable:
+        done = {key: done[key] for key in _WITHOUT_ARM}
+        upcoming = next((key for key, (finished, _) in done.items() if not finished), "")
     steps = tuple(Step(key, TITLES[key], state_of(key), words, busy.get(key)) for key, (_, words) in done.items())
     return Ladder(steps, run_id, identified, accepted, exported, reported, comparable)
 
@@ -194,8 +210,21 @@ def _last(again: list[Row]) -> str:
     what = "after maintenance or a change in behaviour: preflight, run, identify, compare with the accepted set"
     if not again:
         return what
-    when = datetime.fromtimestamp(again[0]["begun"], UTC).strftime("%Y-%m-%d %H:%M UTC")
-    return f"the last one, {when}: {again[0]['state']}; {what}"
+    return Markup("the last one, {}: {}; {}").format(when(again[0]["begun"]), again[0]["state"], what)
+
+
+def _newest_recording(db: Database, arm: str, since: float) -> str | None:
+    row = db.row(
+        "SELECT id FROM runs WHERE arm = ? AND kind = 'recording' AND indexed >= ? ORDER BY created DESC LIMIT 1",
+        *(arm, since),
+    )
+    return None if row is None else str(row["id"])
+
+
+def _nothing_identified(run: str | None, *, movable: bool) -> str:
+    if movable:
+        return "no parameters from the newest run yet"
+    return "no parameters from the newest recording yet" if run else "upload a recording of the arm: MCAP or CSV"
 
 
 def _newest(jobs: list[Row], kind: str) -> Row | None:
@@ -211,10 +240,10 @@ def _made(job: Row | None) -> str | None:
     return None if job is None else str(job["run"])
 
 
-def _identifies(job: Row, run: Row | None) -> bool:
+def _identifies(job: Row, run: str | None) -> bool:
     if job["kind"] != "identify" or job["state"] != "done" or run is None:
         return False
-    return any(one.get("run") == run["run"] for one in job["request"].get("recordings", ()))
+    return any(one.get("run") == run for one in job["request"].get("recordings", ()))
 
 
 def _exports(job: Row, state: Path, run: str) -> bool:
@@ -241,42 +270,57 @@ def _ticket(path: Path, config: ArmConfig) -> tuple[bool, str]:
         ticket = read_ticket(path)
     except IdentError:
         return False, "its ticket cannot be read; repeat the preflight"
-    until = ticket.expires.strftime("%Y-%m-%d %H:%M UTC")
+    until = when(ticket.expires.timestamp())
     if ticket.verdict is not Verdict.PASSED:
         return False, "the last one failed"
     if ticket.subject.arm_sha256 != config.sha256 or ticket.subject.software != f"ident-service {__version__}":
         return False, "the description or the software has changed since"
     if datetime.now(UTC) >= ticket.expires:
-        return False, f"its ticket ended at {until}"
-    return True, f"passed, valid until {until}"
+        return False, Markup("its ticket ended at {}").format(until)
+    return True, Markup("passed, valid until {}").format(until)
 
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 _NUMBERS: Final = {"speed": float, "seconds": float, "seed": int, "starts": int, "until": float}
-_KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export"})
+_KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export", "watch"})
 
 
 @router.get("/")
 def list_arms(service: Serving, who: Viewer) -> Response:
-    """List all arms without reading their descriptions, which would take too long for a first page."""
+    """List all arms: those that something was done with, and the shipped examples."""
+    db = service.db
     accepted = {
-        row["arm"]: row["number"]
-        for row in service.db.rows("SELECT arm, MAX(number) AS number FROM acceptances GROUP BY arm")
+        row["arm"]: row["number"] for row in db.rows("SELECT arm, MAX(number) AS number FROM acceptances GROUP BY arm")
     }
+    last = {
+        row["arm"]: row for row in db.rows("SELECT arm, id, kind, ending, MAX(created) AS at FROM runs GROUP BY arm")
+    }
+    worked = last.keys() | accepted.keys() | {row["arm"] for row in db.rows("SELECT DISTINCT arm FROM jobs")}
+    busy = rows.jobs(db, states=rows.LIVE, most=50)
+    standing, due = _alarms(service, None), planned.pending(db)
     lines = []
-    for row in known.arm_names(service.db):
+    for row in known.arm_names(db):
+        name = row["name"]
         try:
-            faults = len(fault_file(service.state, row["name"]).latched())
+            faults = len(fault_file(service.state, name).latched())
         except IdentError:
             faults = 1  # a damaged file prevents motion like a fault
-        moving = in_use(control_path(service.state, row["name"]))
-        lines.append({**row, "accepted": accepted.get(row["name"]), "faults": faults, "moving": moving})
-    busy = rows.jobs(service.db, states=rows.LIVE, most=50)
-    standing = _alarms(service, None)
-    due = planned.pending(service.db)
-    for line in lines:
-        line["alarms"] = sum(one["arm"] == line["name"] for one in standing)
-        line["dues"] = sum(one["arm"] == line["name"] for one in due)
+        facts = arm_facts(service.state, row)
+        used = row["source"] != "shipped" or name in worked or faults > 0
+        lines.append(
+            {
+                **row,
+                "facts": facts,
+                "used": used,
+                "accepted": accepted.get(name),
+                "faults": faults,
+                "moving": in_use(control_path(service.state, name)),
+                "last": last.get(name),
+                "alarms": sum(one["arm"] == name for one in standing),
+                "dues": sum(one["arm"] == name for one in due),
+                "next": _upcoming(service, row, facts) if used else None,
+            }
+        )
     return page(
         "arms",
         who,
@@ -285,6 +329,30 @@ def list_arms(service: Serving, who: Viewer) -> Response:
         dues=due,
         jobs=[jobs.job_answer_document(service, row) for row in busy],
     )
+
+
+def _upcoming(service: Service, row: Row, facts: ArmFacts) -> Step | None:
+    """Return the step of an arm that comes next, or that is under way; None where none does."""
+    if facts.kind == "unreadable":
+        return None
+    try:
+        config = known.known_arm(service.db, service.state, row["name"]).config
+        steps = ladder(service.db, service.state, config).steps
+    except IdentError:
+        return None  # the page of the arm says why
+    return next((step for step in steps if step.state in ("busy", "next")), None)
+
+
+@router.get("/arms/{arm}/picture.svg")
+def show_picture(service: Serving, _: Viewer, arm: ArmName) -> Response:
+    """Draw an arm at home."""
+    return picture(home_svg(service, arm))
+
+
+@router.get("/arms/{arm}/motion.svg")
+def show_motion(service: Serving, _: Viewer, arm: ArmName, motion: Id | Literal[""] = "") -> Response:
+    """Draw an arm along a motion, the description's own if none is named."""
+    return picture(motion_svg(service, arm, motion))
 
 
 @router.get("/new")
@@ -316,6 +384,9 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
         "arm",
         who,
         arm=answer,
+        facts=facts_of(config),
+        joints=joint_facts(config),
+        seen=_last_look(service, answer.name),
         rungs=ladder(service.db, service.state, config),
         motions=known_motions.motions(service.db, answer.name),
         alarms=_alarms(service, answer.name),
@@ -411,6 +482,17 @@ def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
     return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
+def _last_look(service: Service, arm: str) -> dict[str, Any] | None:
+    """Return the newest job that read the arm at rest, with its answer; None where none has."""
+    found = service.db.row(
+        "SELECT id FROM jobs WHERE arm = ? AND kind = 'watch' AND state = 'done' ORDER BY number DESC LIMIT 1", arm
+    )
+    if found is None:
+        return None
+    job = rows.known_job(service.db, found["id"])
+    return {"at": job["ended"], "job": job["id"], **said(service.state / JOBS / job["id"]).answer}
+
+
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
     """Return the open drift alarms of an arm, or of all, each with its comparison."""
     return [
@@ -446,6 +528,7 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "run": ("motion", "speed", "until"),
     "identify": ("recording", "validation", "method"),
     "simulate": ("motion",),
+    "watch": (),
     "report": ("run",),
     "export": ("run",),
 }
@@ -463,9 +546,28 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
     motion = known_motions.known_motion(service.db, fields["motion"]) if fields["motion"] else None
     status = 409 if problem else 200
     # A rehearsal begins on its own page while its button is held: the lease would lapse while a page loads.
+    moves = form["kind"] in ("run", "rehearse", "check")
+    shown = {
+        "arm": given.arm,
+        "given": given,
+        "fields": fields,
+        "motion": motion,
+        "simulated": facts_of(known.known_arm(service.db, service.state, arm).config).kind == "simulated",
+        "extent": extent(service, given.arm, fields["motion"], _speed(fields["speed"])) if moves else None,
+    }
     if form["kind"] == "rehearse":
-        return page("rehearse", who, status, arm=given.arm, given=given, fields=fields, motion=motion)
-    return page("confirm", who, status, arm=given.arm, given=given, fields=fields, motion=motion, problem=problem)
+        joints = joint_facts(known.known_arm(service.db, service.state, arm).config)
+        return page("rehearse", who, status, joints=joints, **shown)
+    return page("confirm", who, status, problem=problem, **shown)
+
+
+def _speed(given: str) -> float:
+    """Return the share of a motion's speed that a form asks for; 1 where it is none, which the job then refuses."""
+    try:
+        speed = float(given or 1.0)
+    except ValueError:
+        return 1.0
+    return speed if 0.0 < speed <= 1.0 else 1.0
 
 
 def _require_name(arm: str, form: dict[str, str]) -> None:

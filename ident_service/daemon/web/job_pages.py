@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import FileResponse
@@ -12,12 +13,17 @@ from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.jobs.requests import FileName, Id
 from ident_service.daemon.live_stream import RECORDED, log_of
 from ident_service.daemon.routes import jobs
+from ident_service.daemon.web.arm_facts import joint_facts
 from ident_service.daemon.web.forms import Form, PageRoute, seen
 from ident_service.daemon.web.render import page
-from ident_service.errors import UnknownId
+from ident_service.daemon.web.run_pages import identified_set, run_facts
+from ident_service.errors import IdentError, UnknownId
+from ident_service.motion.ticket import ticket_from_json
 from ident_service.registry import jobs as rows
+from ident_service.registry.arms import known_arm
 from ident_service.registry.database import Row
 from ident_service.registry.runs import EXPORTS
+from ident_service.registry.tokens import Access
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 
@@ -36,6 +42,8 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
     live = row["state"] in rows.LIVE
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"
     attends = attends and row["kind"] != "rehearse"  # its lease is kept by the held button on its own page
+    entered = row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None
+    answer = {} if live else _answer(service, row)
     return page(
         "job",
         who,
@@ -44,9 +52,55 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
         lease="keep" if attends else "",
         recorded=row["kind"] in RECORDED,
         log=log_of(service, row),
-        entered=row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None,
+        entered=entered,
         exports=_exported(service, row),
+        answer=answer,
+        checks=_checks(answer),
+        found=identified_set(service, row["run"]) if entered and not live else None,
+        facts=run_facts(service, row["run"]) if entered and not live else None,
+        joints=live_joints(service, row),
     )
+
+
+def live_joints(service: Service, row: Row) -> list[dict[str, Any]]:
+    """Return the joints of a job that is recorded, with units and limits for its plots; none of others."""
+    if row["state"] not in rows.LIVE or row["kind"] not in RECORDED:
+        return []
+    try:
+        return joint_facts(known_arm(service.db, service.state, str(row["arm"])).config)
+    except IdentError:
+        return []
+
+
+def _answer(service: Service, row: Row) -> dict[str, Any]:
+    """Return what a job's command answered, without what the page shows elsewhere."""
+    answer: dict[str, Any] = jobs.get_result(service, _NOBODY, row["id"]).answer
+    return {key: value for key, value in answer.items() if key not in _ELSEWHERE and value not in (None, [], {}, "")}
+
+
+def _checks(answer: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the checks of a preflight, each with its title and the measure nearest to its limit."""
+    from ident_service.operations.arm_checks import TITLES, nearest_measure
+
+    try:
+        checks = ticket_from_json(json.dumps(answer["ticket"])).checks if "ticket" in answer else ()
+    except IdentError:
+        return []
+    return [
+        {
+            "title": TITLES.get(check.code, check.code),
+            "verdict": check.verdict.value,
+            "reason": check.reason,
+            "remedy": check.remedy,
+            "nearest": "" if (nearest := nearest_measure(check)) is None else str(nearest),
+            "measures": [str(one) for one in check.measures],
+        }
+        for check in checks
+    ]
+
+
+_ELSEWHERE: Final = frozenset({"exit_code", "folder", "path", "file", "error", "report"})
+_NOBODY: Final = Access("page", "viewer")
 
 
 @router.post("/jobs/{job}/cancel")

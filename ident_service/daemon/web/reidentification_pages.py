@@ -22,6 +22,7 @@ from ident_service.daemon.jobs.requests import ArmName, Id
 from ident_service.daemon.live_stream import log_of
 from ident_service.daemon.maintenance.reidentification import known_reidentification, require_comparable
 from ident_service.daemon.routes import arms, jobs, maintenance
+from ident_service.daemon.web.arm_facts import joint_facts
 from ident_service.daemon.web.forms import Form, PageRoute, seen
 from ident_service.daemon.web.render import page
 from ident_service.daemon.web.run_pages import POLICY
@@ -219,6 +220,7 @@ def show(service: Serving, who: Viewer, name: Id, attended: bool = False) -> Res
         live=live,
         lease="keep" if attends else "",
         job=None if job is None else jobs.job_answer_document(service, job),
+        joints=joint_facts(known_arm(service.db, service.state, row["arm"]).config) if live else [],
         log="" if job is None else log_of(service, job),
         note=remark[0] if remark else "",
         compared=compared(service.db, service.state, row["run"], row["detail"]),

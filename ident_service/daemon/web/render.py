@@ -8,26 +8,35 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from typing import Any, Final
 
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, Response
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from ident_service import __version__
 from ident_service.registry.tokens import Access
+from ident_service.results.plots import number
 
+_SCRIPTS: Final = ("page", "plots", "live", "again", "upload", "news", "series", "table", "trends", "new", "viewer")
 STATIC: Final = {
     "page.css": "text/css",
-    "page.js": "text/javascript",
-    "live.js": "text/javascript",
-    "again.js": "text/javascript",
-    "upload.js": "text/javascript",
-    "news.js": "text/javascript",
+    "icon.svg": "image/svg+xml",
+    **{f"{name}.js": "text/javascript" for name in _SCRIPTS},
 }
+VENDORED: Final = {
+    "uPlot.iife.min.js": "text/javascript",
+    "uPlot.min.css": "text/css",
+    "three.module.min.js": "text/javascript",
+    "three.core.min.js": "text/javascript",
+}
+"""Files of others that pages load beside those of `STATIC`: plots, and the arm in three dimensions."""
+_LONGEST: Final = 90  # characters of a sentence in a list
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
@@ -56,6 +65,15 @@ def page(name: str, who: Access | None, status: int = 200, **values: Any) -> HTM
     return HTMLResponse(text, status, headers=_HEADERS)
 
 
+def picture(svg: str) -> Response:
+    """Return a drawing, which pages show as an image; what is in it can load nothing."""
+    headers = {
+        "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'self'; sandbox",
+        "Cache-Control": "private, max-age=600",
+    }
+    return Response(svg, media_type="image/svg+xml", headers=headers)
+
+
 def viewer_page() -> HTMLResponse:
     """Return the page with the vendored viewer of the API's description; nothing is loaded from elsewhere."""
     text = _environment().get_template("api.html").render(mark=mark(), viewer=viewer_version())
@@ -81,8 +99,11 @@ def _vendored() -> Traversable:
 @lru_cache(maxsize=1)
 def static() -> dict[str, bytes]:
     """Return the static files of pages, name to content."""
-    place = files(__package__).joinpath("static")
-    return {name: place.joinpath(name).read_bytes() for name in STATIC}
+    own, others = files(__package__).joinpath("static"), _vendored()
+    return {
+        **{name: own.joinpath(name).read_bytes() for name in STATIC},
+        **{name: others.joinpath(name).read_bytes() for name in VENDORED},
+    }
 
 
 @lru_cache(maxsize=1)
@@ -100,23 +121,50 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(when=_when, lasting=_duration_text, short=_short)
+    environment.filters.update(
+        when=when, lasting=_duration_text, short=_short, figure=_figure, share=_share, brief=_brief
+    )
     return environment
 
 
-def _when(seconds: float | None) -> str:
-    """Format a time [s since 1970] in UTC."""
+def when(seconds: float | None) -> Markup:
+    """Format a time [s since 1970] in UTC, in an element that `page.js` turns into the browser's own time."""
     if seconds is None:
-        return "\u2014"
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return Markup("\u2014")
+    at = datetime.fromtimestamp(seconds, UTC)
+    return Markup('<time datetime="{}">{} UTC</time>').format(
+        at.isoformat(timespec="seconds"), at.strftime("%Y-%m-%d %H:%M:%S")
+    )
 
 
 def _duration_text(seconds: float | None) -> str:
     """Format a duration [s]."""
     if seconds is None:
         return "\u2014"
-    minutes, rest = divmod(round(seconds), 60)
-    return " ".join([*([f"{minutes} min"] if minutes else []), *([f"{rest} s"] if rest or not minutes else [])])
+    hours, rest = divmod(round(seconds), 3600)
+    minutes, rest = divmod(rest, 60)
+    parts = [(hours, "h"), (minutes, "min"), (rest, "s")]
+    return " ".join(f"{value} {unit}" for value, unit in parts if value) or (f"{seconds:.2g} s" if seconds else "0 s")
+
+
+def _figure(value: float | None, digits: int = 3) -> str:
+    """Format a number for people, as the report does."""
+    if value is None or not math.isfinite(value):
+        return "\u2014"
+    return number(value, digits)
+
+
+def _share(value: float | None, limit: float | None) -> str:
+    """Format a value as a share of its limit."""
+    if value is None or not limit:
+        return ""
+    return f"{100.0 * abs(value) / limit:.0f} %"
+
+
+def _brief(words: str) -> str:
+    """Return the first clause of a long sentence, so that a list stays one."""
+    first = words.split(";")[0]
+    return first if len(first) <= _LONGEST else f"{first[: _LONGEST - 1].rstrip()}\u2026"
 
 
 def _short(sha256: str) -> str:

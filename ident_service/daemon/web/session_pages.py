@@ -11,7 +11,17 @@ from ident_service.daemon.dependencies import Cookie, Near, Serving
 from ident_service.daemon.routes import about
 from ident_service.daemon.routes.jobs import stop_all
 from ident_service.daemon.web.forms import Form, PageRoute, inside, seen
-from ident_service.daemon.web.render import STATIC, VIEWER, mark, page, static, viewer_file, viewer_page, viewer_version
+from ident_service.daemon.web.render import (
+    STATIC,
+    VENDORED,
+    VIEWER,
+    mark,
+    page,
+    static,
+    viewer_file,
+    viewer_page,
+    viewer_version,
+)
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
 _KEPT: Final = {"Cache-Control": "public, max-age=31536000, immutable"}
@@ -56,9 +66,10 @@ def load(version: str, name: str) -> Response:
     """Return a style sheet or script."""
     if (version, name) == (viewer_version(), VIEWER):
         return Response(viewer_file(), media_type="text/javascript", headers=_KEPT)
-    if name not in STATIC or version != mark():
+    kind = {**STATIC, **VENDORED}.get(name)
+    if kind is None or version != mark():
         raise HTTPException(404, "no such file; load the page again")
-    return Response(static()[name], media_type=STATIC[name], headers=_KEPT)
+    return Response(static()[name], media_type=kind, headers=_KEPT)
 
 
 @router.post("/stop")

@@ -80,11 +80,39 @@ def constrained_least_squares_with_scales(
     _check_bounds(bounds, information.joints)
     free = sorted(bounds)
     R = _stacked(information, free, np.ones(information.joints) if weights is None else weights)
-    n, variables = base.size, len(base.names) + len(free) + 1
+    lower, upper = np.array([bounds[joint] for joint in free], dtype=float).reshape(-1, 2).T
+    guess = np.linalg.lstsq(R[:, : base.size], -R[:, base.size :].sum(axis=1), rcond=None)[0]
+    estimate, factors = feasible_with_factors(R, base, conditions, guess, (lower, upper))
+    scales = np.ones(information.joints)
+    scales[free] = factors
+    at_bound = tuple(j for j in free if min(scales[j] - bounds[j][0], bounds[j][1] - scales[j]) < 1e-6)
+    return ScaledEstimate(estimate, scales, at_bound)
+
+
+def feasible_with_factors(
+    R: Array, base: BaseParameters, conditions: FeasibleSet, guess: Array, bounds: tuple[Array, Array]
+) -> tuple[FeasibleEstimate, Array]:
+    """Return the feasible base parameters, and bounded factors, of the smallest |R [beta; factors; 1]|.
+
+    Args:
+        R: triangular factor, one column a base parameter, one a factor, and one of constants, shape (rows, base +
+            factors + 1).
+        base: grouping of the parameters.
+        conditions: the feasible set.
+        guess: base parameters of the size that is to be expected, shape (base,).
+        bounds: smallest and largest factors, shape (factors,) each.
+
+    Raises:
+        ConditionsError: no parameters at all fulfil the conditions.
+        SolverError: the solver stopped without an optimum.
+    """
+    lower, upper = bounds
+    free = len(lower)
+    n, variables = base.size, len(base.names) + free + 1
     scale = max(float(np.linalg.norm(R, axis=0).max()), np.finfo(float).tiny)
     problem = ConicProblem(variables)
     lift = LinkParameterMap(base)
-    factors = slice(variables - 1 - len(free), variables - 1)
+    factors = slice(variables - 1 - free, variables - 1)
     distance = np.zeros((len(R) + 1, variables))
     distance[0, -1] = 1.0
     distance[1:, :n] = R[:, :n] / scale
@@ -93,20 +121,16 @@ def constrained_least_squares_with_scales(
     to_delta = np.zeros((len(base.names), variables))
     to_delta[:, :n] = lift.of_beta
     to_delta[:, n : factors.start] = lift.of_dependent
-    guess = np.linalg.lstsq(R[:, :n], -R[:, n:].sum(axis=1), rcond=None)[0]
     add_conditions(problem, conditions, to_delta, insets(conditions, base, guess))
     if free:
-        pick = np.zeros((len(free), variables))
-        pick[:, factors] = np.eye(len(free))
-        lower, upper = np.array([bounds[joint] for joint in free]).T
+        pick = np.zeros((free, variables))
+        pick[:, factors] = np.eye(free)
         problem.nonnegative(np.vstack([pick, -pick]), np.concatenate([-lower, upper]))
     objective = np.append(np.zeros(variables - 1), 1.0)
     name = "constrained least squares with torque scales"
     size = float(np.max(np.abs(guess), initial=0.0))
     delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size)
     beta = base.K @ delta
-    scales = np.ones(information.joints)
-    scales[free] = solution.x[factors]
     residual = R @ np.concatenate([beta, solution.x[factors], [1.0]])
     estimate = FeasibleEstimate(
         beta=beta,
@@ -117,8 +141,7 @@ def constrained_least_squares_with_scales(
         iterations=solution.iterations,
         solver_seconds=solution.seconds,
     )
-    at_bound = tuple(j for j in free if min(scales[j] - bounds[j][0], bounds[j][1] - scales[j]) < 1e-6)
-    return ScaledEstimate(estimate, scales, at_bound)
+    return estimate, np.asarray(solution.x[factors])
 
 
 def _stacked(information: Information, free: Sequence[int], weights: Array) -> Array:

@@ -502,7 +502,8 @@ def _notes(
         if one.covariance is not None and "blocks" not in one.content.get("fit", {})
     ]
     scales = [content.get("torque_scales") for content in both]
-    if scales[0] != scales[1] and all(scales):
+    found = [[one["factor"] for one in content.get("torque_constants", [])] for content in both]
+    if (scales[0] != scales[1] and all(scales)) or found[0] != found[1]:
         notes.append("torques were multiplied by different factors")
     return notes
 

@@ -6,9 +6,8 @@ Look and words of the page are those of the report.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +39,21 @@ from ident_service.results.comparison.comparison import (
 from ident_service.results.evidence.gathering import friction_term
 from ident_service.results.manifest import write_atomically
 from ident_service.results.parameter_file import require_schema
-from ident_service.results.plots import Axes, Canvas, draw_frame, draw_key, number, plain, range_around, sheet
+from ident_service.results.plots import Axes, Canvas, draw_frame, draw_key, number, range_around
 from ident_service.results.report.figures import LEFT, RIGHT, WIDTH, Figure
-from ident_service.results.report.markup import Cell, items, paragraph, prose, section, table
+from ident_service.results.report.rendering import Cell, Table, render
 
 _TOP, _HEIGHT, _BOTTOM = 42.0, 200.0, 40.0
 _SAMPLES = 120
 _FASTER = 2.5  # curves reach so many root mean squares of the motion's velocity
 _TERMS: dict[str, JointTerm] = {symbol: term for term, symbol in TERM_SYMBOLS.items() if term != "drive_inertia"}
 _LARGEST_Z = 1e3
+_GOOD = {
+    "friction": "Good: one line on the other. Bad: farther apart where the joint is fast (viscous: lubrication), apart "
+    "everywhere (Coulomb: seals, brake), or shifted up or down (offset: zero, cables).",
+    "effects": "Good: round dots between the lines, without a pattern. Bad: squares; neighbours that are squares "
+    "together are one effect, as the findings say.",
+}
 
 
 def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figure]:
@@ -83,8 +88,7 @@ def friction_curves(reference: ComparedSet, pair: Pair, place: int) -> list[Figu
                 slug=f"friction-{place}-{joint}",
                 title=f"{joint_name(pair, joint)}: friction of both against velocity",
                 description=words,
-                caption=f"{words} Good: one line on the other. Bad: farther apart where the joint is fast (viscous: "
-                "lubrication), apart everywhere (Coulomb: seals, brake), or shifted up or down (offset: zero, cables).",
+                caption=words,
                 canvas=canvas,
             )
         )
@@ -124,8 +128,7 @@ def z_figure(found: ParameterChange, place: int) -> Figure:
         slug=f"z-{place}",
         title="Difference of every base parameter in standard deviations",
         description=words,
-        caption=f"{words} Good: round dots between the lines, without a pattern. Bad: squares; neighbours that are "
-        "squares together are one effect, as the findings say.",
+        caption=words,
         canvas=canvas,
     )
 
@@ -465,53 +468,43 @@ def comparison_html(comparison: Comparison) -> str:
     """Return a comparison as a whole HTML document."""
     reference = comparison.reference
     arm = reference.content.get("arm", {}).get("name", "")
-    title = f"Comparison of {arm}".strip() if arm else "Comparison of parameters"
-    style = files("ident_service.results.report").joinpath("report.css").read_text(encoding="utf-8") + sheet()
-    head = (
-        '<meta charset="utf-8">'
-        "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
-        "base-uri 'none'\">"
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{plain(title)}</title><style>{style}</style>"
+    return render(
+        "comparison.html",
+        title=f"Comparison of {arm}".strip() if arm else "Comparison of parameters",
+        reference=_name(reference),
+        pairs=[_shown(reference, pair, place) for place, pair in enumerate(comparison.pairs, 1)],
+        good=_GOOD,
+        files=_files(comparison),
     )
-    body = [f"<header><h1>{plain(title)}</h1>{paragraph(f'Reference: {_name(reference)}')}</header><main>"]
-    for place, pair in enumerate(comparison.pairs, 1):
-        body += _sections(reference, pair, place)
-    body.append(section("files", "What was compared", _files(comparison)))
-    joined = "\n".join([*body, "</main>"])
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{joined}</body></html>\n'
 
 
-def _sections(reference: ComparedSet, pair: Pair, place: int) -> Iterable[str]:
+def _shown(reference: ComparedSet, pair: Pair, place: int) -> dict[str, Any]:
+    """Return the values that the page shows of a pair."""
     found = findings(pair)
     first, *_ = verdict_lines(pair)
-    said = contradiction(pair)
-    lines = [f"{finding_line(one)}. May mean: {one.meaning}." for one in found]
-    yield section(
-        f"verdict-{place}",
-        f"{_name(pair.side)}: {pair.verdict}",
-        paragraph(first, "verdict"),
-        paragraph(said) if said else "",
-        items(lines) if lines else "",
-        items(pair.notes) if pair.notes else "",
-    )
-    yield section(f"parameters-{place}", "Parameters", _parameters(reference, pair), _left_out(pair))
-    drawn = [] if pair.drift is None else [z_figure(pair.drift, place)]
-    if pair.drift is not None:
-        yield section(f"effects-{place}", "Effects", _effects(pair), _grid(drawn))
-    curves = friction_curves(reference, pair, place)
-    shown = _grid(curves) if curves else paragraph("No joint has friction on both sides.")
-    yield section(f"friction-{place}", "Friction", shown)
-    if pair.crossed is not None:
-        yield section(f"torque-{place}", "Torque error", _torque(pair))
-    if pair.provenance:
-        rows = [[Cell(key), Cell(a), Cell(b)] for key, (a, b) in pair.provenance.items()]
-        made = table("Differences in how they were made", ["what", "reference", "compared"], rows)
-        yield section(f"provenance-{place}", "How they were made", made)
+    return {
+        "place": place,
+        "heading": f"{_name(pair.side)}: {pair.verdict}",
+        "verdict": first,
+        "contradiction": contradiction(pair),
+        "findings": [f"{finding_line(one)}. May mean: {one.meaning}." for one in found],
+        "notes": pair.notes,
+        "parameters": _parameters(reference, pair),
+        "left_out": _left_out(pair),
+        "effects": None if pair.drift is None else _effects(pair),
+        "untested": _untested(pair),
+        "effects_figures": [] if pair.drift is None else [z_figure(pair.drift, place)],
+        "friction": friction_curves(reference, pair, place),
+        "torque": _torque(pair),
+        "provenance": Table(
+            "Differences in how they were made",
+            ["what", "reference", "compared"],
+            [[Cell(key), Cell(a), Cell(b)] for key, (a, b) in pair.provenance.items()],
+        ),
+    }
 
 
-def _parameters(reference: ComparedSet, pair: Pair) -> str:
+def _parameters(reference: ComparedSet, pair: Pair) -> Table:
     table_of = reference.content["base_parameters"]
     units = table_of.get("units", [""] * reference.file.base.size)
     first, second = (side.file.values[at] for side, at in zip((reference, pair.side), pair.places, strict=True))
@@ -539,18 +532,18 @@ def _parameters(reference: ComparedSet, pair: Pair) -> str:
         heads += ["reference in use", "compared in use"]
         for k, cells in enumerate(rows):
             cells += [_number(float(pair.in_use.reference[k])), _number(float(pair.in_use.side[k]))]
-    return table(caption, heads, rows, kind="parameters")
+    return Table(caption, heads, rows, kind="parameters")
 
 
-def _left_out(pair: Pair) -> str:
+def _left_out(pair: Pair) -> list[tuple[str, list[str]]]:
     parts = [("the reference", pair.only_reference), ("the compared", pair.only_side)]
-    return "".join(f"<h3>Only in {plain(name)}</h3>{items(shortened(rows))}" for name, rows in parts if rows)
+    return [(name, list(shortened(rows))) for name, rows in parts if rows]
 
 
-def _effects(pair: Pair) -> str:
+def _effects(pair: Pair) -> Table | None:
     rows = []
     if pair.drift is None:
-        return ""
+        return None
     for one in pair.drift.effects:
         torque = _NOTHING if one.torque_share is None else _number(100.0 * one.torque_share, 3)
         residual = _NOTHING if one.residual_share is None else _number(100.0 * one.residual_share, 3)
@@ -562,15 +555,18 @@ def _effects(pair: Pair) -> str:
     together = [_number(joint.sigma, 3), _number(pair.drift.joint_p, 2)]
     rows.append([Cell("all together"), *together, _NOTHING, _NOTHING, _NOTHING])
     heads = ["effect", "\u03c3", "p (Holm)", "of the torque [%]", "of the residual [%]", "verdict"]
-    made = table("Effects: significance, and what they change of the worst joint's torque", heads, rows)
-    if not joint.left_out:
-        return made
-    return made + paragraph(f"{joint.left_out} of {len(pair.places[0])} directions are {LEFT_OUT}.")
+    return Table("Effects: significance, and what they change of the worst joint's torque", heads, rows)
 
 
-def _torque(pair: Pair) -> str:
-    if pair.crossed is None:
+def _untested(pair: Pair) -> str:
+    if pair.drift is None or not pair.drift.joint.left_out:
         return ""
+    return f"{pair.drift.joint.left_out} of {len(pair.places[0])} directions are {LEFT_OUT}."
+
+
+def _torque(pair: Pair) -> Table | None:
+    if pair.crossed is None:
+        return None
     own, other = pair.crossed.own, pair.crossed.reference
     rows = [[Cell("all joints"), _number(own.relative_percent, 4), _number(other.relative_percent, 4)]]
     names = pair.side.joints or tuple(str(k + 1) for k in range(len(own.joint_rms)))
@@ -578,7 +574,7 @@ def _torque(pair: Pair) -> str:
         values = (own.joint_relative_percent[k], other.joint_relative_percent[k])
         rows.append([Cell(name), *(_number(float(value), 4) for value in values)])
     heads = ["joint", "its own parameters [%]", "the reference's parameters [%]"]
-    return table(f"Relative torque error of the values in use, on the recordings of {_name(pair.side)}", heads, rows)
+    return Table(f"Relative torque error of the values in use, on the recordings of {_name(pair.side)}", heads, rows)
 
 
 def _name(side: ComparedSet) -> str:
@@ -586,11 +582,11 @@ def _name(side: ComparedSet) -> str:
     return f"{side.name} ({arm})" if arm else side.name
 
 
-def _files(comparison: Comparison) -> str:
+def _files(comparison: Comparison) -> Table:
     sides = [comparison.reference, *(pair.side for pair in comparison.pairs)]
     rows = [[Cell(str(side.path)), *_errors(side), Cell(side.sha256, kind="hash")] for side in sides]
     heads = ["set", "torque error of the fit [%]", "of the validation [%]", "SHA-256 of its parameters"]
-    return table("Parameter sets, the reference first", heads, rows)
+    return Table("Parameter sets, the reference first", heads, rows)
 
 
 def _errors(side: ComparedSet) -> tuple[Cell, Cell]:
@@ -600,14 +596,6 @@ def _errors(side: ComparedSet) -> tuple[Cell, Cell]:
         _NOTHING if fit is None else _number(fit["relative_error_percent"], 4),
         Cell(said) if said else _NOTHING,
     )
-
-
-def _grid(made: Iterable[Figure]) -> str:
-    shown = "".join(
-        f'<figure id="{one.slug}">{one.svg(inline=True)}<figcaption>{prose(one.caption)}</figcaption></figure>'
-        for one in made
-    )
-    return f'<div class="figures">{shown}</div>'
 
 
 def _number(value: float, digits: int = 5) -> Cell:

@@ -29,8 +29,6 @@ class Estimated:
         validation: likewise on every recording that was never fitted to.
         moving: as `identification`, without rows of joints near standstill, whose friction is unknown.
         moving_validation: likewise on every recording that was never fitted to.
-        moving_joints: as `moving` and `moving_validation`, joint by joint, each in percent of the joint's own torque;
-            one row for what was fitted to, then one per recording that was not; empty where it was not told.
     """
 
     name: str
@@ -40,7 +38,6 @@ class Estimated:
     validation: tuple[float, ...]
     moving: float | None = None
     moving_validation: tuple[float, ...] = ()
-    moving_joints: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,6 +82,21 @@ class Spectrum:
 
 
 @dataclass(frozen=True)
+class Spike:
+    """Sample of a recording at which a joint in motion has its largest residual.
+
+    Attributes:
+        time: since the recording's first sample [s].
+        residual: measured less predicted [N m or N].
+        position: of all joints then [rad or m], shape (joints,).
+    """
+
+    time: float
+    residual: float
+    position: Array
+
+
+@dataclass(frozen=True)
 class PredictionTrace:
     """Traces and spectra of one recording against the chosen estimate.
 
@@ -96,6 +108,7 @@ class PredictionTrace:
         width: of a stretch [s].
         joints: one per joint.
         spectra: one per joint; empty where the recording is too short for one.
+        spikes: one per joint, None of a joint that never moves; empty in files of earlier versions.
     """
 
     name: str
@@ -105,6 +118,7 @@ class PredictionTrace:
     width: float
     joints: tuple[JointTrace, ...]
     spectra: tuple[Spectrum, ...]
+    spikes: tuple[Spike | None, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from ident_service.results.evidence.evidence import (
     PosedArm,
     PredictionTrace,
     Spectrum,
+    Spike,
     Timing,
 )
 from ident_service.results.manifest import write_atomically
@@ -162,7 +163,6 @@ def evidence_document(evidence: Evidence) -> dict[str, Any]:
                 "validation": list(one.validation),
                 "moving": one.moving,
                 "moving_validation": list(one.moving_validation),
-                "moving_joints": [list(row) for row in one.moving_joints],
             }
             for one in evidence.estimates
         ],
@@ -220,6 +220,10 @@ def _recording_document(one: PredictionTrace) -> dict[str, Any]:
             }
             for spectrum in one.spectra
         ],
+        "spikes": [
+            spike and {"time": spike.time, "residual": spike.residual, "position": spike.position.tolist()}
+            for spike in one.spikes
+        ],
     }
 
 
@@ -268,11 +272,6 @@ def _evidence(content: Mapping[str, Any]) -> Evidence:
     size = len(content["bounds"])
     for one in estimates:
         _require(len(one["values"]) == size, f"estimate {one['name']!r} has {len(one['values'])} values, not {size}")
-        rows = one.get("moving_joints", [])
-        _require(
-            len(rows) in (0, 1 + len(one["validation"])), f"joint errors of {one['name']!r} on {len(rows)} recordings"
-        )
-        _require(all(len(row) == joints for row in rows), f"joint errors of {one['name']!r}: not of {joints} joints")
     for key in ("unconstrained", "constrained", "chosen"):
         _require(content[key] < len(estimates), f"{key} is estimate {content[key]} of {len(estimates)}")
     recordings = tuple(_traced(one, joints) for one in content["recordings"])
@@ -291,7 +290,6 @@ def _evidence(content: Mapping[str, Any]) -> Evidence:
                 tuple(one["validation"]),
                 one["moving"],
                 tuple(one["moving_validation"]),
-                tuple(tuple(row) for row in one.get("moving_joints", [])),
             )
             for one in estimates
         ),
@@ -356,7 +354,14 @@ def _traced(content: Mapping[str, Any], joints: int) -> PredictionTrace:
         for one in content["spectra"]
     )
     time = (numbers + 0.5) * content["width"]
-    return PredictionTrace(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra)
+    spikes = content.get("spikes", [])
+    _require(len(spikes) in (0, joints), f"{content['name']!r} has {len(spikes)} spikes, not {joints}")
+    for spike in filter(None, spikes):
+        _require(len(spike["position"]) == joints, f"a spike of {content['name']!r} is not of {joints} joints")
+    return PredictionTrace(
+        *(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra),
+        tuple(one and Spike(one["time"], one["residual"], _numbers(one["position"])) for one in spikes),
+    )
 
 
 def _friction(content: Mapping[str, Any]) -> Friction:

@@ -44,6 +44,7 @@ from ident_service.results.evidence.evidence import (
     PredictionTrace,
     Role,
     Spectrum,
+    Spike,
     Timing,
 )
 
@@ -539,10 +540,6 @@ def _estimates(estimate: Estimate) -> tuple[Estimated, ...]:
             validation=tuple(score.error.relative_percent for score in scores),
             moving=candidate.moving.relative_percent,
             moving_validation=tuple(score.moving.relative_percent for score in scores),
-            moving_joints=tuple(
-                tuple(error.joint_relative_percent.tolist())
-                for error in (candidate.moving, *(score.moving for score in scores))
-            ),
         )
 
     found = [of(candidate) for candidate in estimate.candidates]
@@ -560,6 +557,7 @@ class _Seen:
         self._envelope: Envelope | None = None
         self._welch: Welch | None = None
         self._velocity = Scatter(4 * most)
+        self._spikes: list[Spike | None] = [None] * estimate.model.chain.joints
         self._last = -np.inf
         self._period = 0.0
         self.torque: Array = np.zeros((0, 0))
@@ -580,11 +578,20 @@ class _Seen:
         values = np.concatenate([measured, predicted, residual])
         self._envelope.add(rows.time, values, np.tile(~rows.keep.T, (3, 1)))
         self._velocity.add(np.column_stack([rows.time, rows.velocity]))
+        self._look_for_spikes(rows, residual)
         # Spectra are of stretches without a gap.
         breaks = np.flatnonzero(np.diff(rows.time, prepend=self._last) > 1.5 * self._period).tolist()
         for begin, end in pairwise(sorted({0, *breaks, len(rows.time)})):
             self._welch.add(residual[:, begin:end], opens=begin in breaks)
         self._last = float(rows.time[-1])
+
+    def _look_for_spikes(self, rows: Rows, residual: Array) -> None:
+        sizes = np.where(rows.keep.T, np.abs(residual), -1.0)
+        for joint, row in enumerate(np.argmax(sizes, axis=1)):
+            known = self._spikes[joint]
+            if sizes[joint, row] > (-1.0 if known is None else abs(known.residual)):
+                at, value = float(rows.time[row]), float(residual[joint, row])
+                self._spikes[joint] = Spike(at, value, np.array(rows.position[row]))
 
     def traced(self, recording: Recording, role: Role) -> PredictionTrace:
         """Return the recording's traces and spectra."""
@@ -613,6 +620,7 @@ class _Seen:
             width=self._envelope.width,
             joints=traces,
             spectra=self._spectra(),
+            spikes=tuple(self._spikes),
         )
 
     def _spectra(self) -> tuple[Spectrum, ...]:

@@ -20,12 +20,12 @@ import numpy as np
 from ident_service import __version__
 from ident_service.config.arm import Joint
 from ident_service.errors import ModelError, UsageError
+from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.friction_state import presliding_distances
 from ident_service.model.parameter_layout import INERTIAL, Layout, about_center
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.export.bodies import about_origin, joint_bodies
-from ident_service.results.export.bodies_said import body_notes
 from ident_service.results.export.c_header import c_header, c_prefix, presliding_notes
 from ident_service.results.export.identified_arm import IdentifiedArm, read_identified
 from ident_service.results.export.mjcf import mjcf_export
@@ -36,6 +36,7 @@ from ident_service.results.manifest import atomic_folder, write_atomically
 
 # Standard deviations are those of the unconstrained values; both are the same where nothing was constrained.
 _HEADER = ("kind", "name", "unit", "value", "sigma", "verdict", "unconstrained_value")
+_LEAST_MASS = 1e-3  # [kg]
 
 
 def csv_export(arm: IdentifiedArm, name: str) -> str:
@@ -297,13 +298,16 @@ def export_texts(arm: IdentifiedArm, formats: Sequence[str]) -> tuple[Export, ..
     return tuple(FORMATS[name](arm) for name in known_formats(",".join(formats)))
 
 
-def export_run(run: Path, formats: Sequence[str], folder: Path) -> tuple[Export, ...]:
+def export_run(
+    run: Path, formats: Sequence[str], folder: Path, step: Callable[[str, float], None] = lambda words, share: None
+) -> tuple[Export, ...]:
     """Export a folder of results: all files, or none.
 
     Args:
         run: the folder, every file in it as its manifest says.
         formats: of `FORMATS`.
         folder: where the files appear; others in it stay.
+        step: called with each format before it is made, and the share of them that is done, from 0 to 1.
 
     Returns:
         What was written, without the texts.
@@ -313,8 +317,65 @@ def export_run(run: Path, formats: Sequence[str], folder: Path) -> tuple[Export,
         ParameterError: the files of the run are torn, changed or foreign.
         ConfigError, ModelError: the arm in it cannot be used, or a format cannot carry it.
     """
-    made = export_texts(read_identified(run), formats)
+    arm, made = read_identified(run), list[Export]()
+    for name in known_formats(",".join(formats)):
+        step(f"exporting {name}", len(made) / len(formats))
+        made += export_texts(arm, [name])
     with atomic_folder(folder) as staging:
         for export in made:
             write_atomically(staging / export.name, export.text)
     return tuple(replace(export, text="") for export in made)
+
+
+def body_notes(arm: IdentifiedArm) -> tuple[str, ...]:
+    """Return notes for files with link values; none for an arm that no body is."""
+    if arm.delta is None:
+        return ()
+    count, size = arm.verdicts.count("unidentified"), arm.base.size
+    drawn = arm.model.config.identification.prior.kind != "none"
+    how = "regularised towards the prior parameters" if drawn else "see option prior of ident identify"
+    first = (
+        f"link values are one feasible body of many with the same torques ({how}); "
+        f"{count} of {size} base parameters are unidentified"
+    )
+    payload = arm.model.config.payload
+    loaded = () if payload is None else (f"link values include the payload of the description: {payload.words}",)
+    return (first, *loaded, *_implausible(arm.model, arm.delta))
+
+
+def _implausible(model: ArmModel, delta: Array) -> tuple[str, ...]:
+    farthest, found = arm_reach(model), []
+    for name, parameters in zip(model.chain.names, joint_bodies(model, delta), strict=True):
+        mass, center, _ = about_center(parameters)
+        distance = float(np.linalg.norm(center))
+        if mass < _LEAST_MASS:
+            found.append(f"implausible: the link of {name} has a mass of {mass:.2g} kg")
+        if distance > farthest:
+            found.append(
+                f"implausible: the link of {name} has its centre of mass {distance:.3g} m from its joint, and the arm "
+                f"reaches {farthest:.3g} m"
+            )
+    return tuple(found)
+
+
+def arm_reach(model: ArmModel) -> float:
+    """Return the longest way from the first joint, wherever mounted, along the frames and the last link [m]."""
+    chain = model.chain
+    ways = np.zeros(chain.joints)
+    for k, parent in enumerate(chain.parents):
+        before = 0.0 if parent == WORLD else ways[parent] + np.linalg.norm(chain.translation[k])
+        ways[k] = before + _stroke(model, k)
+    return float(np.max(ways + _link_lengths(chain)))
+
+
+def _link_lengths(chain: Chain) -> Array:
+    return np.asarray(np.linalg.norm(chain.link_translation, axis=1))
+
+
+def _stroke(model: ArmModel, k: int) -> float:
+    chain = model.chain
+    if chain.revolute[k]:
+        return 0.0
+    joint = model.config.joints.get(chain.names[k])
+    # A slide without limits reaches anywhere.
+    return float(np.inf) if joint is None or joint.position is None else float(np.max(np.abs(joint.position)))

@@ -1,17 +1,19 @@
-"""Draw the figures of a report by section, each with the sentence that says what good looks like."""
+"""Draw the figures of a report by section, with the sentences that say what good looks like in each."""
 
 from __future__ import annotations
 
+import base64
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.recordings.quality import MUCH_JITTER
 from ident_service.results.evidence.evidence import (
-    Body,
     Evidence,
     JointTrace,
     Mask,
@@ -33,27 +35,9 @@ from ident_service.results.plots import (
     round_values,
 )
 
+_LONGEST_NAME = 22
 WIDTH = 560.0  # px; two beside each other on a wide screen, one on a narrow one
 LEFT, RIGHT = 62.0, 12.0
-
-
-@dataclass(frozen=True)
-class Zoom:
-    """Data that the page's script needs to redraw a time plot over a shorter time.
-
-    Attributes:
-        recording: number of the recording.
-        joint: number of the joint.
-        time: lowest and highest time shown [s].
-        torque: lowest and highest torque shown [N m or N].
-        residual: lowest and highest residual shown [N m or N].
-    """
-
-    recording: int
-    joint: int
-    time: tuple[float, float]
-    torque: tuple[float, float]
-    residual: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -64,9 +48,9 @@ class Figure:
         slug: name of its file, without an ending.
         title: what a screen reader says first.
         description: content of the drawing, for readers who cannot see it.
-        caption: what it says, what good looks like and what bad.
+        caption: what it says.
         canvas: the drawing.
-        zoom: for time plots.
+        data: that the page's script needs, by the name of an attribute.
         wide: whether it needs the whole width of a page.
     """
 
@@ -75,7 +59,7 @@ class Figure:
     description: str
     caption: str
     canvas: Canvas
-    zoom: Zoom | None = None
+    data: dict[str, Any] = field(default_factory=dict)
     wide: bool = False
 
     def svg(self, *, inline: bool = False) -> str:
@@ -83,12 +67,32 @@ class Figure:
         return self.canvas.svg(self.title, self.description, inline=inline)
 
 
+GOOD = {
+    "torque": "Good: measured and predicted torque lie on each other, and the residual (measured less predicted) is "
+    "noise about zero, but for spikes where a joint turns round. Bad: a residual that follows the motion.",
+    "residual": "Good: a spectrum that is flat up to where a filter cuts it off, and an autocorrelation that falls at "
+    "once and stays about the dashed lines. Bad: peaks at frequencies of the motion or of a gear, and one that swings "
+    "slowly.",
+    "friction": "Good: the points lie about the curve in a band of noise. Bad: a bow or a hook that the curve does not "
+    "have, which asks for another friction term, or points in loops, which are elasticity or pre-sliding.",
+    "doubt": f"Good: round dots below the lower line, at {100 * IDENTIFIED_BELOW:g} % of the parameter or of a "
+    "negligible size, and a matrix with little but specks. Bad: squares above the upper line, whose values mean "
+    "nothing, and marks that fill their place (beyond 0.9), parameters that this motion cannot separate.",
+    "bodies": "Motion determines base parameters only: the bodies are one choice of many with the same dynamics. Each "
+    "ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on, and "
+    "large margins. Bad: flat, huge or far from their link; no margin, where a constraint is active.",
+    "timing": "Good: one narrow peak at the left, within a few percent of the period, or, from stamps alone, within "
+    f"{100 * MUCH_JITTER:g} % (standard deviation; beyond, the warnings name it). Bad: a tail as long as the period, "
+    "or a second peak.",
+}
+
 _TORQUE_TOP, _TORQUE, _RESIDUAL, _TORQUE_BETWEEN, _TORQUE_BOTTOM = 42.0, 150.0, 74.0, 26.0, 40.0
-_COLUMNS = 440
-_TORQUE_GOOD = (
-    "Good: both lines lie on each other and their difference is noise about zero, but for spikes where a joint turns "
-    "round. Bad: a difference that follows the motion."
-)
+_COLUMNS = 300  # pairs of a line; paper has about three dots for each
+
+
+def _name(canvas: Canvas, name: str) -> None:
+    """Write the joint's name on its drawing, as far as the legend leaves room."""
+    canvas.text("ink strong", 4, 16, name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + "...", size=13)
 
 
 def torque_figures(evidence: Evidence, recording: int) -> list[Figure]:
@@ -107,14 +111,15 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
     canvas = Canvas(WIDTH, below + _RESIDUAL + _TORQUE_BOTTOM)
     above = Axes(LEFT, _TORQUE_TOP, WIDTH - LEFT - RIGHT, _TORQUE, *time, *torque)
     under = Axes(LEFT, below, WIDTH - LEFT - RIGHT, _RESIDUAL, *time, *residual)
-    key = [("area", "measured", "measured"), ("area", "predicted", "predicted"), ("area", "residual", "difference")]
+    key = [("area", "measured", "measured"), ("area", "predicted", "predicted"), ("area", "residual", "residual")]
     if trace.standstill.any():
-        key.insert(0, ("area", "ramp", "not fitted"))
+        key.insert(0, ("area", "ramp", "near standstill"))
     draw_key(canvas, WIDTH - RIGHT, 16, key)
+    _name(canvas, name)
     shown = _Columns(traced, trace)
     _still(canvas, above, shown.edges, shown.standstill)
     draw_frame(canvas, above, x="", y=f"torque [{unit}]")
-    draw_frame(canvas, under, x="time [s]", y=f"measured less predicted [{unit}]")
+    draw_frame(canvas, under, x="time [s]", y=f"residual [{unit}]")
     for axes, kind, values in (
         (above, "measured", shown.torque),
         (above, "predicted", shown.predicted),
@@ -126,14 +131,14 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
         canvas.clip(None)
     largest = float(np.abs(trace.residual).max())
     size = float(np.abs(trace.torque).max())
-    words = f"{name}: torque up to {number(size)} {unit}, difference up to {number(largest)} {unit}."
+    words = f"{name}: torque up to {number(size)} {unit}, residual up to {number(largest)} {unit}."
     return Figure(
         slug=f"torque-{recording + 1}-{traced.role}-{joint + 1}",
         title=f"{name}: measured and predicted torque, {traced.name}",
         description=f"Over {number(time[1] - time[0])} s. {words}",
-        caption=f"{words} {_TORQUE_GOOD}",
+        caption=words,
         canvas=canvas,
-        zoom=Zoom(recording, joint, time, torque, residual),
+        data={"series": {"joint": joint, "name": name, "unit": unit}},
     )
 
 
@@ -176,10 +181,6 @@ def _band(canvas: Canvas, axes: Axes, kind: str, time: Array, values: Array) -> 
 
 
 _FRICTION_TOP, _FRICTION_HEIGHT, _FRICTION_BOTTOM = 42.0, 200.0, 40.0
-_FRICTION_GOOD = (
-    "Good: the points lie about the curve in a band of noise. Bad: a bow or a hook that the curve does not have, which "
-    "asks for another friction term, or points in loops, which are elasticity or pre-sliding."
-)
 
 
 def friction_figures(evidence: Evidence) -> list[Figure]:
@@ -193,6 +194,7 @@ def friction_figures(evidence: Evidence) -> list[Figure]:
         upright = range_around(friction.torque, friction.curve_torque, least=1e-6)
         axes = Axes(LEFT, _FRICTION_TOP, WIDTH - LEFT - RIGHT, _FRICTION_HEIGHT, *across, *upright)
         draw_key(canvas, WIDTH - RIGHT, 16, [("dot", "cloud", "recorded"), ("line", "second", "model")])
+        _name(canvas, name)
         draw_frame(canvas, axes, x=f"velocity [{speed}]", y=f"torque less rigid bodies [{torque}]")
         for x, y in zip(axes.x(friction.velocity), axes.y(friction.torque), strict=True):
             canvas.circle("cloud", float(x), float(y), 2.2)
@@ -201,31 +203,28 @@ def friction_figures(evidence: Evidence) -> list[Figure]:
             if branch.any():
                 x, y = friction.curve_velocity[branch], friction.curve_torque[branch]
                 canvas.polyline("second", axes.x(x), axes.y(y))
-        terms = ", ".join(friction.terms) if friction.terms else "none"
-        words = f"{name}: {len(friction.velocity)} points; the curve's parameters: {terms}."
+        words = f"{name}: {len(friction.velocity)} points, off the curve by "
+        words += f"{number(friction_scatter(evidence, drive))} {torque} rms."
         figures.append(
             Figure(
                 slug=f"friction-{drive + 1}",
                 title=f"{name}: friction against velocity",
-                description=f"{words} Scatter about the curve: {_scatter(evidence, drive)}.",
-                caption=f"{words} {_FRICTION_GOOD}",
+                description=words,
+                caption=words,
                 canvas=canvas,
             )
         )
     return figures
 
 
-def _scatter(evidence: Evidence, drive: int) -> str:
+def friction_scatter(evidence: Evidence, drive: int) -> float:
+    """Return the root mean square of a drive's friction about its curve [N m or N]."""
     friction = evidence.friction[drive]
     off = friction.torque - np.interp(friction.velocity, friction.curve_velocity, friction.curve_torque)
-    return f"{float(np.sqrt(np.mean(off**2))):.3g} {'N m' if evidence.revolute[drive] else 'N'} rms"
+    return float(np.sqrt(np.mean(off**2)))
 
 
 _RESIDUAL_TOP, _RESIDUAL_HEIGHT, _RESIDUAL_BETWEEN, _RESIDUAL_BOTTOM = 42.0, 120.0, 66.0, 40.0
-_RESIDUAL_GOOD = (
-    "Good: a spectrum that is flat up to where a filter cuts it off, and an autocorrelation that falls at once and "
-    "stays about the dashed lines. Bad: peaks at frequencies of the motion or of a gear, and one that swings slowly."
-)
 
 
 def residual_figures(evidence: Evidence) -> list[Figure]:
@@ -245,6 +244,7 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
     kinds = ["first" if one.role == "identification" else "second" for one in shown]
     key = [("line", kind, one.role) for kind, one in zip(kinds, shown, strict=True)]
     draw_key(canvas, WIDTH - RIGHT, 16, key)
+    _name(canvas, name)
     low, high = (extreme(float(extreme(s.frequency)) for s in spectra) for extreme in (min, max))
     densities = [_log(spectrum) for spectrum in spectra]
     above = Axes(
@@ -263,12 +263,12 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
         canvas.line("limit", LEFT, float(below.y(level)), LEFT + wide, float(below.y(level)))
     for kind, spectrum in zip(kinds, spectra, strict=True):
         canvas.polyline(kind, below.x(spectrum.lag), below.y(np.clip(spectrum.correlation, -1.05, 1.05)))
-    words = f"{name}, all rows: {_strongest(spectra[0])}, {_memory(spectra[0])}."
+    words = f"{name}: {_strongest(spectra[0])}, {_memory(spectra[0])}."
     return Figure(
         slug=f"residual-{joint + 1}",
         title=f"{name}: spectrum and autocorrelation of the residual",
         description=words,
-        caption=f"{words} {_RESIDUAL_GOOD}",
+        caption=words,
         canvas=canvas,
     )
 
@@ -328,17 +328,11 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
             x, right, y = float(axes.x(scale * begin)), float(axes.x(scale * end)), float(axes.y(log))
             canvas.rectangle("good", x + 0.5, y, max(right - x - 1.0, 1.0), bottom - y)
     words = timing_words(timing, deviation)
-    within = "a few percent"
-    if not late:
-        within = f"{100 * MUCH_JITTER:g} % (standard deviation; beyond, the warnings name it)"
     return Figure(
         slug=f"timing-{place}",
         title=f"Timing of {timing.recording}",
         description=words,
-        caption=(
-            f"{words} Good: one narrow peak at the left, within {within} of the period "
-            f"({number(scale / timing.rate)} {unit}). Bad: a tail as long as the period, or a second peak."
-        ),
+        caption=f"{words} The period is {number(scale / timing.rate)} {unit}.",
         canvas=canvas,
     )
 
@@ -386,6 +380,9 @@ _UNCERTAINTY_TOP, _UNCERTAINTY_HEIGHT, _UNCERTAINTY_BOTTOM = 42.0, 220.0, 40.0
 _KINDS = {"identified": "good", "weak": "doubt", "unidentified": "bad"}
 _LEAST_SHOWN = 0.2  # correlations below are not drawn
 _PAIRS = 5
+_MATRIX = 1100.0  # px, of a matrix that need not be wider
+_LEAST_CELL, _MOST_CELL = 10.0, 22.0
+_LONGEST_LABEL = 8
 
 
 def relative_deviations(parameters: ParameterFile) -> Array:
@@ -421,7 +418,8 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
     shares = relative_deviations(parameters)
     if not np.isfinite(shares).any():
         return None
-    verdicts = parameters.content["base_parameters"].get("verdicts", [])
+    table = parameters.content["base_parameters"]
+    verdicts = table.get("verdicts", [])
     low, high = 1e-4, 10.0
     shown = np.log10(np.clip(np.where(np.isnan(shares), high, shares), low, high))
     canvas = Canvas(WIDTH, _UNCERTAINTY_TOP + _UNCERTAINTY_HEIGHT + _UNCERTAINTY_BOTTOM)
@@ -448,10 +446,12 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         kind = _KINDS.get(verdicts[place] if place < len(verdicts) else "", "good")
         # Shape repeats what colour shows: a ring would not be seen at this size, but a square is.
         x, y = float(axes.x(place + 1)), float(axes.y(shown[place]))
+        share = "not excited" if np.isnan(shares[place]) else f"{number(100.0 * shares[place])} %"
+        hint = f"{place + 1}: {table['expressions'][place]}: {share}"
         if kind == "good":
-            canvas.circle(kind, x, y, 3.4)
+            canvas.circle(kind, x, y, 3.4, hint)
         else:
-            canvas.rectangle(kind, x - 3.6, y - 3.6, 7.2, 7.2)
+            canvas.rectangle(kind, x - 3.6, y - 3.6, 7.2, 7.2, hint)
     counts = ", ".join(f"{verdicts.count(word)} {word}" for word in _KINDS)
     blind = int(np.isnan(shares).sum())
     words = f"Of {size} base parameters: {counts}." + (f" The recordings do not excite {blind}." if blind else "")
@@ -459,49 +459,74 @@ def deviation_figure(parameters: ParameterFile) -> Figure | None:
         slug="deviations",
         title="Relative standard deviation of every base parameter",
         description=words,
-        caption=(
-            f"{words} Good: round dots below the lower line, where it is below {100 * IDENTIFIED_BELOW:g} % of "
-            "the parameter or of a negligible size. Bad: squares above the upper line; their values mean nothing."
-        ),
+        caption=words,
         canvas=canvas,
     )
 
 
 def correlation_figure(parameters: ParameterFile) -> Figure | None:
-    """Draw the lower half of the correlation matrix as a map; None where the file has no covariance."""
+    """Draw the lower half of the correlation matrix with the parameters' names; None where there is no covariance."""
     correlation = correlations(parameters)
     if correlation is None:
         return None
+    names = [_short_name(text) for text in parameters.content["base_parameters"]["expressions"]]
     size = len(correlation)
-    side = WIDTH - LEFT - RIGHT
-    canvas = Canvas(WIDTH, _UNCERTAINTY_TOP + side + _UNCERTAINTY_BOTTOM)
-    axes = Axes(LEFT, _UNCERTAINTY_TOP, side, side, 0.5, size + 0.5, size + 0.5, 0.5)
-    draw_frame(canvas, axes, x="number of the base parameter", y="number of the base parameter")
-    draw_key(canvas, WIDTH - RIGHT, 16, [("area", "plus", "together"), ("area", "minus", "against each other")])
-    cell = side / size
-    levels = np.ceil(np.abs(np.nan_to_num(correlation)) * 5.0) * np.sign(np.nan_to_num(correlation))
-    levels[np.abs(np.nan_to_num(correlation)) < _LEAST_SHOWN] = 0
+    cell = float(np.clip(_MATRIX / size, _LEAST_CELL, _MOST_CELL))
+    letters = min(0.85 * cell, FONT)
+    margin = 0.62 * letters * max(map(len, names)) + 10.0
+    side, top = cell * size, 26.0
+    canvas = Canvas(max(margin + side + RIGHT, 340.0), top + side + margin)
+    draw_key(canvas, 330.0, 16, [("area", "plus", "together"), ("area", "minus", "against each other")])
+    shown = np.nan_to_num(correlation)
+    levels = np.ceil(np.abs(shown) * 5.0) * np.sign(shown)
+    levels[np.abs(shown) < _LEAST_SHOWN] = 0
     for row in range(size):
+        y = top + row * cell
+        canvas.line("grid", margin, y + cell, margin + (row + 1) * cell, y + cell)
+        canvas.text("soft", margin - 4, y + 0.5 * cell + 0.35 * letters, names[row], size=letters, anchor="end")
+        x = margin + (row + 0.5) * cell + 0.35 * letters
+        canvas.text("soft", x, top + side + 5, names[row], size=letters, anchor="end", upright=True)
         for begin, end, level in _runs(levels[row, :row]):
             if level:
                 # Size of the mark, not only its colour, tells how strong.
                 high = cell * abs(level) / 5.0
-                top = _UNCERTAINTY_TOP + row * cell + 0.5 * (cell - high)
                 kind = "plus" if level > 0 else "minus"
-                canvas.rectangle(kind, LEFT + begin * cell, top, (end - begin) * cell, high)
-    canvas.line("frame", LEFT, _UNCERTAINTY_TOP, LEFT + side, _UNCERTAINTY_TOP + side)
+                canvas.rectangle(kind, margin + begin * cell, y + 0.5 * (cell - high), (end - begin) * cell, high)
+    canvas.polyline(
+        "frame",
+        margin + np.array([0.0, 0.0, side, 0.0]),
+        top + np.array([0.0, side, side, 0.0]),
+    )
     pairs = strongest_pairs(correlation)
-    words = "Strongest: " + ", ".join(f"{i + 1} with {j + 1}: {number(value, 2)}" for i, j, value in pairs) + "."
+    words = "Strongest: " + ", ".join(f"{names[i]} with {names[j]}: {number(value, 2)}" for i, j, value in pairs) + "."
+    rows, columns = np.tril_indices(size, -1)
+    hundredths = np.round(100.0 * shown[rows, columns]).astype(np.int8)
     return Figure(
         slug="correlation",
         title="Correlation of the base parameters",
         description=words,
         caption=(
-            f"{words if pairs else ''} Fuller marks are stronger, below {_LEAST_SHOWN:g} is none. Good: little but "
-            "specks. Bad: marks that fill their place (beyond 0.9), parameters that this motion cannot separate."
+            f"{words if pairs else ''} A base parameter goes by the first parameter of its sum. Fuller marks are "
+            f"stronger, below {_LEAST_SHOWN:g} is none."
         ).strip(),
         canvas=canvas,
+        data={
+            "matrix": {
+                "names": names,
+                "left": round(margin, 2),
+                "top": top,
+                "cell": round(cell, 4),
+                "data": base64.b64encode(hundredths.tobytes()).decode("ascii"),
+            }
+        },
+        wide=True,
     )
+
+
+def _short_name(expression: str) -> str:
+    """Return the first parameter of a base parameter's sum, which is in no other sum first."""
+    found = re.search(r"[A-Za-z]+[0-9]*", expression)
+    return found[0][:_LONGEST_LABEL] if found else expression[:_LONGEST_LABEL]
 
 
 def _runs(values: Array) -> Sequence[tuple[int, int, float]]:
@@ -515,14 +540,11 @@ def _runs(values: Array) -> Sequence[tuple[int, int, float]]:
 
 _BODIES_TOP, _BODIES_BOTTOM = 42.0, 40.0
 _VIEWS = (("side", (0, 2)), ("above", (0, 1)))
-_AROUND = 0.35  # how much is shown around the arm, as a share of its extent
+_AROUND = 0.12  # how much is shown around arm and bodies, as a share of their extent
+_LARGEST = 2.0  # times the arm's extent; larger ellipsoids, and centres farther away, are told, not drawn
 _OUTLINE = 72  # corners of an ellipse
 _NAMES = "xyz"
 _SMALLEST = 0.01  # share of the picture below which nothing is seen beside the dot of the centre
-_BODIES_GOOD = (
-    "Each ellipsoid has the mass, centre and inertia of a link. Good: ellipsoids as large as the links they lie on. "
-    "Bad: flat, huge or far from their link, which means that the motion does not determine the mass distribution."
-)
 
 
 def body_figures(evidence: Evidence) -> list[Figure]:
@@ -546,44 +568,83 @@ def ellipse(axes: Array, view: tuple[int, int]) -> Array:
     return np.asarray((circle * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """Bodies that a drawing of the arm holds, and those that it cannot."""
+
+    drawn: tuple[bool, ...]  # the ellipsoid of each link
+    placed: tuple[bool, ...]  # its centre
+    longest: float  # [m]
+
+
+def _shown(posed: PosedArm) -> _Shown:
+    extent = max(float(np.ptp(posed.points, axis=0).max()), 0.1)
+    middle = 0.5 * (posed.points.min(axis=0) + posed.points.max(axis=0))
+    near = [float(np.linalg.norm(body.center - middle)) <= _LARGEST * extent for body in posed.bodies]
+    placed = tuple(body.mass > 0.0 and close for body, close in zip(posed.bodies, near, strict=True))
+    drawn = tuple(
+        body.axes is not None and close and _length(body.axes) <= _LARGEST * extent
+        for body, close in zip(posed.bodies, placed, strict=True)
+    )
+    return _Shown(drawn, placed, _LARGEST * extent)
+
+
 def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tuple[int, int]) -> Figure:
-    low, high = posed.points.min(axis=0), posed.points.max(axis=0)
-    around = _AROUND * max(float((high - low).max()), 0.1)
-    side = WIDTH - LEFT - RIGHT
     i, j = view
-    span = np.array([high[i] - low[i], high[j] - low[j]]) + 2.0 * around
+    shown = _shown(posed)
+    outlines = [
+        body.center[[i, j]] + ellipse(body.axes, view) if drawn and body.axes is not None else None
+        for body, drawn in zip(posed.bodies, shown.drawn, strict=True)
+    ]
+    centers = [body.center[[i, j]][None] for body, placed in zip(posed.bodies, shown.placed, strict=True) if placed]
+    # The picture reaches as far as what is drawn: an ellipsoid is never cut off.
+    everything = np.vstack([posed.points[:, [i, j]], *centers, *(one for one in outlines if one is not None)])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    span = np.maximum(high - low, 0.1) + 2.0 * _AROUND * max(float((high - low).max()), 0.1)
+    side = WIDTH - LEFT - RIGHT
     scale = min(side / span[0], side / span[1])
     height = float(np.clip(span[1] * scale, 0.5 * side, side))
     half = 0.5 / scale * np.array([side, height])
-    middle = 0.5 * (low + high)[[i, j]]
+    middle = 0.5 * (low + high)
     canvas = Canvas(WIDTH, _BODIES_TOP + height + _BODIES_BOTTOM)
     axes = Axes(LEFT, _BODIES_TOP, side, height, *(middle[0] + [-half[0], half[0]]), *(middle[1] + [-half[1], half[1]]))
     _frame(canvas, axes, view)
     draw_key(canvas, WIDTH - RIGHT, 16, [("area", "body", "link's body"), ("dot", "dot", "centre of mass")])
-    canvas.clip(axes)
-    longest = 2.0 * float(np.hypot(*half))
-    outside = [_draw(canvas, axes, view, body, longest) for body in posed.bodies]
+    for outline in outlines:
+        if outline is not None:
+            canvas.polygon("body", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
     for branch in posed.branches:
         points = posed.points[list(branch)]
         canvas.polyline("posture step7", axes.x(points[:, i]), axes.y(points[:, j]))
-    for body in posed.bodies:
-        if body.mass > 0.0:
+    for body, placed in zip(posed.bodies, shown.placed, strict=True):
+        if placed:
             canvas.circle("dot", float(axes.x(body.center[i])), float(axes.y(body.center[j])), 4.0)
     base = posed.points[0]
     canvas.rectangle("base", float(axes.x(base[i])) - 5, float(axes.y(base[j])) - 5, 10, 10)
-    for link, body in enumerate(posed.bodies):
-        if body.mass > 0.0 and not outside[link]:
-            x, y = float(axes.x(body.center[i])), float(axes.y(body.center[j]))
-            canvas.text("ink halo", x + 7, y - 6, joints[link][:20], size=FONT, hint=f"{body.mass:.3g} kg")
-    canvas.clip(None)
-    words = _words(joints, posed, outside, longest)
+    labels: list[tuple[float, float]] = []
+    for link, (body, placed) in enumerate(zip(posed.bodies, shown.placed, strict=True)):
+        if placed:
+            words = joints[link][:_LONGEST_NAME]
+            room = 6.5 * len(words)
+            x = min(float(axes.x(body.center[i])) + 7, axes.left + axes.width - room)
+            y = float(axes.y(body.center[j])) - 6
+            while any(abs(x - other) < room and abs(y - upright) < FONT for other, upright in labels):
+                y += FONT
+            labels.append((x, y))
+            canvas.text("ink halo", x, y, words, size=FONT, hint=f"{body.mass:.3g} kg")
+    seen = "the side" if name == "side" else name
     return Figure(
         slug=f"bodies-{name}",
-        title=f"The arm and the ellipsoids of its links, from {'the side' if name == 'side' else name}",
-        description=words,
-        caption=f"{words} {_BODIES_GOOD}",
+        title=f"The arm and the ellipsoids of its links, from {seen}",
+        description=_words(joints, posed, shown),
+        caption=f"From {seen}, in one posture of the recordings.",
         canvas=canvas,
     )
+
+
+def bodies_words(evidence: Evidence) -> str:
+    """Return the masses of the links, and which bodies no drawing holds; empty where there are no link parameters."""
+    return "" if evidence.posed is None else _words(evidence.joints, evidence.posed, _shown(evidence.posed))
 
 
 def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
@@ -605,36 +666,32 @@ def _frame(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> None:
     canvas.text("ink", axes.left, axes.top - 6, up, size=FONT)
 
 
-def _draw(canvas: Canvas, axes: Axes, view: tuple[int, int], body: Body, longest: float) -> bool:
-    """Draw a body's outline unless it is larger than the view; return whether its centre lies outside of the view."""
-    center = body.center[list(view)]
-    if body.axes is not None and _length(body.axes) <= longest:
-        outline = center + ellipse(body.axes, view)
-        canvas.polygon("body", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
-    inside = axes.low_x < center[0] < axes.high_x and axes.low_y < center[1] < axes.high_y
-    return not inside
-
-
 def _length(axes: Array) -> float:
     """Return the largest diameter of an ellipsoid [m]."""
     return 2.0 * float(np.linalg.norm(axes, axis=1).max())
 
 
-def _words(joints: tuple[str, ...], posed: PosedArm, outside: list[bool], longest: float) -> str:
+def _words(joints: tuple[str, ...], posed: PosedArm, shown: _Shown) -> str:
+    longest = shown.longest
     masses = ", ".join(f"{name} {number(body.mass)} kg" for name, body in zip(joints, posed.bodies, strict=True))
-    words = f"One posture of the recordings. Masses, one feasible choice of many: {masses}."
+    words = f"Masses, one feasible choice of many: {masses}."
     if gone := [name for name, body in zip(joints, posed.bodies, strict=True) if body.axes is None]:
         words += f" No mass distribution has the inertia of {', '.join(gone)}; only the centre is drawn."
     lengths = [0.0 if body.axes is None else _length(body.axes) for body in posed.bodies]
     if large := [f"{name} ({number(size)} m)" for name, size in zip(joints, lengths, strict=True) if size > longest]:
         words += (
-            f" Longer than the picture ({number(longest)} m) and not drawn: the ellipsoid of {', '.join(large)}. "
+            f" Longer than {number(longest)} m and not drawn: the ellipsoid of {', '.join(large)}. "
             "It is one body of many with the same dynamics; --prior moves the choice towards known bodies."
         )
     tiny = _SMALLEST * longest
     if small := [name for name, size in zip(joints, lengths, strict=True) if 0.0 < size < tiny]:
         words += f" Too small to be seen (shorter than {number(tiny)} m): the ellipsoid of {', '.join(small)}."
-    if far := [name for name, away in zip(joints, outside, strict=True) if away]:
+    far = [
+        name
+        for name, body, placed in zip(joints, posed.bodies, shown.placed, strict=True)
+        if body.mass > 0.0 and not placed
+    ]
+    if far:
         words += f" The centre of {', '.join(far)} lies outside of the picture."
     return words
 

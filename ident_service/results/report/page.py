@@ -1,13 +1,12 @@
-"""Make the report: one self-contained HTML page with its tables, no network, readable without scripts."""
+"""Make the report: one self-contained HTML page with its tables, no network, readable without scripts.
+
+On top stand the verdict, its reasons and a row per joint; details are folded. Time plots are drawn twice: as SVG, which
+is what paper and readers without scripts see, and by uPlot from the same data, with values under the cursor and zoom.
+"""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
-from collections.abc import Iterable, Mapping
-from functools import cache
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,22 +15,62 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW, Verdict
 from ident_service.recordings.quality import MUCH_JITTER
+from ident_service.results.assessment import POOR, USELESS, Assessment, JointAssessment, Word, assess
 from ident_service.results.evidence.evidence import Array, Condition, Evidence, PredictionTrace
 from ident_service.results.evidence.file import packed, packed_mask, runs_of
 from ident_service.results.evidence.gathering import CAD
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.plots import number, plain, sheet
-from ident_service.results.report.figures import Figure, Figures, Zoom, figures
-from ident_service.results.report.markup import Cell, contents, items, paragraph, prose, section, table
-from ident_service.results.report.verdict import POOR, SIMULATED, limitations, verdict
-from ident_service.results.summary import WHAT_THEN
+from ident_service.results.plots import number
+from ident_service.results.report.figures import (
+    GOOD,
+    Figure,
+    bodies_words,
+    figures,
+    friction_scatter,
+    relative_deviations,
+)
+from ident_service.results.report.rendering import WORST, Cell, Table, asset, render, vendored
+from ident_service.results.report.verdict import SIMULATED, next_steps, verdict
+from ident_service.results.summary import WHAT_THEN, noise_and_model, rows_and_filter
 
 _NOTHING = Cell("\u2014")
 _MARKS: dict[Verdict, str] = {"identified": "", "weak": "weak", "unidentified": "bad"}
+_WORDS: dict[Word, str] = {"use": "", "use with care": "weak", "do not use": "bad"}
+_JOINTS = 8  # rows of the table on top before others are folded
 
 
-def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Return every base parameter as a table: the chosen estimate, deviation, verdict, the other estimates.
+def assessment_table(found: Assessment) -> Table | None:
+    """Return the table on top: a row per joint, the worst first; None where the file has no torque errors."""
+    if not found.joints:
+        return None
+    unseen = any(one.unseen is not None for one in found.joints)
+    heads = ["joint", "verdict", "fitted [%]", "moving [%]"]
+    heads += ["unseen [%]", "moving [%]"] if unseen else []
+    heads += ["residual rms", "torque rms"]
+    rows = []
+    for one in found.joints:
+        kind = _WORDS[one.word]
+        errors = [one.fitted, one.fitted_moving, *([one.unseen, one.unseen_moving] if unseen else [])]
+        cells = [Cell(one.joint), Cell(one.word, kind=kind), *(_number(value, 3) for value in errors)]
+        rows.append([*cells, _quantity(one.residual, one.unit), _quantity(one.torque, one.unit)])
+    return Table("Torque error (eq. 84), in percent of the joint's own torque", heads, rows, shown=_JOINTS)
+
+
+def _quantity(value: float | None, unit: str) -> Cell:
+    return _NOTHING if value is None else Cell(f"{number(value)} {unit}".strip(), value)
+
+
+def joint_rule() -> str:
+    """Return the meaning of the columns and words of the table on top."""
+    return (
+        f"Use: below {POOR:g} %; use with care: above, near standstill or in motion; do not use: above {USELESS:g} % "
+        "in motion. Fitted: recordings fitted to; unseen: the worst recording that was not; moving: without rows near "
+        "standstill. Root mean squares are of the recording that decides."
+    )
+
+
+def parameter_table(evidence: Evidence, parameters: ParameterFile) -> Table:
+    """Return every base parameter, the least known first: the chosen estimate, deviation, verdict, the other estimates.
 
     The deviation is the unconstrained fit's, whose column therefore stands beside it where another one was chosen.
     """
@@ -49,31 +88,31 @@ def parameter_table(evidence: Evidence, parameters: ParameterFile) -> str:
         "verdict",
     ]
     intervals = content.get("constrained_intervals")
-    heads += [*(name for name, _ in others), *(["95 % inside the set"] if intervals else []), "bound"]
+    heads += [*(name for name, _ in others), *(["95 % inside the set"] if intervals else [])]
+    heads += ["bound"] if any(evidence.bounds) else []
     rows = []
     for k, expression in enumerate(content["expressions"]):
         cells = [Cell(str(k + 1)), Cell(expression, kind="expression"), Cell(units[k], kind="unit")]
         cells.append(_number(float(parameters.values[k])))
         cells.append(Cell("not excited", kind="bad") if deviations[k] is None else _number(deviations[k], 2))
         cells.append(Cell(verdicts[k], kind=_MARKS.get(verdicts[k], "")))
-        cells += [_NOTHING if values is None else _number(float(values[k])) for _, values in others]
+        cells += [_number(float(values[k])) for _, values in others]
         if intervals:
             ends = [end for end in intervals[k] if end is not None]
             cells.append(Cell(f"{number(ends[0], 3)} to {number(ends[1], 3)}") if len(ends) == 2 else _NOTHING)
-        bounds = "; ".join(evidence.bounds[k])
-        cells.append(Cell(bounds) if bounds else _NOTHING)
+        if any(evidence.bounds):
+            cells.append(Cell("; ".join(evidence.bounds[k]) or "\u2014"))
         rows.append(cells)
-    caption = "Base parameters; \u03c3 is the standard deviation of the unconstrained fit"
-    return table(caption, heads, rows, kind="parameters")
+    caption = "Base parameters, the least known first; \u03c3 is the standard deviation of the unconstrained fit"
+    worst = np.argsort(-np.nan_to_num(relative_deviations(parameters), nan=np.inf), kind="stable")
+    return Table(caption, heads, [rows[k] for k in worst], kind="parameters", shown=WORST)
 
 
-def _others(evidence: Evidence) -> list[tuple[str, Array | None]]:
-    """Return name and values of the estimates to compare the chosen one with; CAD without values where unknown."""
-    first = evidence.estimates[0]
-    found: list[tuple[str, Array | None]] = [(CAD, first.values if first.name == CAD else None)]
+def _others(evidence: Evidence) -> list[tuple[str, Array]]:
+    """Return name and values of the estimates to compare the chosen one with, the CAD values where they are known."""
     places = sorted({evidence.unconstrained, evidence.constrained} - {evidence.chosen})
-    found += [(evidence.estimates[place].name, evidence.estimates[place].values) for place in places]
-    return found
+    first = [0] if evidence.estimates[0].name == CAD else []
+    return [(evidence.estimates[place].name, evidence.estimates[place].values) for place in (*first, *places)]
 
 
 def verdict_rule() -> str:
@@ -88,7 +127,7 @@ def verdict_rule() -> str:
     )
 
 
-def error_table(evidence: Evidence) -> str:
+def error_table(evidence: Evidence) -> Table:
     """Return a table of all estimates: feasible or not, and torque error on every recording."""
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
     rows = []
@@ -107,37 +146,38 @@ def error_table(evidence: Evidence) -> str:
     kind = evidence.estimates[evidence.constrained].name.split()[-1]
     heads = ["estimate", f"feasible ({kind})", "margin"]
     heads += [f"{name} {rows_of} [%]" for name in ("fitted", *unseen) for rows_of in ("all rows", "moving")]
-    return table("Relative torque error (eq. 84) of every estimate, on all rows and away from standstill", heads, rows)
+    return Table("Relative torque error (eq. 84) of every estimate, on all rows and away from standstill", heads, rows)
 
 
-def joint_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Return a table of the chosen estimate's torque error per joint, on every recording."""
-    columns: list[tuple[str, list[Mapping[str, Any]]]] = []
-    if "fit" in parameters.content:
-        columns.append(("fitted", parameters.content["fit"]["per_joint"]))
-    columns += [(one["recording"], one["per_joint"]) for one in parameters.content.get("validation", [])]
+def joint_table(joints: Sequence[JointAssessment], parameters: ParameterFile) -> Table | None:
+    """Return the torque error per joint on every recording; None where the table on top has all of them."""
+    unseen = parameters.content.get("validation", [])
+    if len(unseen) < 2:
+        return None
+    columns = [("fitted", parameters.content["fit"]["per_joint"])]
+    columns += [(one["recording"], one["per_joint"]) for one in unseen]
     heads = ["joint", *(f"{name} {what}" for name, _ in columns for what in ("[%]", "rms"))]
     rows = []
-    for k, name in enumerate(evidence.joints):
-        cells = [Cell(name)]
-        for _, joints in columns:
-            unit = "N m" if evidence.revolute[k] else "N"
-            rms = joints[k]["rms"]
-            cells += [_number(joints[k]["relative_error_percent"], 3), Cell(f"{number(rms)} {unit}", rms)]
+    for one in joints:
+        cells = [Cell(one.joint)]
+        for _, own in columns:
+            row = next(row for row in own if row["joint"] == one.joint)
+            cells += [_number(row["relative_error_percent"], 3), _quantity(row["rms"], one.unit)]
         rows.append(cells)
-    return table("Torque error of the chosen estimate, joint by joint", heads, rows)
+    return Table("Torque error of the chosen estimate on every recording", heads, rows, shown=WORST)
 
 
-def margin_table(evidence: Evidence) -> str:
-    """Return a table, per link, of the condition with the smallest margin, and of those on several links."""
-    rows = []
+def margin_table(evidence: Evidence) -> Table:
+    """Return, per link, the condition with the smallest margin, and of those on several links; the smallest first."""
+    rows: list[list[Cell]] = []
     for link, name in enumerate(evidence.joints):
         own = [one for one in evidence.conditions if one.links == (link,)]
         rows.append([Cell(name), *_tightest(own)])
     if several := [one for one in evidence.conditions if len(one.links) != 1]:
         rows.append([Cell("several links"), *_tightest(several)])
     heads = ["link", "smallest margin in", "smallest eigenvalue", "in reference units"]
-    return table("Margin inside the feasible set, link by link", heads, rows)
+    rows.sort(key=lambda row: np.inf if row[3].value is None else row[3].value)
+    return Table("Margin inside the feasible set, link by link", heads, rows, shown=WORST)
 
 
 def _tightest(conditions: list[Condition]) -> list[Cell]:
@@ -148,49 +188,58 @@ def _tightest(conditions: list[Condition]) -> list[Cell]:
     return [Cell(least.name), Cell(number(least.margin), least.margin, kind), Cell(number(least.scaled), least.scaled)]
 
 
-def friction_table(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Return a table, per joint, of the friction curve's shape parameters; empty where there are none."""
+def friction_table(evidence: Evidence, parameters: ParameterFile, order: Sequence[int]) -> Table:
+    """Return, per joint, how far friction lies off its curve, and the shape parameters that the curve has.
+
+    Args:
+        evidence: with friction.
+        parameters: of the same estimate.
+        order: numbers of the joints, the worst first.
+    """
     found = parameters.content.get("friction", {})
     kinds = (
         ("pre-sliding distance", "presliding", "rad", "m"),
         ("Stribeck velocity", "stribeck_velocity", "rad/s", "m/s"),
     )
     shown = [(*kind, found[kind[1]]) for kind in kinds if any(found.get(kind[1], []))]
-    if not shown or any(len(values) != len(evidence.joints) for *_, values in shown):
-        return ""
+    shown = [one for one in shown if len(one[-1]) == len(evidence.joints)]
     rows = []
-    for k, (name, turns) in enumerate(zip(evidence.joints, evidence.revolute, strict=True)):
-        cells = [
-            Cell(f"{number(values[k])} {unit if turns else other}", values[k]) for _, _, unit, other, values in shown
-        ]
-        rows.append([Cell(name), *cells])
-    heads = ["joint", *(what for what, *_ in shown)]
-    return table("Shape of the friction beside its parameters, found from the recordings or given", heads, rows)
-
-
-def axis_table(evidence: Evidence) -> str:
-    """Return a table, per joint, of how often it did not answer; empty where no recording knows."""
-    known = [one for one in evidence.timing if one.invalid]
-    if not known:
-        return ""
-    heads = ["joint", *(f"{one.recording}: {what}" for one in known for what in ("no answer", "oldest position"))]
-    rows = []
-    for k, name in enumerate(evidence.joints):
-        cells = [Cell(name)]
-        for one in known:
-            cells += [Cell(f"{one.invalid[k]} cycles", one.invalid[k]), Cell(f"{one.oldest[k]} cycles", one.oldest[k])]
+    for k in order:
+        turns = evidence.revolute[k]
+        cells = [Cell(evidence.joints[k]), _quantity(friction_scatter(evidence, k), "N m" if turns else "N")]
+        cells += [_quantity(values[k], unit if turns else other) for _, _, unit, other, values in shown]
+        cells.append(Cell(", ".join(evidence.friction[k].terms) or "none", kind="expression"))
         rows.append(cells)
-    return table("Axes that did not answer", heads, rows)
+    heads = ["joint", "off the curve, rms", *(what for what, *_ in shown), "parameters of the curve"]
+    return Table("Friction: how far it lies off the curve, and the curve", heads, rows, shown=WORST)
 
 
-def file_table(evidence: Evidence, parameters: ParameterFile, sha256: Mapping[str, str]) -> str:
-    """Return a table of the files that were used and made, with hashes."""
+def axis_table(evidence: Evidence) -> Table | None:
+    """Return the joints that did not always answer, per recording; None where all did, or no recording knows."""
+    rows = [
+        (one.invalid[k], [Cell(name), Cell(one.recording), _cycles(one.invalid[k]), _cycles(one.oldest[k])])
+        for one in evidence.timing
+        if one.invalid
+        for k, name in enumerate(evidence.joints)
+        if one.invalid[k]
+    ]
+    rows.sort(key=lambda row: -row[0])
+    heads = ["joint", "recording", "no answer", "oldest position"]
+    return Table("Axes that did not answer", heads, [row for _, row in rows], shown=WORST) if rows else None
+
+
+def _cycles(count: int) -> Cell:
+    return Cell(f"{count} cycles", count)
+
+
+def file_table(evidence: Evidence, parameters: ParameterFile, sha256: Mapping[str, str]) -> Table:
+    """Return the files that were used and made, with hashes."""
     rows = [[Cell(f"{one.role} recording {one.name}"), Cell(one.sha256, kind="hash")] for one in evidence.recordings]
     used = {one.sha256 for one in evidence.recordings}
     if arm := parameters.content.get("arm"):
         rows.append([Cell(f"arm {arm['name']}, as it was identified"), Cell(arm["sha256"], kind="hash")])
     rows += [[Cell(name), Cell(digest, kind="hash")] for name, digest in sha256.items() if digest not in used]
-    return table("Files", ["what", "SHA-256"], rows)
+    return Table("Files", ["what", "SHA-256"], rows)
 
 
 def _number(value: float | None, digits: int = 5) -> Cell:
@@ -201,12 +250,9 @@ def _number(value: float | None, digits: int = 5) -> Cell:
 
 
 _NO_WARNING = (
-    "None: gaps, saturation and standstill are as they should be, and the standard deviation of the steps between "
-    f"stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands under Timing."
-)
-_NOTHING_AGAINST = (
-    f"None: no joint is off by more than {POOR:g} % of its own torque, no constraint is active and no parameter "
-    "is unidentified."
+    "No warnings of the recordings: gaps, saturation and standstill are as they should be, and the standard deviation "
+    f"of the steps between stamps is below {100 * MUCH_JITTER:g} % of a period; how far off single steps are stands "
+    "under Timing."
 )
 _ARRIVAL = (
     "The arm's description takes stamps for times of arrival: between gaps samples count as evenly spaced, so uneven "
@@ -226,30 +272,99 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     Returns:
         A whole HTML document.
     """
+    content = parameters.content
+    found = assess(content)
+    order = [one.place for one in found.joints] or list(range(len(evidence.joints)))
     drawn = figures(evidence, parameters)
     simulated = isinstance(config.driver, SimulatedDriver)
-    script, title = _asset("zoom.js"), f"Identification of {config.name}"
-    policy = f"default-src 'none'; style-src 'unsafe-inline'; script-src '{_hash(script)}'; base-uri 'none'"
-    head = (
-        '<meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{plain(title)}</title><style>{_asset('report.css')}{sheet()}</style>"
+    link_values = content.get("link_parameters", {})
+    return render(
+        "report.html",
+        scripts=(vendored("uPlot.iife.min.js"), asset("report.js")),
+        styles=(vendored("uPlot.min.css"),),
+        title=f"Identification of {config.name}",
+        subtitle=_subtitle(parameters, config),
+        simulated=SIMULATED if simulated else "",
+        assessment=found,
+        joints=assessment_table(found),
+        joint_rule=joint_rule(),
+        sentences=verdict(evidence, parameters),
+        steps=next_steps(evidence, parameters),
+        warnings=evidence.warnings,
+        no_warning=_NO_WARNING,
+        contents=_TITLES,
+        good=GOOD,
+        rows=_rows(config, evidence),
+        worst=WORST,
+        figures={
+            "residual": _in_order(drawn.residual, order),
+            "friction": _in_order(drawn.friction, order),
+            "doubt": drawn.doubt,
+            "bodies": drawn.bodies,
+            "timing": drawn.timing,
+        },
+        recordings=[
+            {
+                "place": place,
+                "name": one.name,
+                "role": "fitted to" if one.role == "identification" else "not used in the fit",
+                "figures": _in_order(made, order),
+                "data": _data(one),
+            }
+            for place, (one, made) in _unseen_first(evidence, drawn.torque)
+        ],
+        unseen=any(one.role == "validation" for one in evidence.recordings),
+        errors=error_table(evidence),
+        every_recording=joint_table(found.joints, parameters),
+        verdict_rule=verdict_rule(),
+        parameters=parameter_table(evidence, parameters),
+        friction=friction_table(evidence, parameters, order) if evidence.friction else None,
+        noise=_noise(content),
+        margins=margin_table(evidence) if evidence.conditions else None,
+        implausible=[f"Implausible, {line}." for line in link_values.get("implausible", [])],
+        what_then=WHAT_THEN,
+        bodies_words=bodies_words(evidence),
+        arrival=_ARRIVAL if config.recording.stamps == "arrival" else "",
+        axes=axis_table(evidence),
+        run=_run(parameters),
+        files=file_table(evidence, parameters, sha256),
     )
-    body = "\n".join(
-        [
-            f"<header><h1>{plain(title)}</h1>{paragraph(_subtitle(parameters, config))}",
-            paragraph(SIMULATED, "simulated") if simulated else "",
-            f"{contents(_TITLES.items())}</header>",
-            "<main>",
-            *_sections(evidence, parameters, drawn, config, sha256),
-            "</main>",
-            *(_data(place, one) for place, one in enumerate(evidence.recordings)),
-            f"<script>{script}</script>",
-        ]
-    )
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{body}</body></html>\n'
+
+
+def _noise(content: Mapping[str, Any]) -> str:
+    """Return how much of the uncertainty is noise, and how much error of the model; empty where it is unknown."""
+    table = content["base_parameters"]
+    if "covariance" not in table:
+        return ""
+    noise, covariance = table.get("noise_standard_deviations"), np.array(table["covariance"], dtype=float)
+    return noise_and_model(None if noise is None else np.array(noise, dtype=float), np.diag(covariance))
+
+
+def _in_order(made: Sequence[Figure], order: Sequence[int]) -> list[Figure]:
+    """Return the figures of joints, the worst joint first; none where there are none."""
+    return [made[k] for k in order] if made else []
+
+
+def _unseen_first(
+    evidence: Evidence, torque: Sequence[Sequence[Figure]]
+) -> list[tuple[int, tuple[PredictionTrace, Sequence[Figure]]]]:
+    """Return recordings with number and figures: those that were not fitted to first, as they tell more."""
+    everyone = list(enumerate(zip(evidence.recordings, torque, strict=True)))
+    return sorted(everyone, key=lambda one: one[1][0].role != "validation")
+
+
+def _rows(config: ArmConfig, evidence: Evidence) -> dict[str, str]:
+    """Return, per section, the rows and the filter that its figures are computed from."""
+    every, *others = rows_and_filter(config.identification)
+    filtered = " ".join(others[1:])  # without the rows away from standstill, of which no figure is
+    shown = [one.name for one in evidence.recordings if one.spectra]
+    fitted = ", ".join(one.name for one in evidence.recordings if one.role == "identification")
+    return {
+        "torque": f"{every} Shaded rows, near standstill, weigh less in the fit. {filtered}",
+        "residual": f"All rows, those near standstill too, of {', '.join(shown[:2]) or 'no recording'}. {filtered}",
+        "friction": f"All rows of {fitted}, thinned out evenly over velocity. {filtered}",
+        "doubt": f"All rows of {fitted}, weighted as in the fit, in blocks of about a second. {filtered}",
+    }
 
 
 def _subtitle(parameters: ParameterFile, config: ArmConfig) -> str:
@@ -260,10 +375,8 @@ def _subtitle(parameters: ParameterFile, config: ArmConfig) -> str:
 
 
 _TITLES = {
-    "verdict": "Verdict",
-    "warnings": "Warnings",
-    "parameters": "Parameters",
     "torque": "Measured and predicted torque",
+    "parameters": "Parameters",
     "residual": "Spectrum and autocorrelation of the residual",
     "friction": "Friction",
     "doubt": "Uncertainty and correlation",
@@ -273,76 +386,7 @@ _TITLES = {
 }
 
 
-def _sections(
-    evidence: Evidence, parameters: ParameterFile, drawn: Figures, config: ArmConfig, sha256: Mapping[str, str]
-) -> Iterable[str]:
-    *found, steps = verdict(evidence, parameters, simulated=isinstance(config.driver, SimulatedDriver))
-    content = {
-        "verdict": [paragraph(" ".join(found), "verdict"), paragraph(steps, "verdict")],
-        "warnings": _warnings(evidence, parameters),
-        "parameters": _parameters(evidence, parameters),
-        "torque": _torque(evidence, parameters, drawn),
-        "residual": [_grid(drawn.residual, "No recording is long enough for a spectrum.")],
-        "friction": [
-            friction_table(evidence, parameters),
-            _grid(drawn.friction, "The arm's model has no friction, so there is no curve to compare with."),
-        ],
-        "doubt": [_grid(drawn.doubt, "The parameter file has no standard deviations.")],
-        "bodies": _bodies(evidence, parameters, drawn),
-        "timing": [_arrival(config), _grid(drawn.timing, ""), axis_table(evidence)],
-        "files": [*_run(parameters), file_table(evidence, parameters, sha256)],
-    }
-    for name, title in _TITLES.items():
-        yield section(name, title, *content[name])
-
-
-def _warnings(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
-    yield "<h3>Of the recordings</h3>"
-    yield items(evidence.warnings) if evidence.warnings else paragraph(_NO_WARNING)
-    yield "<h3>Of the estimate</h3>"
-    against = limitations(evidence, parameters)
-    yield items(against) if against else paragraph(_NOTHING_AGAINST)
-
-
-def _arrival(config: ArmConfig) -> str:
-    return paragraph(_ARRIVAL) if config.recording.stamps == "arrival" else ""
-
-
-def _parameters(evidence: Evidence, parameters: ParameterFile) -> Iterable[str]:
-    if evidence.estimates[0].name != CAD:
-        yield paragraph("The arm's description has no CAD values (prior), so there is nothing to compare with.")
-    yield paragraph(verdict_rule())
-    yield parameter_table(evidence, parameters)
-
-
-def _torque(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> Iterable[str]:
-    yield error_table(evidence)
-    yield joint_table(evidence, parameters)
-    if said := parameters.content.get("fit", {}).get("rows_and_filter"):
-        yield items(said)
-    for one, made in zip(evidence.recordings, drawn.torque, strict=True):
-        role = "fitted to" if one.role == "identification" else "not used in the fit"
-        yield f"<h3>{plain(one.name)}, {role}</h3>{_grid(made, '')}"
-    if not any(one.role == "validation" for one in evidence.recordings):
-        yield paragraph("There is no validation recording. Give one with --validate.")
-
-
-def _bodies(evidence: Evidence, parameters: ParameterFile, drawn: Figures) -> Iterable[str]:
-    if not evidence.conditions:
-        yield paragraph("These parameters are not feasible, so there are no link parameters, margins or ellipsoids.")
-        return
-    yield paragraph(
-        "Motion determines base parameters only: the bodies are one choice of many with the same dynamics. "
-        "Good: large margins. Bad: almost none, where a constraint is active."
-    )
-    if strange := parameters.content.get("link_parameters", {}).get("implausible"):
-        yield items([f"Implausible, {line}." for line in strange])
-        yield paragraph(WHAT_THEN)
-    yield margin_table(evidence)
-    yield _grid(drawn.bodies, "")
-
-
-def _run(parameters: ParameterFile) -> Iterable[str]:
+def _run(parameters: ParameterFile) -> list[str]:
     origin, fit = parameters.content.get("provenance", {}), parameters.content.get("fit")
     rows = [f"Method {parameters.content.get('method', '?')}, feasible set {parameters.feasible_set or '?'}."]
     if fit is not None:
@@ -355,33 +399,18 @@ def _run(parameters: ParameterFile) -> Iterable[str]:
     scales = parameters.content.get("torque_scales", [])
     if any(scale != 1.0 for scale in scales):
         rows.append("Measured torques multiplied by " + ", ".join(number(scale, 4) for scale in scales) + ".")
+    for one in parameters.content.get("torque_constants", []):
+        doubt = one["standard_deviation"]
+        told = "not shown" if doubt is None else f"{number(one['factor'], 4)} \u00b1 {number(doubt)}"
+        rows.append(f"Torque of motor {one['motor']} ({', '.join(one['joints'])}) for one by its description: {told}.")
     rows.append(f"Made {origin.get('created', 'at an unknown time')} by {origin.get('software', 'unknown software')}")
     rows[-1] += f", commit {origin['git']}." if origin.get("git") else "."
-    yield items(rows)
+    return [*rows, *(fit or {}).get("rows_and_filter", [])]
 
 
-def _grid(made: Iterable[Figure], otherwise: str) -> str:
-    shown = "".join(map(_figure, made))
-    return f'<div class="figures">{shown}</div>' if shown else paragraph(otherwise)
-
-
-def _figure(figure: Figure) -> str:
-    about = "" if figure.zoom is None else _zoom(figure.zoom)
-    return (
-        f'<figure id="{figure.slug}"{about}>{figure.svg(inline=True)}'
-        f"<figcaption>{prose(figure.caption)}</figcaption></figure>"
-    )
-
-
-def _zoom(zoom: Zoom) -> str:
-    content = {"recording": zoom.recording, "joint": zoom.joint, "time": zoom.time}
-    content |= {"torque": zoom.torque, "residual": zoom.residual}
-    return f' data-zoom="{plain(json.dumps(content))}"'
-
-
-def _data(place: int, traced: PredictionTrace) -> str:
+def _data(traced: PredictionTrace) -> dict[str, Any]:
     """Return a recording for the script: its entries of `evidence.json` without the names."""
-    joints: list[dict[str, Any]] = [
+    joints = [
         {
             "torque": packed(joint.torque),
             "predicted": packed(joint.predicted),
@@ -391,16 +420,4 @@ def _data(place: int, traced: PredictionTrace) -> str:
         for joint in traced.joints
     ]
     numbers = np.round(traced.time / traced.width - 0.5).astype(np.int64)
-    content = {"width": traced.width, "runs": runs_of(numbers), "joints": joints}
-    text = json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")
-    return f'<script type="application/json" id="recording-{place}">{text}</script>'
-
-
-@cache
-def _asset(name: str) -> str:
-    return files("ident_service.results.report").joinpath(name).read_text(encoding="utf-8")
-
-
-def _hash(script: str) -> str:
-    """Return the hash by which a content security policy allows a script."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    return {"width": traced.width, "runs": runs_of(numbers), "joints": joints}

@@ -1,57 +1,26 @@
-"""State the verdict on an estimate, and its limitations, each by a rule that the page states."""
+"""Write out an assessment in sentences: feasibility and its certificate, prediction, unknowns, what to do next."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, WEAK_BELOW
+from ident_service.results.assessment import (
+    MUCH_WORSE,
+    active_constraints,
+    generalises_poorly,
+    poor_joints,
+)
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
 from ident_service.results.plots import number
 from ident_service.results.report.figures import relative_deviations
 
-POOR = 15.0  # torque error of a joint [percent of its own torque], above which it is predicted poorly
 ILL_CONDITIONED = 1000.0  # condition number of the regressor, SI units
 NAMED = 5
 _LONGEST = 60  # characters of a name in a sentence
-
-
-@dataclass(frozen=True)
-class PoorJoint:
-    """Joint whose torque is predicted poorly.
-
-    Attributes:
-        name: of the joint.
-        whole: its relative torque error over all rows (eq. 84), of the worst recording [percent].
-        moving: the same without rows near standstill; None where it was not told.
-    """
-
-    name: str
-    whole: float
-    moving: float | None
-
-    @property
-    def in_motion(self) -> bool:
-        """Return whether the joint's torque is predicted poorly in motion, too."""
-        return self.moving is None or self.moving > POOR
-
-
-def poor_joints(evidence: Evidence, parameters: ParameterFile) -> list[PoorJoint]:
-    """Return joints off by more than 15 % of their own torque on unseen data, or else on the fitted data."""
-    content = parameters.content
-    unseen = content.get("validation", [])
-    scores = unseen or ([content["fit"]] if "fit" in content else [])
-    moving = evidence.estimates[evidence.chosen].moving_joints
-    moving = moving[1:] if unseen else moving[:1]
-    found = []
-    for joint, name in enumerate(evidence.joints):
-        whole = max((score["per_joint"][joint]["relative_error_percent"] for score in scores), default=0.0)
-        if whole > POOR:
-            found.append(PoorJoint(name, whole, max((row[joint] for row in moving), default=None)))
-    return found
 
 
 def unidentified(parameters: ParameterFile) -> list[tuple[str, float]]:
@@ -67,55 +36,12 @@ def unidentified(parameters: ParameterFile) -> list[tuple[str, float]]:
 
 def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
     """Return the number of active conditions, in words; empty where there are none or no body has the parameters."""
-    found = parameters.content.get("feasibility", {})
-    tight = found.get("tight", [])
-    if not tight or found["margin"] <= 0.0:
+    tight = active_constraints(parameters.content)
+    if not tight:
         return ""
     known = {one.name for one in evidence.conditions}
     of = f" of {len(known)}" if known.issuperset(tight) else ""
     return f"{len(tight)}{of} constraints are active" if len(tight) > 1 else f"1{of} constraint is active"
-
-
-def limitations(evidence: Evidence, parameters: ParameterFile) -> list[str]:
-    """Return the limitations of the estimate, in sentences; empty where there are none."""
-    found = [f"Must not be used: {reason}." for reason in parameters.content.get("unusable", [])]
-    if parameters.content.get("feasibility", {}).get("margin", 1.0) <= 0.0:
-        found.append("The parameters are not physically feasible.")
-    second = parameters.content.get("second_opinion", {})
-    if second.get("conclusive") and not second.get("agrees", True):
-        found.append("A second solution of the constrained problem predicts other torques (report.txt).")
-    poor = poor_joints(evidence, parameters)
-    if moving := [one for one in poor if one.in_motion]:
-        found.append(f"Off by more than {POOR:g} % of their own torque: {joints_in_words(moving)}.")
-    if still := [one for one in poor if not one.in_motion]:
-        found.append(
-            f"Off by more than {POOR:g} % of their own torque, near standstill only: {joints_in_words(still)}."
-        )
-    if words := active_conditions(evidence, parameters):
-        found.append(f"{words}: there the values are determined by constraints, not by the recordings.")
-    verdicts = parameters.content["base_parameters"].get("verdicts", [])
-    if count := verdicts.count("unidentified"):
-        found.append(
-            f"{count} of {len(verdicts)} base parameters are unidentified: these recordings do not determine them."
-        )
-    fit = parameters.content.get("fit")
-    # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
-    if fit is not None and "unidentified" in verdicts and (fit["condition_number"] or np.inf) > ILL_CONDITIONED:
-        size = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
-        found.append(
-            f"The regressor's condition number is {size}, above {ILL_CONDITIONED:g}: "
-            "some combinations of parameters are hardly excited."
-        )
-    return found
-
-
-def joints_in_words(joints: Sequence[PoorJoint]) -> str:
-    """List every joint with its errors, in words."""
-    return ", ".join(
-        f"{one.name} ({number(one.whole)} %"
-        + (")" if one.in_motion or one.moving is None else f"; {number(one.moving)} % away from standstill)")
-        for one in joints
-    )
 
 
 def listed(names: Sequence[str]) -> str:
@@ -130,28 +56,23 @@ def shortened(name: str) -> str:
     return name if len(name) <= _LONGEST else name[: _LONGEST - 3] + "..."
 
 
-_MUCH_WORSE = 1.5  # times the error on what was fitted to
 SIMULATED = "The arm is simulated: this is no commissioning of a real arm."
 # The page repeats a file, which anybody may have written; only the verifier, with the arm, can tell.
 _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` checks it in exact arithmetic."
 
 
-def verdict(evidence: Evidence, parameters: ParameterFile, *, simulated: bool = False) -> list[str]:
-    """Return the verdict in sentences: feasibility, its certificate, prediction error, unknowns, next step.
+def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
+    """Return the verdict in sentences.
 
     Args:
         evidence: what was gathered while the estimate was at hand.
         parameters: the parameter file that it belongs to.
-        simulated: whether the arm's driver is a simulated one.
     """
     return [
-        *([SIMULATED] if simulated else []),
-        *(f"Do not use these parameters: {reason}." for reason in parameters.content.get("unusable", [])),
         *_feasibility(evidence, parameters),
-        _prediction(evidence),
-        *_joints(evidence, parameters),
+        _prediction(evidence, parameters),
         _knowledge(parameters),
-        _next(evidence, parameters),
+        *_condition(parameters),
     ]
 
 
@@ -185,7 +106,7 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     return [*sentences, how]
 
 
-def _prediction(evidence: Evidence) -> str:
+def _prediction(evidence: Evidence, parameters: ParameterFile) -> str:
     own = evidence.estimates[evidence.chosen]
     fitted = "" if own.identification is None else _error(own.identification, own.moving)
     unseen = [one.name for one in evidence.recordings if one.role == "validation"]
@@ -198,44 +119,15 @@ def _prediction(evidence: Evidence) -> str:
     )
     words = f"On validation recordings its torque error is {errors}, against {fitted} on the fitted ones: "
     words += "it predicts other motions " if own.moving is None else "away from standstill it predicts other motions "
-    words += "markedly worse than its own" if _generalises_poorly(evidence) else "about as well as its own"
+    words += "markedly worse than its own" if generalises_poorly(parameters.content) else "about as well as its own"
     if own.moving is None or own.identification is None:
         return f"{words}."
     times = max(own.validation) / max(own.identification, 1e-12)
-    return f"{words}{f' (over all rows, {number(times, 2)} times its own error)' if times > _MUCH_WORSE else ''}."
-
-
-def _joints(evidence: Evidence, parameters: ParameterFile) -> list[str]:
-    """Return sentences on joints whose errors the error of the whole arm hides."""
-    poor = poor_joints(evidence, parameters)
-    unseen = bool(evidence.estimates[evidence.chosen].validation)
-    where = "the validation recordings" if unseen else "the fitted recordings"
-    if not poor:
-        return [f"No joint's error exceeds {POOR:g} % of its own torque on {where}."]
-    sentences = []
-    if moving := [one for one in poor if one.in_motion]:
-        sentences.append(
-            f"That is of the whole arm, in which the largest torques count most: on {where}, the error exceeds "
-            f"{POOR:g} % of the joint's own torque at {joints_in_words(moving)}."
-        )
-    if still := [one for one in poor if not one.in_motion]:
-        sentences.append(
-            "Over all rows, with those near standstill where friction has no known size, the error exceeds "
-            f"{POOR:g} % of the joint's own torque at {joints_in_words(still)}."
-        )
-    return sentences
+    return f"{words}{f' (over all rows, {number(times, 2)} times its own error)' if times > MUCH_WORSE else ''}."
 
 
 def _error(whole: float, moving: float | None) -> str:
     return f"{number(whole)} %" + ("" if moving is None else f" ({number(moving)} % away from standstill)")
-
-
-def _generalises_poorly(evidence: Evidence) -> bool:
-    """Return whether unseen motions are predicted markedly worse than the fitted ones; without standstill, if known."""
-    own = evidence.estimates[evidence.chosen]
-    if own.moving is not None and own.moving_validation:
-        return max(own.moving_validation) > _MUCH_WORSE * own.moving
-    return own.identification is not None and max(own.validation, default=0.0) > _MUCH_WORSE * own.identification
 
 
 def _knowledge(parameters: ParameterFile) -> str:
@@ -256,28 +148,39 @@ def _knowledge(parameters: ParameterFile) -> str:
     return f"{words}, the most uncertain first (\u03c3 over the larger of size and reference): {shown}{more}."
 
 
-def _next(evidence: Evidence, parameters: ParameterFile) -> str:
+def _condition(parameters: ParameterFile) -> list[str]:
+    """Return a sentence on the regressor's condition number where it matters."""
+    fit, verdicts = parameters.content.get("fit"), parameters.content["base_parameters"].get("verdicts", [])
+    # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
+    if fit is None or "unidentified" not in verdicts or (fit["condition_number"] or np.inf) <= ILL_CONDITIONED:
+        return []
+    size = "infinite" if fit["condition_number"] is None else number(fit["condition_number"])
+    return [
+        f"The regressor's condition number is {size}, above {ILL_CONDITIONED:g}: "
+        "some combinations of parameters are hardly excited."
+    ]
+
+
+def next_steps(evidence: Evidence, parameters: ParameterFile) -> list[str]:
     """Return what a person should do now, the most urgent thing first."""
     if parameters.content.get("unusable"):
-        return "Next: correct what forbids their use, and identify again."
+        return ["correct what forbids their use, and identify again"]
     steps = []
     found = parameters.content.get("feasibility")
     if found is not None and found["margin"] <= 0.0:
         steps.append("identify within a feasible set, and look first for wrong signs, units or joint directions")
-    if evidence.warnings:
-        steps.append("correct what the recordings' warnings name and record again")
     own = evidence.estimates[evidence.chosen]
     if not own.validation:
         steps.append("record a second motion and give it with --validate")
-    elif _generalises_poorly(evidence):
+    elif generalises_poorly(parameters.content):
         steps.append("see below which joint's residual follows the motion, and identify from a richer motion")
-    poor = poor_joints(evidence, parameters)
-    if moving := [one.name for one in poor if one.in_motion]:
+    poor = poor_joints(parameters.content)
+    if moving := [one.joint for one in poor if one.in_motion]:
         steps.append(
             f"do not rely on the predicted torque of {', '.join(moving)}: see below whether residual and friction ask "
             "for another friction term, and record a motion that moves and loads them more"
         )
-    if still := [one.name for one in poor if not one.in_motion]:
+    if still := [one.joint for one in poor if not one.in_motion]:
         steps.append(f"use it where joints move, not for the torque near standstill of {', '.join(still)}")
     if active_conditions(evidence, parameters):
         steps.append("find out why constraints are active: signs, units, friction, drive inertia")
@@ -285,6 +188,6 @@ def _next(evidence: Evidence, parameters: ParameterFile) -> str:
         steps.append(
             "where the unidentified parameters matter, design a motion that excites them (ident design --after)"
         )
-    if not steps:
-        return "Next: it can be used."
-    return "Next: " + "; ".join(steps) + "."
+    if evidence.warnings:
+        steps.append("correct what the warnings name and record again")
+    return steps or ["it can be used"]

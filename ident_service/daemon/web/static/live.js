@@ -5,11 +5,7 @@ const job = document.getElementById("job");
 let id = job.dataset.job; // empty before a rehearsal has begun
 const WINDOW = 10; // s that plots show
 const LAG = 0.25; // s behind the newest sample, so that what comes in pieces moves evenly
-const FRAME = 1000 / 30; // ms
-const DASHES = [[], [7, 3], [2, 3], [9, 3, 2, 3]];
-const LIGHT = ["#0072b2", "#c14f00", "#007a5a", "#a0528a", "#8a6d00", "#2f6f9f", "#5f5f5f"];
-const DARK = ["#56b4e9", "#ff9440", "#2fc79b", "#dd9cc6", "#f0e442", "#9acdf2", "#b8b8b8"];
-const dark = matchMedia("(prefers-color-scheme: dark)");
+const FRAME = 1000 / 20; // ms
 const byId = (name) => document.getElementById(name);
 
 // --- the lease: while this page is there, or while a key is held
@@ -123,145 +119,68 @@ function showJob(text) {
 
 // --- samples and plots
 
-const series = { joints: [], time: [], position: [], torque: [], error: [] };
-const doubt = { time: [], shares: [], first: [] };
+const QUANTITIES = ["position", "reference", "torque", "measured", "error"];
+const series = { joints: [], time: [] };
+const doubt = { time: [], shares: [], first: [], plot: null };
+let known = []; // what the description says of the joints
+let plots = [];
 let play = null; // s of the recording that the right edge shows
+
+const shownWindow = () => {
+  const from = Math.max(0, (play ?? 0) - WINDOW);
+  return [from, from + WINDOW];
+};
 
 function addSamples(text) {
   const piece = JSON.parse(text);
+  document.dispatchEvent(new CustomEvent("samples", { detail: piece }));
   if (!series.joints.length) {
     series.joints = piece.joints;
-    for (const kind of ["position", "torque", "error"]) series[kind] = piece.joints.map(() => []);
+    for (const kind of QUANTITIES) series[kind] = piece[kind] ? piece.joints.map(() => []) : null;
     byId("live").hidden = false;
-    makeLegend();
+    makePlots();
   }
   series.time.push(...piece.time);
-  for (const kind of ["position", "torque", "error"]) {
-    piece[kind].forEach((values, joint) => series[kind][joint].push(...values));
+  for (const kind of QUANTITIES) {
+    series[kind]?.forEach((values, joint) => {
+      if (piece[kind]) values.push(...piece[kind][joint]);
+      else for (let k = 0; k < piece.time.length; k += 1) values.push(null);
+    });
   }
   const newest = series.time[series.time.length - 1];
   let old = 0;
   while (old < series.time.length && series.time[old] < newest - WINDOW - 3) old += 1;
   if (old > 200) {
     series.time.splice(0, old);
-    for (const kind of ["position", "torque", "error"]) for (const values of series[kind]) values.splice(0, old);
+    for (const kind of QUANTITIES) for (const values of series[kind] || []) values.splice(0, old);
   }
 }
 
-function colour(joint) {
-  const colours = dark.matches ? DARK : LIGHT;
-  return colours[joint % colours.length];
-}
-
-function makeLegend() {
-  const SVG = "http://www.w3.org/2000/svg";
-  byId("legend").replaceChildren(
-    ...series.joints.map((name, joint) => {
-      const item = document.createElement("li");
-      const svg = document.createElementNS(SVG, "svg");
-      const line = document.createElementNS(SVG, "line");
-      for (const [key, value] of Object.entries({ width: 26, height: 4, "aria-hidden": "true" })) svg.setAttribute(key, value);
-      const look = { x1: 0, x2: 26, y1: 2, y2: 2, stroke: colour(joint), "stroke-width": 3 };
-      for (const [key, value] of Object.entries(look)) line.setAttribute(key, value);
-      line.setAttribute("stroke-dasharray", DASHES[joint % DASHES.length].join(" "));
-      svg.append(line);
-      item.append(svg, name);
-      return item;
-    }),
-  );
+function makePlots() {
+  for (const one of plots) one.plot.end();
+  byId("plots").replaceChildren();
+  plots = [];
+  const described = JSON.parse(byId("live").dataset.joints);
+  known = series.joints.map((name, k) => described.find((joint) => joint.name === name) || described[k] || { name, unit: "rad" });
+  const zoomed = () => byId("zoomed").checked;
+  known.forEach((joint, k) => {
+    const charts = Plots.row(byId("plots"), joint.name);
+    for (const one of Plots.quantities(joint, (name) => Boolean(series[name]))) {
+      const lines = Object.values(one.columns);
+      const plot = new Plots.Plot(charts, { ...one, lines, window: shownWindow, zoomed, sync: "live" });
+      plots.push({ plot, columns: Object.keys(one.columns).map((name) => series[name][k]) });
+    }
+  });
   byId("values").replaceChildren(
-    ...series.joints.map((name) => {
+    ...known.map((joint) => {
       const row = document.createElement("tr");
-      const head = document.createElement("th");
-      head.scope = "row";
-      head.textContent = name;
-      row.append(head, ...[0, 1, 2].map(() => Object.assign(document.createElement("td"), { className: "number" })));
+      const head = Object.assign(document.createElement("th"), { scope: "row", textContent: joint.name });
+      const cells = QUANTITIES.map(() => Object.assign(document.createElement("td"), { className: "number", textContent: "–" }));
+      const units = `${joint.unit}, ${Plots.torqueUnit(joint)}`;
+      row.append(head, ...cells, Object.assign(document.createElement("td"), { textContent: units }));
       return row;
     }),
   );
-}
-
-function nice(span) {
-  const power = 10 ** Math.floor(Math.log10(span / 3));
-  return power * [1, 2, 5, 10].find((step) => span / (step * power) <= 4);
-}
-
-function plot(canvas, times, columns, from, to, range) {
-  const width = canvas.clientWidth;
-  const height = canvas.clientHeight;
-  const scale = devicePixelRatio || 1;
-  if (canvas.width !== Math.round(width * scale) || canvas.height !== Math.round(height * scale)) {
-    canvas.width = Math.round(width * scale);
-    canvas.height = Math.round(height * scale);
-  }
-  const draw = canvas.getContext("2d");
-  draw.setTransform(scale, 0, 0, scale, 0, 0);
-  draw.clearRect(0, 0, width, height);
-  let low = Infinity;
-  let high = -Infinity;
-  times.forEach((time, k) => {
-    if (time < from || time > to) return;
-    for (const values of columns) {
-      if (values[k] === null || values[k] === undefined) continue;
-      low = Math.min(low, values[k]);
-      high = Math.max(high, values[k]);
-    }
-  });
-  if (low > high) return;
-  if (range) [low, high] = range(low, high);
-  if (high - low < 1e-9) [low, high] = [low - 1e-9, high + 1e-9];
-  const pad = 0.08 * (high - low);
-  low -= pad;
-  high += pad;
-  const left = 58;
-  const bottom = 20;
-  const x = (time) => left + ((time - from) / (to - from)) * (width - left - 6);
-  const y = (value) => 6 + ((high - value) / (high - low)) * (height - bottom - 6);
-  const look = getComputedStyle(document.documentElement);
-  draw.font = "11px system-ui, sans-serif";
-  draw.lineWidth = 1;
-  draw.strokeStyle = look.getPropertyValue("--edge");
-  draw.fillStyle = look.getPropertyValue("--soft");
-  draw.textAlign = "right";
-  draw.textBaseline = "middle";
-  const rise = nice(high - low);
-  const digits = Math.max(0, -Math.floor(Math.log10(rise)));
-  for (let value = Math.ceil(low / rise) * rise; value <= high; value += rise) {
-    draw.beginPath();
-    draw.moveTo(left, y(value));
-    draw.lineTo(width - 6, y(value));
-    draw.stroke();
-    draw.fillText(digits > 4 ? value.toExponential(1) : value.toFixed(digits), left - 6, y(value));
-  }
-  draw.textAlign = "center";
-  draw.textBaseline = "alphabetic";
-  const stride = nice(to - from);
-  for (let time = Math.ceil(Math.max(from, 0) / stride) * stride; time <= to; time += stride) {
-    if (x(time) > width - 16) break;
-    draw.fillText(`${+time.toFixed(2)} s`, x(time), height - 5);
-  }
-  draw.save();
-  draw.beginPath();
-  draw.rect(left, 0, width - left - 6, height - bottom);
-  draw.clip();
-  columns.forEach((values, joint) => {
-    draw.beginPath();
-    let open = false;
-    times.forEach((time, k) => {
-      if (values[k] === null || values[k] === undefined || time < from - 0.2 || time > to + 0.2) {
-        open = false;
-        return;
-      }
-      if (open) draw.lineTo(x(time), y(values[k]));
-      else draw.moveTo(x(time), y(values[k]));
-      open = true;
-    });
-    draw.strokeStyle = colour(joint);
-    draw.setLineDash(DASHES[joint % DASHES.length]);
-    draw.lineWidth = columns.length > 8 ? 1 : 1.8;
-    draw.stroke();
-  });
-  draw.restore();
 }
 
 let drawn = 0;
@@ -276,14 +195,7 @@ function frame(now) {
   if (play === null) play = newest - LAG;
   // As fast as the arm, which may be a simulated one that is faster than its clock; what is far behind catches up.
   play = Math.min(newest, play + passed + Math.max(0, newest - LAG - play - passed) * Math.min(1, 4 * passed));
-  const from = Math.max(0, play - WINDOW);
-  for (const kind of ["position", "torque", "error"]) {
-    plot(byId(`plot-${kind}`), series.time, series[kind], from, from + WINDOW, null);
-  }
-  if (doubt.time.length > 1) {
-    const ends = [doubt.time[0], doubt.time[doubt.time.length - 1]];
-    plot(byId("plot-doubt"), doubt.time, doubt.shares, ends[0], ends[1], (low, high) => [Math.min(low, -0.3), Math.max(high, 0)]);
-  }
+  for (const { plot, columns } of plots) plot.set([series.time, ...columns]);
 }
 
 let counted = 0;
@@ -294,8 +206,8 @@ function showValues() {
   counted = now;
   const last = series.time.length - 1;
   [...byId("values").rows].forEach((row, joint) => {
-    ["position", "torque", "error"].forEach((kind, k) => {
-      const value = series[kind][joint][last];
+    QUANTITIES.forEach((kind, k) => {
+      const value = series[kind]?.[joint][last] ?? null;
       row.cells[k + 1].textContent = value === null ? "–" : kind === "error" ? value.toExponential(2) : value.toFixed(3);
     });
   });
@@ -314,6 +226,12 @@ function showDoubt(text) {
     doubt.shares[k].push(deviation > 0 ? Math.log10(deviation / doubt.first[k]) : null);
   });
   byId("doubt").hidden = false;
+  if (doubt.plot === null) {
+    const lines = doubt.first.map((_, k) => ({ label: told.parameters[k].expression, colour: "--line-1" }));
+    const title = "Standard deviations against their first, in powers of ten";
+    doubt.plot = new Plots.Plot(byId("doubt-plot"), { title, unit: "", lines, height: 200 });
+  }
+  doubt.plot.set([doubt.time, ...doubt.shares]);
   const known = told.parameters.filter((one) => one.verdict === "identified").length;
   const until = Number(job.dataset.until || 0);
   const at = until ? told.parameters.filter((one) => one.share !== null && one.share <= until).length : known;
@@ -342,8 +260,9 @@ function showDoubt(text) {
 function listen() {
   closeStreams();
   if (!id) return;
+  doubt.plot?.end();
   Object.assign(series, { joints: [], time: [] });
-  Object.assign(doubt, { time: [], shares: [], first: [] });
+  Object.assign(doubt, { time: [], shares: [], first: [], plot: null });
   play = null;
   const stream = new EventSource(`/api/v1/jobs/${id}/live`);
   streams.add(stream);
@@ -367,5 +286,6 @@ document.addEventListener("visibilitychange", () => {
   else listen();
 });
 document.addEventListener("stop-asked", listen);
+byId("zoomed")?.addEventListener("change", () => plots.forEach(({ plot }) => plot.redraw()));
 listen();
 if (byId("live")) requestAnimationFrame(frame);

@@ -14,6 +14,7 @@ async function refresh() {
   const answer = await fetch(location.href);
   if (!answer.ok) return;
   const fresh = new DOMParser().parseFromString(await answer.text(), "text/html").getElementById("main");
+  if (fresh) showLocalTimes(fresh);
   if (fresh && !occupied() && !fresh.isEqualNode(main)) main.replaceChildren(...fresh.childNodes);
 }
 

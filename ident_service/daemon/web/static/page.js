@@ -9,6 +9,20 @@ function closeStreams() {
   streams.clear();
 }
 
+// Times are written in UTC, and shown as this browser's clock says them.
+function showLocalTimes(within) {
+  const pad = (value) => String(value).padStart(2, "0");
+  for (const one of within.querySelectorAll("time[datetime]")) {
+    const at = new Date(one.getAttribute("datetime"));
+    const day = [at.getFullYear(), pad(at.getMonth() + 1), pad(at.getDate())].join("-");
+    one.title = one.title || one.textContent;
+    one.textContent = `${day} ${[at.getHours(), at.getMinutes(), at.getSeconds()].map(pad).join(":")}`;
+  }
+}
+
+showLocalTimes(document);
+document.getElementById("zone").textContent = Intl.DateTimeFormat().resolvedOptions().timeZone || "of this browser";
+
 addEventListener("pagehide", closeStreams);
 document.addEventListener("submit", closeStreams);
 

@@ -1,0 +1,160 @@
+"""Read from an arm's description what pages say of it: real or simulated, joints with units and limits, pictures.
+
+What is computed from a description is kept by the file and its time of change, so that a list of arms reads each once.
+Modules that compute with mechanisms are imported only where they are needed, so that the service starts without them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from ident_service.config.arm import ArmConfig
+from ident_service.config.load import load_arm
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.daemon.dependencies import Service
+from ident_service.errors import IdentError
+from ident_service.registry.arms import description_path, known_arm
+from ident_service.registry.database import Row
+from ident_service.registry.motions import motion_path
+
+Kind = Literal["simulated", "real", "recordings", "unreadable"]
+WORDS: Final[dict[Kind, str]] = {
+    "simulated": "simulated",
+    "real": "real",
+    "recordings": "recordings only",
+    "unreadable": "description cannot be read",
+}
+
+
+@dataclass(frozen=True)
+class ArmFacts:
+    """Facts of an arm's description.
+
+    Attributes:
+        kind: `recordings` for an arm without a driver, which cannot be moved from here.
+        driver: its kind, for a real arm; empty for others.
+        joints: how many; 0 where the description does not list them.
+        description: the description's own words.
+    """
+
+    kind: Kind
+    driver: str
+    joints: int
+    description: str = ""
+
+    @property
+    def words(self) -> str:
+        """Return what kind of arm it is, in words."""
+        return f"real, {self.driver}" if self.driver else WORDS[self.kind]
+
+
+@dataclass(frozen=True)
+class JointFacts:
+    """Joint with its unit and limits, for plots and tables; None for what the description does not limit.
+
+    Attributes:
+        name: of the joint.
+        unit: of its position, `rad` or `m`; its torque is in N m or N.
+        lower: lowest position.
+        upper: highest position.
+        velocity: largest speed.
+        torque: largest torque.
+        error: largest following error.
+    """
+
+    name: str
+    unit: Literal["rad", "m"]
+    lower: float | None
+    upper: float | None
+    velocity: float | None
+    torque: float | None
+    error: float | None
+
+
+def arm_facts(state: Path, row: Row) -> ArmFacts:
+    """Return the facts of an arm, of its row in the registry."""
+    try:
+        path = description_path(state, row)
+        return _facts(path, path.stat().st_mtime_ns)
+    except (IdentError, OSError):
+        return ArmFacts("unreadable", "", 0)
+
+
+@lru_cache(maxsize=512)
+def _facts(path: Path, changed: int) -> ArmFacts:
+    del changed  # part of the key
+    return facts_of(load_arm(path))
+
+
+def facts_of(config: ArmConfig) -> ArmFacts:
+    """Return the facts of a description."""
+    driver = config.driver
+    if driver is None:
+        return ArmFacts("recordings", "", len(config.joints), config.description)
+    if isinstance(driver, SimulatedDriver):
+        return ArmFacts("simulated", "", len(config.joints), config.description)
+    return ArmFacts("real", str(driver.kind), len(config.joints), config.description)
+
+
+def joint_facts(config: ArmConfig) -> list[dict[str, Any]]:
+    """Return the joints of a description (`JointFacts`) as JSON values; none where it has no readable mechanism."""
+    from ident_service.model.arm_model import arm_model
+
+    try:
+        chain = arm_model(config).chain
+    except IdentError:
+        return []
+    found = []
+    for name, turns in zip(chain.names, chain.revolute, strict=True):
+        joint = config.joints.get(name)
+        lower, upper = (None, None) if joint is None or joint.position is None else joint.position
+        rest = (None,) * 3 if joint is None else (joint.velocity, joint.torque, joint.following_error)
+        found.append(asdict(JointFacts(name, "rad" if turns else "m", lower, upper, *rest)))
+    return found
+
+
+def home_svg(service: Service, arm: str) -> str:
+    """Return the picture of an arm at home, as an SVG."""
+    found = known_arm(service.db, service.state, arm)
+    return _home_svg(found.path, found.path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=64)
+def _home_svg(path: Path, changed: int) -> str:
+    from ident_service.model.arm_model import arm_model
+    from ident_service.operations.arm_pictures import home_picture
+
+    del changed
+    return home_picture(arm_model(load_arm(path)))
+
+
+def motion_svg(service: Service, arm: str, motion: str) -> str:
+    """Return the picture of an arm along a motion, the description's own if its id is empty, as an SVG."""
+    from ident_service.operations.arm_pictures import motion_picture
+
+    return motion_picture(*_motion(service, arm, motion))
+
+
+def extent(service: Service, arm: str, motion: str, speed: float) -> Any:
+    """Return how far, how fast and how long an arm goes along a motion (`MotionExtent`); None where nobody can say."""
+    from ident_service.operations.arm_pictures import motion_extent
+
+    try:
+        model, planned = _motion(service, arm, motion)
+        return motion_extent(model, planned, speed)
+    except IdentError:
+        return None  # preflight says why
+
+
+def _motion(service: Service, arm: str, motion: str) -> Any:
+    from ident_service.excitation.described_motion import excitation
+    from ident_service.excitation.motion_file import read_excitation
+    from ident_service.model.arm_model import arm_model
+
+    model = arm_model(known_arm(service.db, service.state, arm).config)
+    if motion:
+        return model, read_excitation(motion_path(service.db, service.state, motion))
+    return model, excitation(model, "identification", checked=False)

@@ -1,0 +1,157 @@
+"""The last line of an answer names the command that follows: right for the state, quoted, and one that runs."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cli.conftest import Commissioned, Ident, quick_arm
+from helpers.tickets import write_checked_ticket
+
+from ident_service.cli import parser
+from ident_service.cli.next_command import _FOLLOWS, WITHOUT, next_after_error, next_line
+from ident_service.config.load import load_arm
+from ident_service.errors import ArmFault, IdentError, MotionRefused, UsageError
+
+TOP = parser()
+
+
+def verbs(top: argparse.ArgumentParser) -> set[str]:
+    found = set()
+    for action in top._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for sub in action.choices.values():
+                found |= {sub.get_default("word")} | verbs(sub)
+    return found - {None}
+
+
+def test_every_verb_has_a_next_command_or_is_known_to_have_none() -> None:
+    assert set(_FOLLOWS) | WITHOUT == verbs(TOP)
+    assert not set(_FOLLOWS) & WITHOUT
+
+
+RUN = {"id": "r1", "kind": "motion", "arm": "planar2"}
+JOB = {"id": "j1", "kind": "run", "arm": "planar2", "run": "r1", "motion": 1, "state": "done"}
+DUE = {"id": 1, "arm": "planar2"}
+# Words of a verb, its exit code and answer, and the command that follows.
+TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
+    ("config check planar2", 0, {}, "simulate planar2"),
+    ("config check wam7_canopen", 0, {}, "bus scan wam7_canopen"),
+    ("config check wam7", 0, {}, "identify RECORDING --arm wam7"),
+    ("config check planar2", 3, {}, "config check planar2"),
+    ("preview planar2 m.json", 0, {}, "preflight planar2 m.json"),
+    ("preview wam7 m.json", 0, {}, "identify RECORDING --arm wam7"),
+    ("preview planar2", 3, {}, "design planar2"),
+    ("design planar2", 0, {"folder": "/a b"}, "preview planar2 '/a b/motion.json'"),
+    ("design planar2", 3, {"folder": "/a"}, "design planar2 --search-time 300"),
+    ("preflight planar2 m.json", 0, {}, "run planar2 m.json"),
+    ("preflight planar2 --home", 0, {}, "home planar2"),
+    ("preflight 'my arm.yaml' --home", 3, {}, "preflight 'my arm.yaml' --home"),
+    ("run planar2", 0, {"folder": "/runs/x"}, "identify /runs/x/run.mcap --arm planar2"),
+    ("run planar2", 1, {"folder": "/runs/x"}, "recover planar2"),
+    ("run wam7_canopen --dry-run", 0, {}, "run wam7_canopen"),
+    ("run planar2 --server http://h:1", 0, {"job": JOB, "answer": {}}, "identify r1 --arm planar2 --server http://h:1"),
+    ("stop", 0, {"arms": ["planar2"]}, "recover planar2"),
+    ("stop", 0, {"arms": []}, "arms"),
+    ("stop my.yaml --state 's t'", 0, {"arm": "my"}, "recover my.yaml --state 's t'"),
+    ("recover planar2", 3, {"steps": ["Look.", "`ident acknowledge planar2 x`, when known."]}, "acknowledge planar2 x"),
+    ("home planar2", 0, {"asked": "home"}, "supported planar2"),
+    ("home planar2", 0, {"folder": "/x"}, "preflight planar2"),
+    ("set-home planar2", 0, {}, "watch planar2"),
+    ("identify a.mcap --arm planar2", 0, {"folder": "/r"}, "accept /r --note 'identified from a.mcap'"),
+    ("identify a.mcap --arm planar2", 3, {"folder": "/r"}, "design planar2"),
+    ("compare a b", 3, {"verdict": "changed"}, "accept b --note WHY"),
+    ("compare a b", 0, {"verdict": "unchanged"}, "report b"),
+    ("feasible t.json", 3, {}, "project t.json --out feasible.json"),
+    ("fleet status 'a/*' --arm wam7 --store s", 0, {}, "fleet identify 'a/*' --arm wam7 --store s"),
+    ("runs", 0, {"runs": []}, "simulate"),
+    ("runs", 0, {"runs": [RUN]}, "identify r1 --arm planar2"),
+    ("runs", 0, {"runs": [RUN | {"kind": "identification"}]}, "report r1"),
+    ("jobs", 0, {"jobs": [JOB | {"state": "running"}]}, "jobs watch j1"),
+    ("jobs show j1", 0, {"job": JOB, "answer": {}}, "identify r1 --arm planar2"),
+    ("jobs show j1", 0, {"job": JOB | {"state": "faulted"}, "answer": None}, "recover planar2"),
+    ("due", 0, {"due": []}, "schedules"),
+    ("due", 0, {"due": [DUE | {"accepted": True}]}, "reidentify planar2"),
+    ("due", 0, {"due": [DUE | {"accepted": False}]}, "preflight planar2"),
+    ("maintenance planar2 --what oil", 0, {"due": []}, "schedules add planar2 --maintenance"),
+    ("alarms", 3, {"alarms": [{"id": 7}]}, "alarms acknowledge 7 --note WHY"),
+    ("prune --keep 3", 0, {"deleted": False, "recordings": [{}]}, "prune --keep 3 --yes"),
+    ("prune --keep 3 --yes", 0, {"deleted": True, "recordings": [{}]}, "runs"),
+    ("backup f.zip --state s", 0, {}, "restore f.zip --state restored"),
+    ("emulate wam7_canopen", 0, {}, "bus scan wam7_canopen"),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "said", "follows"), TABLE, ids=[f"{row[0]}:{row[1]}" for row in TABLE])
+def test_the_next_command_fits_the_answer(words: str, code: int, said: Mapping[str, Any], follows: str) -> None:
+    line = next_line(TOP.parse_args(shlex.split(words)), code, said)
+    assert line == f"next: ident {follows}\n"
+    assert TOP.parse_args(shlex.split(line)[2:]).word
+
+
+ERRORS: list[tuple[str, IdentError, str]] = [
+    ("run planar2 m.json", MotionRefused("no preflight ticket"), "next: ident preflight planar2 m.json\n"),
+    ("home planar2", MotionRefused("no preflight ticket"), "next: ident preflight planar2 --home\n"),
+    ("run planar2", MotionRefused("active faults"), "next: ident recover planar2\n"),
+    ("run planar2", ArmFault("lease_lost", "x"), "next: ident recover planar2\n"),
+    ("run planar2", UsageError("exists"), ""),
+    ("reidentify planar2", UsageError("planar2: nothing has been accepted yet"), "next: ident preflight planar2\n"),
+]
+
+
+@pytest.mark.parametrize(("words", "error", "line"), ERRORS)
+def test_what_refused_or_stopped_a_motion_is_followed_by_what_clears_it(
+    words: str, error: IdentError, line: str
+) -> None:
+    assert next_after_error(TOP.parse_args(words.split()), error) == line
+
+
+@pytest.mark.slow
+def test_the_named_commands_run_one_after_the_other(
+    ident: Ident, quick: Commissioned, state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a result in the state folder, which is named by its id, to what is due; paths have spaces."""
+    monkeypatch.chdir(tmp_path)
+    folder = state / "runs" / "20260101T000000Z-planar2"
+    shutil.copytree(quick.folder, folder)
+    state.chmod(0o700)
+    ended = ident("runs")
+    assert ended.next == ["report", folder.name]
+    for words in (["export", folder.name], ["report", folder.name]):
+        ended = ident(*ended.next)
+        assert (ended.code, ended.next) == (0, words), ended.err
+    recording, arm = folder / "identification.mcap", tmp_path / "my arm.yaml"
+    shutil.copy(quick.arm, arm)
+    assert ident("config", "check", arm).next == ["simulate", str(arm)]
+    assert ident("base-parameters", arm).next == ["design", str(arm)]
+    ended = ident("identify", recording, "--arm", arm)
+    assert ended.next[0] == "accept"
+    ended = ident(*ended.next)
+    assert (ended.code, ended.next[0]) == (0, "export"), ended.err
+    assert "acceptance 1" in ended.out
+    assert "typo: no arm of this name has an accepted set" in ident("compare", "accepted:typo", folder.name).err
+    assert "did you mean planar2?" in ident("compare", "accepted:planar", folder.name).err
+    compared = ident("compare", "accepted:planar2", folder.name)
+    assert compared.next[:2] == ["report", folder.name]
+    for words in (["verify", folder], ["feasible", folder / "parameters.json"]):
+        assert ident(*ident(*words).next).code == 0
+
+
+@pytest.mark.slow
+def test_a_motion_is_followed_by_the_identification_of_its_recording(ident: Ident, state: Path, tmp_path: Path) -> None:
+    arm = quick_arm(tmp_path)
+    refused = ident("run", arm)
+    assert (refused.code, refused.next) == (3, ["preflight", str(arm)])
+    state.mkdir(mode=0o700, exist_ok=True)
+    write_checked_ticket(load_arm(arm), state)
+    ended = ident("run", arm)
+    assert ended.code == 0, ended.err
+    assert ended.next[0] == "identify"
+    assert ended.next[2:] == ["--arm", str(arm)]
+    assert (state / "runs" / ended.next[1] / "run.mcap").is_file()
+    assert ident(*ended.next).code in (0, 3)

@@ -1,0 +1,94 @@
+"""What viewers in three dimensions are told: where joints are, and how near bodies come."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ident_service.config.load import load_arm
+from ident_service.errors import UsageError
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.trajectory import FourierPath
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.model.collision import CollisionModel
+from ident_service.operations.arm_view import MOST_SAMPLES, figure, view_at_rest, view_of_motion, view_of_recording
+from ident_service.recordings.cycle import Cycle
+from ident_service.recordings.mcap_writer import RecordingWriter
+
+
+@pytest.fixture(scope="module")
+def wam() -> ArmModel:
+    return arm_model(load_arm("wam7_sim"))
+
+
+@pytest.mark.parametrize("speed", [1.0, 0.25])
+@pytest.mark.parametrize("ramp", [0.0, 2.0])
+def test_a_motion_begins_and_ends_at_home_and_never_jumps(
+    wam: ArmModel, ramp: float, speed: float, tmp_path: Path
+) -> None:
+    motion = excitation(wam, "identification")
+    assert isinstance(motion.path, FourierPath)
+    motion = replace(motion, path=FourierPath(motion.path.series, 3, ramp))
+    (tmp_path / "motion.json").write_text(motion.to_json())
+    view = view_of_motion(wam.config, tmp_path / "motion.json", speed)
+    time, position = np.array(view["time"]), np.array(view["position"]).T
+    assert position.shape == (len(time), 7)
+    assert len(time) <= MOST_SAMPLES
+    assert (np.diff(time) > 0.0).all()
+    home = [wam.config.joints[name].home for name in wam.chain.names]
+    np.testing.assert_allclose(position[[0, -1]], [home, home], atol=1e-4)
+    fastest = np.abs(motion.path.at(np.linspace(0.0, motion.duration, 5000))[1]).max(axis=0)
+    steps = np.abs(np.diff(position, axis=0)) / np.diff(time)[:, None]
+    assert (steps <= speed * np.maximum(1.02 * fastest, 2.0)).all()  # a jump would be faster than motion and limits
+    assert [one["name"] for one in view["phases"]] == ["approach", "identification", "return"]
+    # What is shown of the motion is the motion.
+    begin = view["phases"][1]["begin"]
+    shown = (time > begin) & (time < begin + (ramp + motion.path.series.period) / speed)
+    expected = motion.path.at((time[shown] - begin) * speed)[0]
+    np.testing.assert_allclose(position[shown], expected, atol=5e-3)
+    assert any("the rest repeats" in note for note in view["notes"])
+
+
+def test_distances_are_those_of_the_collision_check(wam: ArmModel) -> None:
+    view = view_of_motion(wam.config, None)
+    collision, told = CollisionModel(wam), view["clearance"]
+    position = np.array(view["position"]).T[told["samples"]]
+    distances = collision.distances(position)
+    assert told["pairs"] == list(collision.pairs)
+    for kind, outside in (("itself", False), ("surroundings", True)):
+        chosen = [k for k, pair in enumerate(collision.pairs) if ("obstacle" in pair or "inside" in pair) is outside]
+        np.testing.assert_allclose(told[kind]["distance"], distances[:, chosen].min(axis=1), atol=1e-3)
+        assert set(told[kind]["pair"]) <= set(chosen)
+
+
+def test_an_arm_without_bodies_has_sticks_and_says_why_there_are_no_distances() -> None:
+    config = load_arm("planar2")
+    bare = arm_model(config.model_copy(update={"geometry": {}, "workspace": type(config.workspace)()}))
+    view = view_of_motion(bare.config, None)
+    assert view["clearance"] is None
+    assert any("distances are not known" in note for note in view["notes"])
+    assert {solid["joint"] for solid in view["figure"]["bodies"]} >= {0, 1}
+    assert view_at_rest(bare.config)["figure"] == figure(bare)
+
+
+def test_a_motion_of_another_arm_is_refused(wam: ArmModel, tmp_path: Path) -> None:
+    (tmp_path / "motion.json").write_text(excitation(wam, "identification").to_json())
+    with pytest.raises(UsageError, match="a motion of 7 joints, but planar2 has 2"):
+        view_of_motion(load_arm("planar2"), tmp_path / "motion.json")
+
+
+def test_a_recording_is_thinned_and_keeps_its_ends(wam: ArmModel, tmp_path: Path) -> None:
+    count, flags, age = 9_000, np.ones(7, bool), np.zeros(7, int)
+    with RecordingWriter(tmp_path / "run.mcap", wam.chain.names, "<robot/>", 10**18) as writer:
+        for k in range(count):
+            q = np.full(7, 1e-4 * k)
+            writer.sample(Cycle(5 + k * 10_000_000, q, None, q, q, q, k, 0, 0, flags, age, 0))
+    view = view_of_recording(wam.config, tmp_path / "run.mcap")
+    time, position = np.array(view["time"]), np.array(view["position"]).T
+    assert len(time) == MOST_SAMPLES
+    assert time[0] == 0.0
+    assert time[-1] == pytest.approx(0.01 * (count - 1), abs=0.02)
+    np.testing.assert_allclose(position, np.outer(1e-2 * time, np.ones(7)), atol=1e-4)

@@ -1,0 +1,191 @@
+"""The arm behind emulated drives: the simulated arm's physics, gears that lose nothing, brakes that couple joints."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drives_bench import GEARS, MS, drives_config
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ident_service.config.load import load_arm
+from ident_service.config.recording import Transmission
+from ident_service.config.simulation import SimulatedDriver
+from ident_service.errors import DriverError
+from sim_backend.build import build_machine
+from sim_backend.emulator.body import Body, Gears
+from sim_backend.emulator.build import build_emulator
+from sim_backend.emulator.motor import Power
+
+WAM = Transmission(
+    ratios=(-42.0, 28.25, -28.25, -18.0, 9.7, 9.7, -14.93),
+    coupling=(
+        (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, -1 / 1.68, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 1.0, 1 / 1.68, 0.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 0.0, 1.0, -1.0, 0.0),
+        (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0),
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    ),
+)
+
+
+def body_of(folder: Path, **emulation: object) -> Body:
+    return build_emulator(drives_config(folder, emulation={"seed": 3, **emulation})).body
+
+
+def test_gears_of_the_wam_are_those_of_its_tables() -> None:
+    gears = Gears(WAM, 7)
+    expected = np.zeros((7, 7))
+    expected[0, 0], expected[3, 3], expected[6, 6] = -42.0, -18.0, -14.93
+    expected[1, 1:3], expected[2, 1:3] = (28.25, -28.25 / 1.68), (-28.25, -28.25 / 1.68)
+    expected[4, 4:6], expected[5, 4:6] = (9.7, -9.7), (9.7, 9.7)
+    assert gears.matrix == pytest.approx(expected)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=14, max_size=14))
+def test_gears_lose_no_power(values: list[float]) -> None:
+    gears = Gears(WAM, 7)
+    speed, torque = np.array(values[:7]), np.array(values[7:])
+    at_motors = torque @ gears.motor_velocity(speed)
+    assert gears.joint_torque(torque) @ speed == pytest.approx(at_motors, abs=1e-9)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_at_the_nominal_period_it_is_the_simulated_arm_to_the_bit(tmp_path: Path, noise: float) -> None:
+    body = body_of(tmp_path, torque_noise=noise)
+    simulated = SimulatedDriver(kind="simulated", seed=3, torque_noise=noise)
+    machine = build_machine(load_arm("planar2").model_copy(update={"driver": simulated, "joints": {}}))
+    # Home is the same without the limits, which would clip what the simulated arm makes of a torque.
+    assert (machine.plant.position == body.plant.position).all()
+    machine.enable()
+    body.start(0)
+    random = np.random.default_rng(1)
+    for cycle in range(500):
+        at_motors = random.uniform(-0.5, 0.5, 2)
+        for motor, torque in zip(body.motors, at_motors.tolist(), strict=True):
+            motor.drive(torque, cycle * MS)
+        machine.cycle(body.gears.joint_torque(at_motors))
+        machine.advance()
+        body.advance((cycle + 1) * MS)
+        assert (machine.plant.position == body.plant.position).all()
+        assert (machine.plant.velocity == body.plant.velocity).all()
+    assert np.abs(body.plant.velocity).max() > 0.1
+
+
+def test_uneven_cycles_lead_to_nearly_the_same_place(tmp_path: Path) -> None:
+    ends = []
+    for divided in (False, True):
+        body = body_of(tmp_path)
+        body.start(0)
+        now = 0
+        for motor in body.motors:
+            motor.drive(0.1, 0)
+        random = np.random.default_rng(5)
+        while now < 300 * MS:
+            now = min(300 * MS, now + (round(random.uniform(0.2, 1.4) * MS) if divided else MS))
+            body.advance(now)
+        ends.append(body.plant.position)
+    assert np.abs(ends[0]).max() > 0.1
+    assert ends[1] == pytest.approx(ends[0], abs=2e-6)
+
+
+def test_a_long_silence_is_watched_in_steps(tmp_path: Path) -> None:
+    body, seen = body_of(tmp_path), []
+    body.watch = seen.append
+    body.start(0)
+    for motor in body.motors:
+        motor.drive(0.0, 0)
+    body.advance(10 * MS)
+    assert len(seen) >= 5
+    assert seen == sorted(seen)
+    assert max(np.diff([0, *seen, 10 * MS])) <= 1.5 * MS
+
+
+def test_nobody_falls_before_all_motors_have_power_and_some_torque(tmp_path: Path) -> None:
+    body = body_of(tmp_path)
+    start = body.plant.position
+    body.motors[0].drive(1.0, 0)
+    body.advance(100 * MS)
+    assert body.plant.position is start
+    body.motors[1].drive(0.0, 100 * MS)
+    body.motors[0].drive(0.0, 100 * MS)
+    body.advance(200 * MS)
+    assert body.plant.position is start
+    body.motors[0].drive(1e-3, 200 * MS)
+    body.advance(300 * MS)
+    assert (body.plant.position != start).any()
+
+
+@pytest.mark.parametrize("braked", [(0,), (1,), (0, 1)])
+def test_braking_takes_the_energy_that_motors_turn_into_heat(tmp_path: Path, braked: tuple[int, ...]) -> None:
+    body = body_of(tmp_path)
+    plant, gears = body.plant, body.gears
+    body.start(0)
+    for motor in body.motors:
+        motor.drive(0.05, 0)
+    body.advance(200 * MS)
+    for number, motor in enumerate(body.motors):
+        if number in braked:
+            motor.brake(200 * MS)
+        else:
+            motor.switch_off(200 * MS)
+    coefficients = np.array([m.braking if m.power is Power.BRAKE else 0.0 for m in body.motors])
+    body.advance(205 * MS)  # the step in which brakes close sees the acceleration before
+    for cycle in range(205, 400):
+        q0, v0 = plant.position, plant.velocity
+        body.advance((cycle + 1) * MS)
+        q, v, a = (q0 + plant.position) / 2, (v0 + plant.velocity) / 2, plant.acceleration
+        # What the true model needs beyond friction is what the brakes give, turned over the gears by power balance.
+        needed = plant.inverse_dynamics(q, v, a)
+        speed = gears.motor_velocity(v)
+        heat = coefficients @ speed**2
+        assert -needed @ v == pytest.approx(heat, rel=2e-3, abs=2e-3)
+
+
+def test_all_motors_together_brake_no_joint_less_than_asked(tmp_path: Path) -> None:
+    gears = Gears(WAM, 7)
+    asked = np.array([15.0, 15.0, 11.0, 7.0, 2.5, 2.5, 0.3])
+    felt = gears.joint_damping(gears.motor_damping(asked))
+    assert (np.diag(felt) >= asked - 1e-12).all()
+    assert np.linalg.eigvalsh(felt).min() > 0.0
+    one = gears.joint_damping(np.where(np.arange(7) == 1, gears.motor_damping(asked), 0.0))
+    assert one[1, 2] != 0.0
+
+
+def test_gears_of_another_arm_are_refused() -> None:
+    with pytest.raises(DriverError, match="7 ratios in transmission, but the arm has 6 joints"):
+        Gears(WAM, 6)
+
+
+def test_an_encoder_counts_motor_turns_from_the_zero_of_the_joints(tmp_path: Path) -> None:
+    gears = dict(GEARS, offsets=[0.3, -0.2])
+    absolute = build_emulator(drives_config(tmp_path, gears=gears)).body
+    expected = gears["ratios"] * (np.array(gears["coupling"]) @ (absolute.plant.position - [0.3, -0.2]))
+    counts = [motor.encoder(0) for motor in absolute.motors]
+    assert counts == np.rint(expected * 4096 / (2 * np.pi)).astype(int).tolist()
+    relative = build_emulator(drives_config(tmp_path, gears=gears, zero="at_home"))
+    relative.power_up(0)
+    assert [motor.encoder(0) for motor in relative.body.motors] == [0, 0]
+
+
+def test_a_late_host_finds_the_arm_moved_on_already(tmp_path: Path) -> None:
+    emulator = build_emulator(drives_config(tmp_path))
+    emulator.power_up(0)
+    body = emulator.body
+    emulator.go_on(100 * MS)
+    assert (body.overdue_ns, body.now_ns) == (None, 0)  # somebody holds it
+    for motor in body.motors:
+        motor.drive(0.5, 0)
+    body.advance(MS)
+    assert not body.supported
+    start = body.plant.position
+    emulator.go_on(MS + MS)  # a cycle that is in time needs nothing
+    assert body.plant.position is start
+    assert body.overdue_ns is not None
+    assert 2 * MS < body.overdue_ns <= MS + 1.5 * MS
+    emulator.go_on(body.overdue_ns)
+    assert (body.plant.position != start).any()

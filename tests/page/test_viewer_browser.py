@@ -1,0 +1,201 @@
+"""The arm in three dimensions, in a browser that draws by software, and in one without WebGL."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from daemon.conftest import commissioned as commissioned
+from daemon.conftest import quick_text
+from helpers.browser import chromium_program
+from page.conftest import Reached, listening, log_in
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
+
+from ident_service.operations.run_archive import import_run
+from ident_service.registry.arms import add_arm
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
+ARM = "quick"
+VENDORED = files("ident_service.daemon.web").joinpath("vendored")
+NO_WEBGL = """
+const asked = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+  return kind.startsWith("webgl") ? null : asked.call(this, kind, ...rest);
+};
+"""
+PIXELS = """
+async () => {
+  const canvas = document.getElementById("viewer-canvas");
+  canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "+" })); // draws; the frame lasts as long as this task
+  const shot = await createImageBitmap(canvas);
+  const flat = new OffscreenCanvas(shot.width, shot.height).getContext("2d");
+  flat.drawImage(shot, 0, 0);
+  const { data } = flat.getImageData(0, 0, shot.width, shot.height);
+  const seen = new Set();
+  const colour = (k) => (data[k] << 16) | (data[k + 1] << 8) | data[k + 2];
+  for (let k = 0; k < data.length; k += 4) if (data[k + 3]) seen.add(colour(k));
+  return seen.size;
+}
+"""
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory, commissioned: Path) -> Iterator[tuple[Browser, Reached, str]]:
+    """A browser that draws WebGL by software, a service with an arm, and a run of it."""
+    state = tmp_path_factory.mktemp("viewer") / "state"
+    switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with listening(state) as reached, sync_playwright() as playwright:
+        add_arm(reached.service.db, state, quick_text(ARM), {}, "test", replace=True)
+        import_run(reached.service.db, state, commissioned, "test")
+        browser = playwright.chromium.launch(executable_path=chromium_program(), args=switches)
+        yield browser, reached, commissioned.name
+        browser.close()
+
+
+@pytest.fixture
+def page(shown: tuple[Browser, Reached, str]) -> Iterator[Page]:
+    """A page of an operator on which nothing may be complained of."""
+    browser, reached, _ = shown
+    page = log_in(browser, reached)
+    said = list[str]()
+
+    def hear(message: ConsoleMessage) -> None:
+        # Chromium warns of its own slowness when pixels are read, and names the answer that a test refuses.
+        if message.type in ("error", "warning") and not any(one in message.text for one in ("GPU stall", "409")):
+            said.append(message.text)
+
+    page.on("console", hear)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    yield page
+    page.context.close()
+    assert said == []
+
+
+def drawn(page: Page) -> int:
+    """Draw once more and count the colours."""
+    return int(page.evaluate(PIXELS))
+
+
+def confirm_page(page: Page, reached: Reached) -> None:
+    """Ask for a run as the page of the arm does, whichever of its steps comes next."""
+    page.goto(f"{reached.url}/arms/{ARM}")
+    with page.expect_navigation():
+        page.evaluate(
+            """address => {
+              const form = document.createElement("form");
+              Object.assign(form, { method: "post", action: address });
+              form.innerHTML = '<input name="kind" value="run"><input name="speed" value="1">';
+              document.body.append(form);
+              form.submit();
+            }""",
+            f"/arms/{ARM}/confirm",
+        )
+    page.get_by_label("Type the arm's name").wait_for()
+
+
+def test_the_script_that_draws_is_what_its_document_says() -> None:
+    told = json.loads(VENDORED.joinpath("three.json").read_text())
+    assert (told["package"], told["licence"]) == ("three", "MIT")
+    for name, sha256 in told["sha256"].items():
+        assert hashlib.sha256(VENDORED.joinpath(name).read_bytes()).hexdigest() == sha256, name
+    assert set(told["sha256"]) == {"three.core.min.js", "three.module.min.js", "three.LICENSE.txt"}
+
+
+def test_a_motion_is_seen_before_it_is_made(shown: tuple[Browser, Reached, str], page: Page) -> None:
+    _, reached, _ = shown
+    confirm_page(page, reached)
+    page.locator("#viewer-controls").wait_for()
+    expect(page.get_by_label("Type the arm's name")).to_be_focused()  # the viewer takes nothing from the question
+    assert drawn(page) > 50
+    view = page.evaluate(f"fetch('/api/v1/arms/{ARM}/view?motion=own').then((answer) => answer.json())")
+    end, near = view["time"][-1], view["clearance"]["itself"]["distance"]
+    at = page.locator("#viewer-at")
+    expect(at).to_have_text(f"0.00 s of {end:.2f} s, approach")
+    expect(page.locator("#viewer-itself-least")).to_contain_text(f"{1000 * min(near):.0f} mm at ")
+    expect(page.locator("#viewer-itself")).to_contain_text(f"{1000 * near[0]:.0f} mm, ")
+    # The slider by keyboard, to the end.
+    page.locator("#viewer-time").press("End")
+    expect(at).to_have_text(f"{end:.2f} s of {end:.2f} s, return")
+    expect(page.locator("#viewer-itself")).to_contain_text(f"{1000 * near[-1]:.0f} mm, ")
+    play = page.get_by_role("button", name="Play")
+    play.click()  # from the beginning again
+    page.get_by_role("button", name="Pause").click()
+    now = float(at.inner_text().split()[0])
+    assert 0.0 < now < end
+    expect(play).to_have_attribute("aria-pressed", "false")
+    # The nearest pair of bodies has a colour of its own.
+    page.locator("#viewer-canvas").press("ArrowLeft")
+    assert drawn(page) > 50
+
+
+def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], page: Page) -> None:
+    _, reached, run = shown
+    page.goto(f"{reached.url}/runs/{run}")
+    page.locator("#viewer-controls").wait_for()
+    assert drawn(page) > 50
+    view = page.evaluate(f"fetch('/api/v1/runs/{run}/view').then((answer) => answer.json())")
+    expect(page.locator("#viewer-at")).to_have_text(f"0.00 s of {view['time'][-1]:.2f} s")
+    path = page.locator("#viewer-clearance .itself").get_attribute("d")
+    assert path is not None
+    assert path.count("L") == len(view["clearance"]["samples"]) - 1
+
+
+def test_the_browser_places_joints_as_the_service_does(shown: tuple[Browser, Reached, str], page: Page) -> None:
+    """The pictures' kinematics against those that identification uses, on the arm with the most joints."""
+    from ident_service.config.load import load_arm
+    from ident_service.model.arm_model import arm_model
+    from ident_service.model.kinematics import joint_frames
+
+    _, reached, _ = shown
+    model = arm_model(load_arm("wam7_sim"))
+    confirm_page(page, reached)
+    page.evaluate("document.getElementById('viewer').dataset.source = '/api/v1/arms/wam7_sim/view?motion=own'")
+    source = page.evaluate("[...document.scripts].find((one) => one.src.endsWith('viewer.js')).src")
+    text = page.evaluate(f"fetch('{source}').then((answer) => answer.text())")
+    body = text.replace("./three.module.min.js", source.replace("viewer.js", "three.module.min.js"))
+    assert "export" not in body
+    # The same script as a module that hands out its class.
+    page.route(
+        "**/placed.js", lambda route: route.fulfill(body=f"{body}\nexport {{ Arm }};", content_type="text/javascript")
+    )
+    position = np.linspace(-0.7, 0.9, 7).tolist()
+    found = page.evaluate(
+        """async ([address, position]) => {
+          const { Arm } = await import(address);
+          const view = await (await fetch(document.getElementById("viewer").dataset.source)).json();
+          const arm = new Arm(view.figure);
+          arm.pose(position);
+          return arm.joints.map((joint) => joint.frame.matrixWorld.toArray());
+        }""",
+        [source.replace("viewer.js", "placed.js"), position],
+    )
+    turns, places = joint_frames(model.chain, np.array([position]))
+    for k, entries in enumerate(found):
+        matrix = np.array(entries).reshape(4, 4).T
+        np.testing.assert_allclose(matrix[:3, :3], turns[0, k], atol=1e-4)
+        np.testing.assert_allclose(matrix[:3, 3], places[0, k], atol=1e-4)
+
+
+def test_without_webgl_times_and_distances_stay(shown: tuple[Browser, Reached, str], page: Page) -> None:
+    _, reached, _ = shown
+    page.add_init_script(NO_WEBGL)
+    confirm_page(page, reached)
+    page.locator("#viewer-controls").wait_for()
+    expect(page.locator("#viewer-missing")).to_contain_text("has no WebGL")
+    expect(page.locator("#viewer-canvas")).to_be_hidden()
+    page.locator("#viewer-time").press("End")
+    expect(page.locator("#viewer-at")).to_contain_text("return")
+    expect(page.locator("#viewer-itself")).to_contain_text(" mm, ")
+
+
+def test_what_cannot_be_shown_is_said(shown: tuple[Browser, Reached, str], page: Page) -> None:
+    _, reached, _ = shown
+    page.route("**/view?motion=own*", lambda route: route.fulfill(status=409, json={"error": {"message": "no limits"}}))
+    confirm_page(page, reached)
+    expect(page.locator("#viewer-status")).to_have_text("The arm cannot be shown: no limits")
+    expect(page.locator("#viewer-controls")).to_be_hidden()
