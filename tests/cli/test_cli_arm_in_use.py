@@ -33,9 +33,9 @@ def test_a_run_of_an_arm_that_another_process_has_leaves_no_folder(ident: Ident,
     state.mkdir(mode=0o700)
     write_checked_ticket(load_arm("planar2"), state)
     with ControlFile.take(control_path(state, "planar2"), None) as mover:
-        ended = ident("run", "planar2")
+        pid, ended = mover.pid, ident("run", "planar2")
     assert ended.code == 1
-    assert f"in use by process {mover.pid}" in ended.err
+    assert f"in use by process {pid}" in ended.err
     assert "recording" not in ended.err
     assert not (state / "runs").exists() or not list((state / "runs").iterdir())
 
