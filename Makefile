@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	docs docs-figures mutants test-socketcan test-foreign test-latest lock screenshots clean
+	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -54,6 +54,13 @@ docs: $(READY)
 docs-figures: $(READY)
 	$(BIN)/python tools/docs_figures.py
 
+docs-pictures: $(READY)
+	$(BIN)/python tools/docs_pictures.py
+
+# What a newcomer does, in a clean clone, by the documents' own commands.
+walk: $(READY)
+	$(BIN)/python tests/documents/walk.py --clean README.md $(addprefix docs/,tutorial.md your-own-arm.md identify-recordings.md)
+
 bench: $(READY)
 	$(BIN)/python -m benchmarks
 
@@ -81,9 +88,9 @@ bench-realtime: $(READY)
 bench-peers: $(READY)
 	$(BIN)/python -m benchmarks.peers
 
-# Two hundred recordings of twenty arms, on one and two processes.
+# Two hundred recordings of twenty arms, on one and two processes: make bench-fleet FLEET="--data FOLDER" keeps them.
 bench-fleet: $(READY)
-	$(BIN)/python -m benchmarks.fleet
+	$(BIN)/python -m benchmarks.fleet $(FLEET)
 
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
 campaign: test-socketcan

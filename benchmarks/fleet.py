@@ -1,12 +1,14 @@
 """Fleets: recordings a second on one and two processes, a second call, the merge, the scheduler's cost per task.
 
-`python -m benchmarks.fleet`, half an hour with the data, which are made once: 200 recordings of 60 s at 1 kHz, seven
-joints, of 20 simulated arms, in `IDENT_BENCH_FLEET` (default: a temporary folder). `IDENT_BENCH_FLEET_ARMS` takes fewer
-arms. Making the data is not counted; starting the workers is.
+`python -m benchmarks.fleet --data FOLDER`: 200 recordings of 60 s at 1 kHz, seven joints, of 20 simulated arms, 2.8 GB.
+They are made in FOLDER (default: a temporary one) unless they are there, so that a call that was ended goes on. On an
+idle machine of two cores that takes four minutes, and the rest eight. `--arms` takes fewer arms. Making the data is not
+counted; starting the workers is.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import sys
@@ -22,6 +24,7 @@ from distributed import Client
 from benchmarks.harness import Row, table, write
 from ident_service import __version__
 from ident_service.fleet.factor import (
+    AT_ONCE,
     FACTORS,
     FAN_IN,
     Described,
@@ -37,7 +40,6 @@ from ident_service.fleet.storage import Store, find
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-ARMS = int(os.environ.get("IDENT_BENCH_FLEET_ARMS", "20"))
 EACH, RATE, SECONDS, ARM = 10, 1000.0, 60.0, "wam7_sim"
 NEW = 0.05
 TASKS, STORED = 10_000, 10_000
@@ -54,11 +56,15 @@ def make(folder: Path, arm: int, number: int) -> None:
         write_recording(of, path, of.individual(arm), seed=1000 * arm + number, at=BEGIN + number * WEEK)
 
 
-def recordings(folder: Path) -> None:
+def recordings(folder: Path, arms: int) -> None:
+    """Make the recordings that are not there."""
+    begin, there = time.perf_counter(), len(list(folder.glob("*/*.mcap")))
     with ProcessPoolExecutor(os.cpu_count()) as pool:
-        made = [pool.submit(make, folder, arm, number) for arm in range(ARMS) for number in range(EACH)]
-        for one in made:
+        made = [pool.submit(make, folder, arm, number) for arm in range(arms) for number in range(EACH)]
+        for count, one in enumerate(made, 1):
             one.result()
+            if count > there and count % EACH == 0:
+                print(f"  {time.perf_counter() - begin:6.1f} s  {count} of {len(made)} recordings made", flush=True)
 
 
 def whole(folder: Path, place: Path, store: str, workers: int) -> tuple[float, int, Any]:
@@ -105,19 +111,19 @@ def merging(store: Store, result: Any) -> tuple[float, float]:
     own = [one.row.key for one in result.reduced.arms["arm00"]]
     many = Store(f"{store.url}-many")
     size = 0.0
-    for number in range(STORED):
-        content = store.read(f"{FACTORS}/{own[number % len(own)]}.npz")
-        if content is None:
-            raise FileNotFoundError(own[0])
-        size = float(len(content))
-        many.write(f"{FACTORS}/{number:05}.npz", content)
+    place = Path(many.url, FACTORS)
+    place.mkdir(parents=True)
+    for number in range(STORED):  # links, for 10,000 copies are 4.6 GB
+        factor = Path(store.url, FACTORS, f"{own[number % len(own)]}.npz")
+        size = float(factor.stat().st_size)
+        (place / f"{number:05}.npz").hardlink_to(factor)
     request = FleetRequest(ARM, (), many.url, workers=2)
     with connected(request, lambda _: None) as client:
         begin = time.perf_counter()
         keys = [f"{number:05}" for number in range(STORED)]
         level = [
-            client.submit(merge_stored, keys[k : k + FAN_IN], described, many, True, pure=False)
-            for k in range(0, len(keys), FAN_IN)
+            client.submit(merge_stored, keys[k : k + AT_ONCE], described, many, True, pure=False)
+            for k in range(0, len(keys), AT_ONCE)
         ]
         while len(level) > 1:
             level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
@@ -141,10 +147,10 @@ def overhead(client: Client) -> float:
     return (time.perf_counter() - begin) / TASKS
 
 
-def measure(folder: Path, place: Path) -> list[Row]:
+def measure(folder: Path, place: Path, arms: int) -> list[Row]:
     """All figures."""
-    recordings(folder)
-    total = ARMS * EACH
+    recordings(folder, arms)
+    total = arms * EACH
     load = os.getloadavg()[0]
     two, computed, result = whole(folder, place / "out2", str(place / "store2"), 2)
     one, _, _ = whole(folder, place / "out1", str(place / "store1"), 1)
@@ -154,7 +160,7 @@ def measure(folder: Path, place: Path) -> list[Row]:
     merged, size = merging(Store(store), result)
     with connected(FleetRequest(ARM, (), store, workers=2), lambda _: None) as client:
         per_task = overhead(client)
-    label = f"{total} recordings of {SECONDS:g} s, 7 joints, {ARMS} arms"
+    label = f"{total} recordings of {SECONDS:g} s, 7 joints, {arms} arms"
     return [
         Row(f"{label}: two processes", computed / two, "1/s", ">= 2.5"),
         Row(f"{label}: one process", total / one, "1/s"),
@@ -186,10 +192,12 @@ def _again(folder: Path, place: Path, total: int) -> tuple[float, str]:
 
 def main() -> None:
     """Measure, print and write."""
-    with tempfile.TemporaryDirectory(prefix="ident-bench-") as temporary:
-        place = Path(temporary)
-        folder = Path(os.environ.get("IDENT_BENCH_FLEET", temporary)) / "recordings"
-        rows = measure(folder, place)
+    parser = argparse.ArgumentParser(prog="benchmarks.fleet", description=__doc__)
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="where recordings are made, and found again")
+    parser.add_argument("--arms", type=int, default=20, metavar="N")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="ident-bench-", dir=given.data and given.data.parent) as temporary:
+        rows = measure(given.data or Path(temporary, "recordings"), Path(temporary), given.arms)
     print(table(rows))
     print(f"written to {write(rows, Path(__file__).parent / 'results', 'fleet')}")
 

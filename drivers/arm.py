@@ -99,6 +99,8 @@ class Sample:
             between the request and its stamp; else 0.
         torque_difference: by how much the drives' last reports exceed the torque they were told [N m or N], shape
             (joints,), less what a healthy drive may deviate; None where nothing is to be compared.
+        joint_position: by encoders behind the transmission, which have the motors' positions where the arm was opened
+            [rad or m], shape (joints,), NaN for joints without one; None for an arm without any.
     """
 
     cycle: int
@@ -116,6 +118,7 @@ class Sample:
     measured_torque: Vector | None = None
     torque_difference: Vector | None = None
     stamp_doubt_ns: int = 0
+    joint_position: Vector | None = None
 
 
 @dataclass(frozen=True)

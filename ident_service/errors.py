@@ -38,7 +38,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 
 class IdentError(Exception):
@@ -105,6 +105,46 @@ class Problem:
 
     def __str__(self) -> str:
         return f"{self.path}:{self.line}:{self.column}: {self.message}"
+
+
+# By what begins a pattern: the form that it asks for, in words.
+_FORMS: tuple[tuple[str, str], ...] = (
+    (
+        "^[A-Za-z0-9][A-Za-z0-9_.-]",
+        "a name: letters, digits, '_', '.' and '-', of which the first is a letter or digit",
+    ),
+    (
+        "^[a-z0-9][a-z0-9_.-]",
+        "a name: small letters, digits, '_', '.' and '-', of which the first is a letter or digit",
+    ),
+    ("^[A-Za-z0-9_.-]", "a name: letters, digits, '_', '.' and '-'"),
+    (r"^[A-Za-z_]\w*", "a module and its function, as in my_constraints:bodies"),
+    ("^(t|(q|dq|tau)", "t, or q, dq or tau with the number of a joint, as in q1"),
+    ("^[0-9A-F]{4}:", "an object of the drive and its type, as in 6077:0/i16"),
+    (r"^[\x21-\x7e]+", "a word of printable ASCII characters"),
+    ("^[0-9a-f]{64}", "a SHA-256 of 64 hexadecimal digits"),
+)
+
+
+def plain_mistake(mistake: Mapping[str, Any]) -> str:
+    """Return the message of one mistake that pydantic found, without the pattern of a text, which is for programs.
+
+    Args:
+        mistake: of `ValidationError.errors()`: `type`, `msg`, `input` and `ctx`.
+    """
+    if mistake["type"] != "string_pattern_mismatch":
+        return str(mistake["msg"]).removeprefix("Value error, ")
+    pattern = str(mistake.get("ctx", {}).get("pattern", ""))
+    form = next((words for start, words in _FORMS if pattern.startswith(start)), "of the form that is needed here")
+    long = f", and at most {most} characters" if (most := _most_characters(pattern)) else ""
+    return f"{str(mistake.get('input'))[:60]!r} is not {form}{long}"
+
+
+def _most_characters(pattern: str) -> int:
+    """Return how long a name may be that a pattern of one repeated set of characters describes; 0 for others."""
+    repeated = pattern.rpartition("{")[2].removesuffix("}$")
+    least, _, most = repeated.partition(",")
+    return int(most) + (1 - int(least) if least == "0" else 0) if least.isdigit() and most.isdigit() else 0
 
 
 class ConfigError(IdentError, ValueError):

@@ -20,6 +20,7 @@ from ident_service.daemon.app import create_app
 from ident_service.daemon.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
+ELSEWHERE = re.compile(r'<(?:script|img|iframe|link)\b[^>]*?(?:src|href)="(?:https?:)?//[^"]*')
 PLACE = re.compile(r"<!-- made: ([a-z-]+) -->")
 
 
@@ -30,6 +31,17 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         KeyError: nothing of that name is made here.
     """
     return PLACE.sub(lambda place: MADE[place[1]](), markdown)
+
+
+def on_post_page(output: str, **_: Any) -> str:
+    """Refuse a page that a browser would load something for from elsewhere.
+
+    Raises:
+        ValueError: it does; the site is read where there is no network.
+    """
+    if found := ELSEWHERE.search(output):
+        raise ValueError(f"the page loads from a network: {found[0]}")
+    return output
 
 
 def command_line() -> str:

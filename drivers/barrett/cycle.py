@@ -69,6 +69,7 @@ class MotorPuck:
     Attributes:
         node: its number.
         position: of the last answer [counts], as a signed number of 22 bits.
+        encoder: of the last answer, the joint encoder's position [counts], likewise; None where it has told none.
         answered: in this cycle.
         age: cycles since it answered, 0 in a cycle in which it did.
         mode: MODE; None while unknown.
@@ -78,6 +79,7 @@ class MotorPuck:
 
     node: int
     position: int = 0
+    encoder: int | None = None
     answered: bool = False
     age: int = 0
     mode: int | None = None
@@ -217,7 +219,7 @@ class PuckCodec:
             words = "a second position in one cycle" if self._open else "its position came after its cycle"
             self._tell(EventCode.DUPLICATE if self._open else EventCode.LATE, puck.node, words)
         else:
-            puck.position, puck.answered, puck.age = answer.counts, True, 0
+            puck.position, puck.encoder, puck.answered, puck.age = answer.counts, answer.encoder, True, 0
             self._missing -= 1
 
     def _on_reply(self, answer: Reply) -> None:

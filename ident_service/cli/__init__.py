@@ -63,7 +63,7 @@ __all__ = ["DONE", "FAILED", "FAULTED", "PERSON_NEEDED", "USAGE", "VERDICT_NO", 
 
 GROUPS = (
     *(identification_commands, planning_commands, motion_commands, recovery_commands, archive_commands),
-    *(maintenance_commands, daemon_commands, remote, completion),
+    *(maintenance_commands, daemon_commands, remote),
 )
 # One rule for all verbs: USAGE when what was given cannot be used, be it words, a description or any other file; FAILED
 # when it was understood and came to nothing.

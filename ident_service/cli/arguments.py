@@ -39,7 +39,7 @@ LOCAL_ONLY: dict[str, str] = {
     "schema": "it is the same for every machine of this version",
     "completion": "it is for the shell that it is typed into",
     "doctor": "it looks at the computer that it runs on; log in where the daemon runs",
-    **dict.fromkeys(("fleet identify", "fleet status"), "recordings of many arms are read where they are, not sent"),
+    "fleet status": "its store is in the daemon's state folder; log in where the daemon runs",
     "emulate": "it is drives on a bus of this machine, until they are switched off",
     "driver test": "it may energise an arm that you must stand beside; log in where the daemon runs",
     "new": "it writes files beside yours; `ident config check --server` sends what it wrote",

@@ -9,45 +9,37 @@ from __future__ import annotations
 
 import argparse
 import os
-import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.arguments import Parser, VerbList
-from ident_service.cli.output import DONE, Answer, state_folder
+from ident_service.cli.arguments import Parser
+from ident_service.cli.output import state_folder
 from ident_service.errors import IdentError, UsageError
 
 VARIABLE = "_ARGCOMPLETE"
 """Environment variable by which a shell asks for completions."""
-_SHELLS = ("bash", "zsh", "fish")
+SHELLS = ("bash", "zsh", "fish")
 _MOST = 50  # names offered, the newest first
 _JOBS, _UPLOADED = "SELECT id FROM jobs ORDER BY number DESC LIMIT 50", "SELECT name FROM arms"
 
 
-def add(verbs: VerbList) -> None:
-    """Register `completion`."""
-    sub = verbs.add(
-        "completion",
-        _completion,
-        "print or install completion for bash, zsh or fish",
-        more='For one shell: `eval "$(ident completion bash)"`, and `ident completion fish | source`.',
-        examples=("bash", "zsh", "fish --install"),
-    )
-    sub.add_argument("shell", choices=_SHELLS)
-    sub.add_argument("--install", action="store_true", help="write it where the shell looks for it (bash, fish)")
+def install_completion(shell: str, *, install: bool) -> tuple[str, Path | None]:
+    """Return the script by which a shell completes `ident`, and where it was written if that was asked for.
 
+    Args:
+        shell: `bash`, `zsh` or `fish`.
+        install: whether to write it where the shell looks for it.
 
-def _completion(arguments: argparse.Namespace) -> Answer:
-    try:
-        from argcomplete.shell_integration import shellcode
-    except ImportError:
-        raise UsageError("argcomplete is not installed; pip install argcomplete") from None
-    shell = arguments.shell
+    Raises:
+        UsageError: zsh looks into no folder of its own.
+    """
+    from argcomplete.shell_integration import shellcode
+
     script = str(shellcode(["ident"], use_defaults=False, shell=shell))
-    if not arguments.install:
-        return DONE, script, {}
+    if not install:
+        return script, None
     if shell == "zsh":
         raise UsageError('zsh has no such folder of its own; add this line to ~/.zshrc: eval "$(ident completion zsh)"')
     data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
@@ -56,7 +48,7 @@ def _completion(arguments: argparse.Namespace) -> Answer:
     path = Path(place).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(script, encoding="utf-8")
-    return DONE, f"{path}: written; a new {shell} completes `ident`\n", {}
+    return script, path
 
 
 def complete(top: Parser) -> None:
@@ -101,6 +93,8 @@ def _completer(parser: Parser, action: argparse.Action) -> Any:
 
 
 def _found(names: Callable[[Path, Any, argparse.Namespace], list[str]], parsed: argparse.Namespace) -> list[str]:
+    import sqlite3
+
     for key in ("state", "server", "word", "arm"):
         setattr(parsed, key, getattr(parsed, key, None))
     try:
@@ -154,6 +148,8 @@ def _folders(place: Path) -> list[str]:
 
 def _rows(state: Path, query: str) -> list[str]:
     """Read one column of the registry; none where there is no registry, or where it is locked."""
+    import sqlite3
+
     from ident_service.registry.database import FILE
 
     path = (state / FILE).absolute()

@@ -1,4 +1,4 @@
-"""Register and run the verbs about the daemon: `serve`, and `tokens` for its access tokens."""
+"""Register and run the verbs about the daemon, `serve` and `tokens`, and `completion`, about the shell."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
+from ident_service.cli.completion import SHELLS, install_completion
 from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 
 _PORT = 8470
 
 
 def add(verbs: VerbList) -> None:
-    """Register `serve`, `tokens`, `tokens add` and `tokens revoke`."""
+    """Register `serve`, `tokens`, `tokens add`, `tokens revoke` and `completion`."""
     sub = verbs.add(
         "serve",
         _serve,
@@ -58,6 +59,21 @@ def add(verbs: VerbList) -> None:
     )
     sub.add_argument("name", metavar="NAME")
     add_by(sub)
+    sub = verbs.add(
+        "completion",
+        _completion,
+        "print or install completion for bash, zsh or fish",
+        more='For one shell: `eval "$(ident completion bash)"`, and in zsh; fish: `ident completion fish | source`.',
+        examples=("bash", "zsh", "fish --install"),
+    )
+    sub.add_argument("shell", choices=SHELLS)
+    sub.add_argument("--install", action="store_true", help="write it where the shell looks for it (bash, fish)")
+
+
+def _completion(arguments: argparse.Namespace) -> Answer:
+    script, path = install_completion(arguments.shell, install=arguments.install)
+    text = script if path is None else f"{path}: written; a new {arguments.shell} completes `ident`\n"
+    return DONE, text, {}
 
 
 def _serve(arguments: argparse.Namespace) -> Answer:

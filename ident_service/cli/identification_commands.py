@@ -7,7 +7,7 @@ import atexit
 import gc
 import importlib.util
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -279,7 +279,7 @@ def _add_fleet(verbs: VerbList) -> None:
         "patterns",
         nargs="+",
         metavar="PATTERN",
-        help="files, folders or globs; also as URLs: s3://, gs://, sftp:// ...",
+        help="files, folders, globs, or such URLs: s3://, gs://, sftp://; with --server: names of its arms",
     )
     _fleet_options(sub)
     sub.add_argument(
@@ -344,14 +344,47 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
         settle_again=arguments.settle_again,
     )
     from ident_service.fleet.identify import identify_fleet
-    from ident_service.fleet.results import fleet_text
+    from ident_service.fleet.results import FLEET, PAGE, TABLE
 
     config = load_arm(arguments.arm)
     arm_model(config)  # what cannot be used is told before workers start
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name, "fleets")
     result = identify_fleet(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     good = not result.document["left_out"] and not result.changed
-    return (DONE if good else VERDICT_NO), fleet_text(result), {"folder": str(folder), **result.document}
+    files = [f"files: {folder}", f"  {PAGE}, {FLEET}, {TABLE}, arms/*/parameters.json", ""]
+    text = "\n".join([*fleet_lines(result.document), *files])
+    return (DONE if good else VERDICT_NO), text, {"folder": str(folder), **result.document}
+
+
+def fleet_lines(document: Mapping[str, Any]) -> list[str]:
+    """Return what was found, for a terminal, from the content of `fleet.json`."""
+    lines = [
+        f"{document['recordings']} recordings of {len(document['arms'])} arms, {len(document['left_out'])} left out"
+    ]
+    lines += [f"  left out: {one['url']}{one['piece']}: {one['message']}" for one in document["left_out"]]
+    for key, words in (("several_recordings", "as recorded"), ("one_recording", "with one recording each")):
+        held = document["held_out"][key]
+        if held["arms"]:
+            helps = "pooled" if held["pooling_helps"] else "each arm alone"
+            lines.append(
+                f"torque error on held-out recordings, {words}: {held['alone_percent']:.3g} % alone,"
+                f" {held['pooled_percent']:.3g} % pooled ({-100.0 * held['gain']:+.0f} %): {helps}"
+            )
+    differing = {arm: document["arms"][arm]["differs"] for arm in document["ranking"]}
+    lines.append(f"unlike the others: {', '.join(arm for arm, found in differing.items() if found) or 'no arm'}")
+    lines += [
+        f"  {arm}: {one['what']}, {one['sigma']:.1f} sigma, {one['torque_share']:.1%} of {one['joint']}"
+        for arm, found in differing.items()
+        for one in found
+    ]
+    lines.append(f"changed: {', '.join(dict.fromkeys(one['arm'] for one in document['changes'])) or 'no arm'}")
+    lines += [
+        f"  {one['arm']}: {one['what']}{' drifts' if one['kind'] == 'drift' else ''} between {one['after'][:10]} and "
+        f"{one['until'][:10]}, {one['sigma']:.1f} sigma"
+        for one in document["changes"]
+    ]
+    lines += [f"  alarm: {one['arm']}: {one['what']}" for one in document.get("alarms", [])]
+    return lines
 
 
 def _fleet_status(arguments: argparse.Namespace) -> Answer:

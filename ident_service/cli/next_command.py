@@ -302,6 +302,11 @@ _FOLLOWS: dict[str, Follows] = {
     **dict.fromkeys(("home", "set-home"), _homed),
     **dict.fromkeys(("simulate", "identify"), _identified),
     "report": lambda ended: ["export", ended.run],
+    "view": lambda ended: (
+        ["report", ended.short(ended.given.run)]
+        if ended.said["residuals"]
+        else ["identify", ended.short(ended.given.run), "--arm", str(ended.given.run / "arm.json")]
+    ),
     "figures": lambda ended: ["report", ended.short(ended.given.run)],
     "export": lambda ended: ["report", ended.short(ended.given.run)],
     "compare": _compared,
@@ -336,5 +341,5 @@ _FOLLOWS: dict[str, Follows] = {
     "restore": _of("serve"),
 }
 
-WITHOUT = frozenset({"serve", "completion", "tokens add"})
+WITHOUT = frozenset({"serve", "completion", "schema", "tokens add"})
 """Verbs after which no line follows: their output is for a program, or they end when everything does."""

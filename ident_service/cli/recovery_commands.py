@@ -17,6 +17,7 @@ from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
 from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
+from ident_service.cli.next_command import command
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -129,11 +130,12 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)
     write_audit_entry(arguments, "home", config.name, reached=[config.name])
+    supported = command(arguments, ["supported", arguments.arm])
     document = {"arm": config.name, "asked": "home", "pid": pid, "ended": stage.name.lower()}
     if stage is Homing.ENDED and not stopped:
-        return DONE, f"{config.name}: at home; held there until `ident supported {arguments.arm}`\n", document
+        return DONE, f"{config.name}: at home; held there until `{supported}`\n", document
     why = "see the events of its run" if stage is Homing.REFUSED else "it was stopped"
-    held = f"it is still held: support it, then `ident supported {arguments.arm}`" if in_use(path) else "it is not held"
+    held = f"it is still held: support it, then `{supported}`" if in_use(path) else "it is not held"
     return FAILED, f"{config.name}: not moved home, {why}; {held}\n", document
 
 

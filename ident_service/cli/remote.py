@@ -94,9 +94,9 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
 
 def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
     """Return the verbs that a daemon can do, and for each the arguments that are sent to it."""
-    from ident_service.cli import remote_maintenance, remote_results, remote_watching
+    from ident_service.cli import remote_results, remote_watching
 
-    groups = (remote_maintenance, remote_results, remote_watching)
+    groups = (remote_results, remote_watching)
     verbs, carried = dict(REMOTE), dict(_CARRIED)
     for group in groups:
         verbs |= group.VERBS

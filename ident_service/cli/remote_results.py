@@ -1,4 +1,4 @@
-"""Run the verbs about results, parameters, acceptances and tokens on a daemon (`--server`).
+"""Run the verbs about results, acceptances, lists, maintenance and tokens on a daemon (`--server`).
 
 Files that a daemon makes stay there, as exports; `--out` fetches them.
 """
@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import argparse
 import re
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from ident_service.cli.archive_commands import (
     arm_line,
@@ -19,9 +22,11 @@ from ident_service.cli.archive_commands import (
     runs_text,
 )
 from ident_service.cli.daemon_commands import token_line
-from ident_service.cli.identification_commands import accepted_name
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, with_answer_lines
-from ident_service.cli.remote import Verb, job_verb, word_of_address
+from ident_service.cli.identification_commands import accepted_name, fleet_lines
+from ident_service.cli.maintenance_commands import alarm_lines, due_line, schedule_line
+from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
+from ident_service.cli.recovery_commands import EXIT_CODES
+from ident_service.cli.remote import Verb, confirmation, job_verb, motion_id, word_of_address
 from ident_service.cli.remote_recordings import recording
 from ident_service.errors import ArmError, UsageError
 
@@ -29,6 +34,7 @@ if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 _API = "/api/v1"
+_LOOK = 0.4  # s between looks, and between renewals of the lease
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that cannot lead out of the folder it is written into
 
 
@@ -76,11 +82,30 @@ def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
     return {**run, "recordings": recordings, "refit_offsets": arguments.refit_offsets}
 
 
+def _fleet(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the request of a fleet, whose recordings are those that the daemon has of the arms named."""
+    asked = {"kind": "fleet", "arm": arguments.arm, "arms": arguments.patterns}
+    return {**asked, "settle_again": True if arguments.settle_again else None}
+
+
+def _of_fleet(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """Tell what was found as at the daemon's machine, then download the page, the table and the document."""
+    code, text, document = answer
+    found = document["answer"]
+    if "arms" in found:
+        text += "\n".join([*fleet_lines(found), ""])
+    return _fetched_files(client, arguments, (code, text, document))
+
+
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """Download the files of an export, where `--out` was given."""
+    """Download the files of an export, where `--out` was given, after its answer's lines."""
+    return _fetched_files(client, arguments, with_answer_lines(client, arguments, answer))
+
+
+def _fetched_files(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     from ident_service.results.manifest import atomic_folder
 
-    code, text, document = with_answer_lines(client, arguments, answer)
+    code, text, document = answer
     if code not in (DONE, VERDICT_NO):
         return code, text, document
     if document["job"]["run"] is None:  # refused before anything was written
@@ -184,10 +209,106 @@ def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return DONE, f"{arguments.name}: revoked\n", row
 
 
+def _of_arm(arguments: argparse.Namespace, path: str) -> str:
+    return f"{_API}/{path}" + (f"?arm={quote(arguments.arm, safe='')}" if arguments.arm is not None else "")
+
+
+def _add_schedule(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    body = {
+        "arm": arguments.arm,
+        "cron": arguments.cron,
+        "hours": arguments.hours,
+        "maintenance": arguments.maintenance,
+        "motion": arguments.motion,
+    }
+    row = client.post(f"{_API}/schedules", body)
+    return DONE, schedule_line(row), row
+
+
+def _schedules(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    rows = client.get(_of_arm(arguments, "schedules"))
+    return DONE, "".join(map(schedule_line, rows)) or "nothing is scheduled\n", {"schedules": rows}
+
+
+def _remove_schedule(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    client.ask("DELETE", f"{_API}/schedules/{arguments.number}")
+    return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
+
+
+def _enabled(enabled: bool) -> Callable[[IdentClient, argparse.Namespace], Answer]:
+    def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+        row = client.post(f"{_API}/schedules/{arguments.number}/enabled", {"enabled": enabled})
+        return DONE, schedule_line(row), row
+
+    return verb
+
+
+def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    body = {"what": arguments.what, "note": arguments.note}
+    row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
+    due = _pending(client, arguments)
+    text = f"{arguments.arm}: recorded: {row['what']}\n" + "".join(map(due_line, due))
+    return DONE, text, {**row, "due": due}
+
+
+def _due(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    rows = _pending(client, arguments)
+    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
+
+
+def _pending(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    rows = client.get(_of_arm(arguments, "due"))
+    arms = {row["arm"] for row in rows}
+    accepted = {arm for arm in arms if client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")}
+    return [{**row, "accepted": row["arm"] in accepted} for row in rows]
+
+
+def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    client.post(f"{_API}/due/{arguments.number}/dismiss", {"note": arguments.note})
+    return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
+
+
+def _alarms(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    rows = client.get(_of_arm(arguments, "alarms"))
+    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": rows}
+
+
+def _acknowledge_alarm(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    row = client.post(f"{_API}/alarms/{arguments.number}/ack", {"note": arguments.note})
+    return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", row
+
+
+def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+    """Begin a re-identification, renew its lease until it ends, and report it; Ctrl-C stops the arm."""
+    body = {
+        "arm": arguments.arm,
+        "motion": motion_id(client, arguments.arm, arguments.motion),
+        "confirm": confirmation(client, arguments),
+    }
+    row: dict[str, Any] = client.post(f"{_API}/reidentifications", body)
+    path, step, stopping, stopped = f"{_API}/reidentifications/{row['id']}", "", StopOnSignal(), False
+    with stopping:
+        while row["state"] == "running":
+            if row["step"] != step:
+                step = row["step"]
+                tell(arguments, f"-- {step}")
+            if stopping.requested():
+                if not stopped:
+                    client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/stop")
+                stopped = True
+            else:
+                client.post(f"{path}/lease")
+            time.sleep(_LOOK)
+            row = client.get(path)
+    text = f"{row['arm']}: {row['detail'] or row['state']}\n" + (f"run {row['run']}\n" if row["run"] else "")
+    return EXIT_CODES.get(row["state"], FAILED), text, row
+
+
 _DELETES = ("runs delete", "motions delete", "arms delete")
 VERBS: dict[str, Verb] = {
     "report": job_verb(_run, _reported),
     "export": job_verb(_export, _fetched),
+    "fleet identify": job_verb(_fleet, _of_fleet),
     "figures": job_verb(_figures, _fetched),
     "payload": job_verb(_payload, _fetched),
     "compare": job_verb(_compare, with_answer_lines),
@@ -203,11 +324,24 @@ VERBS: dict[str, Verb] = {
     "motions": _motions,
     "tokens": _tokens,
     "tokens revoke": _revoke,
+    "schedules add": _add_schedule,
+    "schedules": _schedules,
+    "schedules remove": _remove_schedule,
+    "schedules enable": _enabled(True),
+    "schedules disable": _enabled(False),
+    "maintenance": _maintenance,
+    "due": _due,
+    "due dismiss": _dismiss,
+    "alarms": _alarms,
+    "alarms acknowledge": _acknowledge_alarm,
+    "reidentify": _reidentify,
 }
 _FILE = frozenset({"file", "feasible_set", "arm"})
+_NUMBER = frozenset({"number"})
 CARRIED: dict[str, frozenset[str]] = {
     "report": frozenset({"run", "out"}),
     **dict.fromkeys(("export", "figures"), frozenset({"run", "format", "out"})),
+    "fleet identify": frozenset({"patterns", "arm", "settle_again", "out"}),
     "payload": frozenset({"run", "recordings", "refit_offsets", "out"}),
     "compare": frozenset({"reference", "others"}),
     "verify": frozenset({"file", "arm"}),
@@ -221,5 +355,11 @@ CARRIED: dict[str, frozenset[str]] = {
     **dict.fromkeys(("runs", "motions"), frozenset({"arm", "most"})),
     "tokens": frozenset(),
     "tokens revoke": frozenset({"name"}),
+    "schedules add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
+    **dict.fromkeys(("schedules", "due", "alarms"), frozenset({"arm"})),
+    **dict.fromkeys(("schedules remove", "schedules enable", "schedules disable"), _NUMBER),
+    "maintenance": frozenset({"arm", "what", "note"}),
+    **dict.fromkeys(("due dismiss", "alarms acknowledge"), _NUMBER | {"note"}),
+    "reidentify": frozenset({"arm", "motion", "confirm"}),
 }
 """Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

@@ -47,7 +47,7 @@ _OF_HTTP: Final[dict[str, type[IdentError]]] = {
 """What refuses a request before it reaches anything that has an error of its own, by the kind that it is told with."""
 _UNAUTHORIZED: Final = (
     "takes no request without a valid token, and this one is not: it was revoked, or is of another daemon, or none was "
-    "given; `ident token add NAME --role operator` makes one at the daemon's machine"
+    "given; `ident tokens add NAME --role operator` makes one at the daemon's machine"
 )
 _PLACE: Final = re.compile(r"(?P<path>.+?):(?P<line>\d+):(?P<column>\d+): (?P<message>.*)", re.DOTALL)
 
@@ -77,7 +77,7 @@ class Connection:
             raise UsageError(f"{url}: a token is sent to other machines over https only")
         self.url = url.rstrip("/")
         if token is not None and not token.strip():
-            raise UsageError(f"{url}: the token is empty; give what `ident token add` has printed, or None for a stop")
+            raise UsageError(f"{url}: the token is empty; give what `ident tokens add` has printed, or None for a stop")
         headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         secure = parts.scheme == "https"
         # Without TLS no certificate is checked; an empty context is quicker to make.

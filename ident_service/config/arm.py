@@ -498,6 +498,11 @@ class ArmConfig(ExtendedSection):
         return None
 
     @property
+    def point_speed_limit(self) -> float | None:
+        """Return the speed of elbow and tip at which the arm's own safety system stops it [m/s]; None without one."""
+        return self.driver.limits.velocity if isinstance(self.driver, BarrettDriver) else None
+
+    @property
     def watchdog(self) -> float | None:
         """Return after how long without its host the slowest drive gives up torque [s]; None where unknown.
 

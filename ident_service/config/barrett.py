@@ -57,6 +57,10 @@ class Puck(Section):
     """Calibrated angle of a motor with an absolute encoder when the arm is at home [rad]; without, the posture in which
     a person zeroes the arm is all that is known."""
 
+    joint_counts: Annotated[int, Field(strict=True, ge=-0x7FFFFF, le=0x7FFFFF)] | None = None
+    """Counts of the joint encoder that this puck reads, per turn of the joint of the same place [1]; negative where it
+    counts the other way; none when left out."""
+
     @property
     def max_torque(self) -> float:
         """Return the largest torque that the puck lets through, at the motor [N m]."""
@@ -105,6 +109,8 @@ class PuckEmulation(Section):
     """
     heartbeat: Positive = 0.05
     """Time without positions or torques after which the safety puck leaves ACTIVE [s]."""
+    velocity: Positive | None = None
+    """Speed of elbow and tip at which the safety puck really trips [m/s]; what it was told when left out."""
     zeroed: bool = False
     """The arm has been zeroed since power came."""
     faults: tuple[SimulatedFault, ...] = ()
@@ -128,7 +134,10 @@ class BarrettDriver(Section):
     limits: SafetyLimits = SafetyLimits()
     """Limits at which the safety puck stops the arm."""
     joint_encoders: tuple[int, ...] = ()
-    """Nodes that answer with a second position [1]."""
+    """Nodes that answer with a second position, of an encoder at the joint [1]; their pucks need `joint_counts`."""
+    joint_tolerance: Annotated[float, Field(strict=True, gt=0.0, le=0.5)] = 0.05
+    """Angle by which a joint's encoder and its motors may have moved apart since the arm was opened [rad]: cables are
+    elastic. Beyond it, the transmission has slipped."""
     heartbeat: Seconds = 0.1
     """Time without positions and torques after which the safety puck lets the arm go [s]; no public source says it, and
     preflight proves it."""
@@ -160,6 +169,12 @@ class BarrettDriver(Section):
             raise ValueError(f"node {', '.join(map(str, twice))} stands twice")
         if foreign := sorted(set(self.joint_encoders) - set(nodes)):
             raise ValueError(f"joint_encoders: {', '.join(map(str, foreign))} is none of the nodes")
+        read = {puck.node for puck in self.pucks if puck.joint_counts}
+        if odd := sorted(set(self.joint_encoders) ^ read):
+            raise ValueError(
+                f"joint_encoders: node {', '.join(map(str, odd))} must be among them, and its puck have joint_counts, "
+                "not 0, or neither"
+            )
         if self.bus.data_bitrate is not None:
             raise ValueError("pucks do not speak CAN FD; leave bus.data_bitrate out")
         if trips := [puck.node for puck in self.pucks if puck.mt > self.limits.torque]:

@@ -23,7 +23,7 @@ from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, arm_schema_file, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
-from ident_service.errors import ConfigError, DriverError, Problem, UsageError
+from ident_service.errors import ConfigError, DriverError, Problem, UsageError, plain_mistake
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -248,7 +248,9 @@ def arm_from_json(path: Path) -> ArmConfig:
     try:
         return ArmConfig.model_validate_json(data)
     except ValidationError as error:
-        places = [(".".join(map(str, mistake["loc"])), mistake["msg"]) for mistake in error.errors(include_url=False)]
+        places = [
+            (".".join(map(str, mistake["loc"])), plain_mistake(mistake)) for mistake in error.errors(include_url=False)
+        ]
         raise ConfigError([Problem(path, 1, 1, f"{where}: {said}") for where, said in places[:10]]) from None
 
 
@@ -509,8 +511,8 @@ def _told(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -
         return "said", f"must be a list of {bound}, not {context['actual_length']}"
     if kind == "string_pattern_mismatch":
         words = known.description(where, tree.value)
-        return "said", f"{str(value)!r} does not match the pattern {context['pattern']}{f'; {words}' if words else ''}"
-    return "said", mistake["msg"].removeprefix("Value error, ")
+        return "said", plain_mistake(mistake) + (f"; {words}" if words else "")
+    return "said", plain_mistake(mistake)
 
 
 def _nearest(word: str, mistakes: Sequence[ErrorDetails]) -> str:

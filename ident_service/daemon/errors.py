@@ -29,6 +29,7 @@ from ident_service.errors import (
     Unavailable,
     UnknownId,
     UsageError,
+    plain_mistake,
 )
 from ident_service.registry.database import FILE, shortage
 
@@ -113,7 +114,7 @@ def install_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
-        said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:10])
+        said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors()[:10])
         return _answer(422, "InvalidRequest", said)
 
     @app.exception_handler(HTTPException)

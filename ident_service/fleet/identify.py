@@ -13,9 +13,13 @@ the files. A folder of results holds
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import shutil
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,11 +27,12 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
+from ident_service import __version__
 from ident_service.config.load import load_arm
 from ident_service.errors import UsageError
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.estimation.plausibility import reasons_against
-from ident_service.estimation.uncertainty import negligible
+from ident_service.estimation.uncertainty import Uncertainty, negligible
 from ident_service.fleet.factor import Described, Merged, merge_stored
 from ident_service.fleet.population import (
     ArmFit,
@@ -78,7 +83,8 @@ from ident_service.results.manifest import (
     staging_beside,
     write_atomically,
 )
-from ident_service.results.run_folder import write_manifest, write_results
+from ident_service.results.parameter_file import write_parameters
+from ident_service.results.run_folder import PARAMETERS, write_manifest, write_results
 
 
 def identify_fleet(
@@ -136,13 +142,15 @@ def _require_file_name(arm: str) -> None:
 
 
 Files = Mapping[str, bytes]
+KEPT = "results"  # of the store: what follows from an arm's factors
+_SUMMARY = "summary.json"
 
 
 def _analysed(
     client: Client, request: FleetRequest, reduced: Reduced, folder: Path, tell: Tell, step: Step
 ) -> tuple[FleetResult, dict[str, tuple[Files, dict[str, Any]]], dict[str, tuple[Files, Files]]]:
     described, arms = reduced.described, reduced.arms
-    groups, method = described.groups, described.config.identification.method
+    groups = described.groups
     shares = variance_shares({arm: [one.row for one in recordings] for arm, recordings in arms.items()}, groups)
 
     def submit(function: Any, *arguments: Any) -> Any:
@@ -153,12 +161,16 @@ def _analysed(
 
     step("fitting arms", REDUCED)
     tell(f"{len(arms)} arms: each alone, and all together")
-    fitting = {
-        arm: submit(arm_fit, tree.merged, method, between(arm, len(arms[arm]))) for arm, tree in reduced.trees.items()
-    }
-    training = {
-        arm: submit(arm_fit, tree.trained, method, between(arm, tree.count)) for arm, tree in reduced.trees.items()
-    }
+    store = Store(absolute_url(request.store))
+
+    def fit(merged: Any, leaves: Leaves, between: Array | None) -> Any:
+        return submit(_kept_fit, merged, leaves, described, store, between)
+
+    fitting, training = {}, {}
+    for arm, tree in reduced.trees.items():
+        whole = tree.by_recording
+        fitting[arm] = fit(tree.merged, (tree.keys, whole), between(arm, len(arms[arm])))
+        training[arm] = fit(tree.trained, (tree.keys[: tree.count], whole), between(arm, tree.count))
     fits = {arm: future.result() for arm, future in fitting.items()}
     found = population(fits, groups)
     told = population({arm: future.result() for arm, future in training.items()}, groups)
@@ -166,7 +178,7 @@ def _analysed(
     for arm, tree in reduced.trees.items():
         if tree.held is not None:
             prior = told.other_arms(arm)
-            one = submit(arm_fit, tree.single, method, shares.recordings)
+            one = fit(tree.single, (tree.keys[:1], False), shares.recordings)
             judged[arm] = (
                 submit(held_out_errors, training[arm], tree.held, prior, told.scale, described),
                 submit(held_out_errors, one, tree.held, prior, told.scale, described),
@@ -190,8 +202,10 @@ def _analysed(
         pooled = pooled_fit(fits[arm], found.other_arms(arm), found.scale) if len(arms) > 1 else None
         names = [(one.name, one.row.sha256) for one in arms[arm]]
         more = {"arm": arm, "pooled": helps and pooled is not None, "arms": len(arms)}
-        files_of[arm] = submit(_arm_files, fits[arm], tree.merged, names, described, pooled, config, more)
-    store = Store(absolute_url(request.store))
+        leaves = (tree.keys, tree.by_recording)
+        files_of[arm] = submit(
+            *(_arm_files, fits[arm], tree.merged, leaves, names, described, pooled, config, more, store)
+        )
     splits_of = {
         arm: _split_files(
             client, arm, [one for one in changes if one.changed and one.arm == arm], reduced, store, config
@@ -206,21 +220,59 @@ def _analysed(
     return result, written, splits
 
 
+Leaves = tuple[tuple[str, ...], bool]
+"""Keys of the factors of an estimate in the order in which they are merged, and whether each is one cluster."""
+
+
+def _kept_name(kind: str, described: Described, leaves: Leaves, *more: str) -> str:
+    """Return the name in the store of what follows from factors, the description and this version."""
+    told = json.dumps([__version__, described.description, leaves, more])
+    return f"{KEPT}/{hashlib.sha256(told.encode()).hexdigest()}.{kind}"
+
+
+def _kept_fit(merged: Merged, leaves: Leaves, described: Described, store: Store, between: Array | None) -> ArmFit:
+    """Return `arm_fit`, whose uncertainty is kept in the store by content."""
+    name, method = _kept_name("npz", described, leaves), described.config.identification.method
+    content = store.read(name)
+    if content is not None:
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+                return arm_fit(merged, method, between, Uncertainty(**archive))
+        except (ValueError, TypeError, KeyError, OSError, EOFError, zipfile.BadZipFile):
+            pass  # damaged, or another version's: made again
+    found = arm_fit(merged, method, between)
+    stream = io.BytesIO()
+    np.savez(stream, **{key: value for key, value in vars(found.doubt).items() if value is not None})
+    store.write(name, stream.getvalue())
+    return found
+
+
 def _arm_files(
     alone: ArmFit,
     merged: Merged,
+    leaves: Leaves,
     recordings: Sequence[tuple[str, str]],
     described: Described,
     pooled: LeastSquares | None,
     config: str,
     more: dict[str, Any],
+    store: Store,
 ) -> tuple[Files, dict[str, Any]]:
-    """Return the files of one arm's results, and what the fleet's own say of it."""
-    from ident_service.config.arm import ArmConfig
+    """Return the files of one arm's results, and what the fleet's own say of it.
 
-    chosen = arm_estimate(alone, merged, recordings, described, pooled if more["pooled"] else None, more["arms"])
-    own = chosen.candidates[chosen.chosen]
-    unusable = reasons_against(chosen)
+    What does not depend on the other arms is kept in the store by content: the estimate with its proof.
+    """
+    used = pooled if more["pooled"] else None
+    drawn = () if used is None else (used.beta.tobytes().hex(), used.R1.tobytes().hex(), str(more["arms"]))
+    name = _kept_name("zip", described, leaves, config, json.dumps(recordings), *drawn)
+    kept = _unzipped(store.read(name))
+    if kept is None:
+        kept = _estimated(alone, merged, recordings, described, used, config, more["arms"])
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive:
+            for file, data in kept.items():
+                archive.writestr(zipfile.ZipInfo(file), data)
+        store.write(name, stream.getvalue())
     fleet = {
         **more,
         "alone": alone.fit.beta.tolist(),
@@ -228,24 +280,58 @@ def _arm_files(
         "together": None if pooled is None else pooled.beta.tolist(),
         "together_deviations": None if pooled is None else pooled.standard_deviations.tolist(),
     }
-    torque = described.config.identification.torque or "recorded"
-    with tempfile.TemporaryDirectory(prefix="ident-fleet-") as name:
-        place = Path(name)
-        write_results(place, chosen, {"fleet": fleet}, unusable, ArmConfig.model_validate_json(config), torque)
+    summary = json.loads(kept[_SUMMARY]) | {"pooled": more["pooled"], "negligible": negligible(alone.total)}
+    with tempfile.TemporaryDirectory(prefix="ident-fleet-") as folder:
+        place = Path(folder)
+        for file, data in kept.items():
+            if file not in (_SUMMARY, PARAMETERS):
+                (place / file).write_bytes(data)
+        write_parameters(place / PARAMETERS, json.loads(kept[PARAMETERS]) | {"fleet": fleet})
         write_manifest(place)
-        content = {path.name: path.read_bytes() for path in sorted(place.iterdir())}
+        return {path.name: path.read_bytes() for path in sorted(place.iterdir())}, summary
+
+
+def _unzipped(content: bytes | None) -> dict[str, bytes] | None:
+    """Return the files of a kept estimate; None where there is none, or it is damaged."""
+    if content is None:
+        return None
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            found = {name: archive.read(name) for name in archive.namelist()}
+    except (zipfile.BadZipFile, OSError, EOFError, zlib.error):
+        return None
+    return found if {_SUMMARY, PARAMETERS} <= set(found) and all(Path(name).name == name for name in found) else None
+
+
+def _estimated(
+    alone: ArmFit,
+    merged: Merged,
+    recordings: Sequence[tuple[str, str]],
+    described: Described,
+    pooled: LeastSquares | None,
+    config: str,
+    arms: int,
+) -> dict[str, bytes]:
+    """Return the files of an arm's estimate without what the fleet says of it, and a summary."""
+    from ident_service.config.arm import ArmConfig
+
+    chosen = arm_estimate(alone, merged, recordings, described, pooled, arms)
+    unusable = reasons_against(chosen)
+    torque = described.config.identification.torque or "recorded"
     summary = {
         "feasible": chosen.feasible,
         "margin": chosen.margin,
-        "pooled": more["pooled"],
         "unusable": list(unusable),
-        "error_percent": own.identification.relative_percent,
+        "error_percent": chosen.candidates[chosen.chosen].identification.relative_percent,
         "values": chosen.beta.tolist(),
         "standard_deviations": [float(v) if np.isfinite(v) else None for v in chosen.standard_deviations],
         "verdicts": list(chosen.verdicts),
-        "negligible": negligible(alone.total),
     }
-    return content, summary
+    with tempfile.TemporaryDirectory(prefix="ident-fleet-") as name:
+        place = Path(name)
+        write_results(place, chosen, None, unusable, ArmConfig.model_validate_json(config), torque)
+        content = {path.name: path.read_bytes() for path in sorted(place.iterdir())}
+    return content | {_SUMMARY: json.dumps(summary).encode()}
 
 
 def _split_files(
@@ -257,11 +343,14 @@ def _split_files(
     recordings = reduced.arms[arm]
     for part in (recordings[: change.at], recordings[change.at :]):
         keys = [one.row.key for one in sorted(part, key=lambda one: (one.row.sha256, one.row.label, one.row.key))]
+        leaves = (tuple(keys), False)
         merged = client.submit(merge_stored, keys, described, store, False, pure=False)
-        alone = client.submit(arm_fit, merged, described.config.identification.method, None, pure=False)
+        alone = client.submit(_kept_fit, merged, leaves, described, store, None, pure=False)
         names = [(one.name, one.row.sha256) for one in part]
         more = {"arm": arm, "pooled": False, "arms": len(reduced.arms)}
-        found.append(client.submit(_arm_files, alone, merged, names, described, None, config, more, pure=False))
+        found.append(
+            client.submit(*(_arm_files, alone, merged, leaves, names, described, None, config, more, store), pure=False)
+        )
     return found[0], found[1]
 
 

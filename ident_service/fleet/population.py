@@ -80,7 +80,7 @@ class ArmFit:
 
 
 @one_blas_thread()
-def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit:
+def arm_fit(merged: Merged, method: str, between: Array | None = None, doubt: Uncertainty | None = None) -> ArmFit:
     """Estimate one arm from merged factors.
 
     Args:
@@ -88,10 +88,11 @@ def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit
         method: `ols` gives all joints the same weight.
         between: variance of the arm's mean by what differs from recording to recording [SI^2], shape (base,); None
             where recordings are the clusters, whose covariance has it already.
+        doubt: its uncertainty, which takes most of the time, where it is known; estimated if None.
     """
     total = merged.fitted.total
     fit = ordinary_least_squares(total) if method == "ols" else weighted_least_squares(total)
-    doubt = uncertainty(merged.fitted, fit)
+    doubt = uncertainty(merged.fitted, fit) if doubt is None else doubt
     degrees = max(int(total.rows.sum()) - total.base, 1)
     variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
     white = fit.standard_deviations

@@ -118,7 +118,8 @@ class Tree:
         held: of those held out to judge, a third; None where there is one recording only.
         merged: of all.
         by_recording: whether each recording is a cluster of the uncertainty.
-        count: recordings that are not held out.
+        keys: of the factors, in the order in which they are merged.
+        count: recordings that are not held out, the first ones.
     """
 
     single: Any
@@ -126,6 +127,7 @@ class Tree:
     held: Any | None
     merged: Any
     by_recording: bool
+    keys: tuple[str, ...]
     count: int
 
 
@@ -488,7 +490,7 @@ def _tree(client: Client, recordings: Sequence[Recorded], described: Described, 
     trained = single if count == 1 else branch(keys[:count])
     held = branch(keys[count:]) if count < len(keys) else None
     merged = trained if held is None else client.submit(merge, [trained, held], pure=False)
-    return Tree(single, trained, held, merged, whole, count)
+    return Tree(single, trained, held, merged, whole, tuple(keys), count)
 
 
 def status_of(request: FleetRequest) -> Mapping[str, Any]:

@@ -1,4 +1,4 @@
-"""Present what was found of a fleet: a document for programs, a Parquet table, one page, lines for a terminal."""
+"""Present what was found of a fleet: a document for programs, a Parquet table, one page."""
 
 from __future__ import annotations
 
@@ -385,36 +385,3 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-
-
-def fleet_text(result: FleetResult) -> str:
-    """Return what was found, for a terminal."""
-    document = result.document
-    lines = [
-        f"{document['recordings']} recordings of {len(document['arms'])} arms, {len(document['left_out'])} left out"
-    ]
-    lines += [f"  left out: {one['url']}{one['piece']}: {one['message']}" for one in document["left_out"]]
-    for key, words in (("several_recordings", "as recorded"), ("one_recording", "with one recording each")):
-        held = document["held_out"][key]
-        if held["arms"]:
-            helps = "pooled" if held["pooling_helps"] else "each arm alone"
-            lines.append(
-                f"torque error on held-out recordings, {words}: {held['alone_percent']:.3g} % alone,"
-                f" {held['pooled_percent']:.3g} % pooled ({-100.0 * held['gain']:+.0f} %): {helps}"
-            )
-    differing = {arm: document["arms"][arm]["differs"] for arm in document["ranking"]}
-    lines.append(f"unlike the others: {', '.join(arm for arm, found in differing.items() if found) or 'no arm'}")
-    lines += [
-        f"  {arm}: {one['what']}, {one['sigma']:.1f} sigma, {one['torque_share']:.1%} of {one['joint']}"
-        for arm, found in differing.items()
-        for one in found
-    ]
-    lines.append(f"changed: {', '.join(dict.fromkeys(one['arm'] for one in document['changes'])) or 'no arm'}")
-    lines += [
-        f"  {one['arm']}: {one['what']}{' drifts' if one['kind'] == 'drift' else ''} between {one['after'][:10]} and "
-        f"{one['until'][:10]}, {one['sigma']:.1f} sigma"
-        for one in document["changes"]
-    ]
-    lines += [f"  alarm: {one['arm']}: {one['what']}" for one in document.get("alarms", [])]
-    lines += [f"files: {result.folder}", f"  {PAGE}, {FLEET}, {TABLE}, arms/*/parameters.json"]
-    return "\n".join(lines) + "\n"

@@ -384,6 +384,7 @@ class Loop:
                     sample.age,
                     sample.lost,
                     sample.measured_torque,
+                    sample.joint_position,
                 )
             )
             why = "" if kept else self.sink.error or "the recorder cannot keep up"

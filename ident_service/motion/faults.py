@@ -134,6 +134,8 @@ FAULTS: dict[str, Rule] = {
     "drive_restarted": Rule(_QUICK, "its power failed for a moment, or its firmware restarted"),
     "drive_left": Rule(_QUICK, "it accepts no torque any more; another host commands it, or it lost this host"),
     "torque_ignored": Rule(_QUICK, "it is at its own speed or position limit, or its encoder is wrong"),
+    # Motors stop the best by themselves: where the joint is, their positions do not say any more.
+    "transmission_slipped": Rule(_QUICK, "a cable slipped or broke, or the motor's or the joint's encoder is wrong"),
     "second_host": Rule(_QUICK, "another program or device drives the same arm"),
     "bus_off": Rule(_QUICK, "a short circuit, a wrong bit rate, or no other node on the bus"),
     "drive_watchdog": Rule(_QUICK, "the drive received nothing from the host in time"),

@@ -22,6 +22,7 @@ from ident_service.model.collision import corners, scene
 from ident_service.model.kinematics import branches, frame_origins, joint_poses
 from ident_service.model.solids import HalfSpace
 from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
+from ident_service.operations.arm_view import home_position
 from ident_service.results.posture_figure import Box, Closest, Limb, Plane, Postures, Rod, silhouette, stick_figure
 
 _SAMPLES: Final = 1000
@@ -136,15 +137,7 @@ def postures(model: ArmModel, path: FourierPath | PosturePath, time: Array, clos
 
 def home_picture(model: ArmModel) -> str:
     """Draw an arm at its home position, or in the middle of its limits where it has no home, as a small SVG."""
-    chain, joints = model.chain, model.config.joints
-    position = np.zeros(chain.joints)
-    for k, name in enumerate(chain.names):
-        joint = joints.get(name)
-        if joint is not None and joint.home is not None:
-            position[k] = joint.home
-        elif joint is not None and joint.position is not None:
-            position[k] = 0.5 * sum(joint.position)
-    return silhouette(_limbs(model, position), f"{model.config.name} at home")
+    return silhouette(_limbs(model, home_position(model)), f"{model.config.name} at home")
 
 
 def _limbs(model: ArmModel, position: Array) -> list[Limb]:

@@ -13,12 +13,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.config.recording import RecordingFormat
-from ident_service.errors import IdentError, RecordingError
-from ident_service.excitation.motion_file import Excitation
+from ident_service.errors import IdentError, RecordingError, UsageError
+from ident_service.excitation.described_motion import excitation
+from ident_service.excitation.motion_file import read_excitation
 from ident_service.model.appearance import visible_bodies
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, surroundings
 from ident_service.model.solids import Body, Box, Capsule, Cylinder
@@ -50,23 +52,27 @@ def figure(model: ArmModel) -> dict[str, Any]:
         "bodies": [_solid(body) for body in visible_bodies(model)],
         "surroundings": [_solid(body) for body in surroundings(model)],
         "up": _numbers(-gravity / size) if size > 0.0 else [0.0, 0.0, 1.0],
-        "home": _numbers(_home(model)),
+        "home": _numbers(home_position(model)),
     }
 
 
-def view_of_motion(model: ArmModel, excitation: Excitation, speed: float = 1.0) -> dict[str, Any]:
+def view_of_motion(config: ArmConfig, motion: Path | None, speed: float = 1.0) -> dict[str, Any]:
     """Return an arm along a motion that begins and ends at home.
 
     Args:
-        model: of the arm.
-        excitation: the motion; what it repeats is shown once.
+        config: of the arm.
+        motion: file of the motion, None for the description's own; what it repeats is shown once.
         speed: share of its own speed, above 0 and at most 1.
 
     Raises:
         UsageError: the motion is one of another number of joints.
         MotionRefused: the arm's description lacks limits.
     """
-    path, limits = excitation.path, motion_limits(model.config)
+    model, limits = arm_model(config), motion_limits(config)
+    named = excitation(model, "identification", checked=False) if motion is None else read_excitation(motion)
+    path = named.path
+    if path.joints != model.chain.joints:
+        raise UsageError(f"a motion of {path.joints} joints, but {config.name} has {model.chain.joints}")
     begin, end = (Setpoint(*path.at(at)[:3]) for at in (0.0, path.duration))
     shown = sum(last - first for first, last in path.distinct)
     notes = []
@@ -83,7 +89,7 @@ def view_of_motion(model: ArmModel, excitation: Excitation, speed: float = 1.0) 
         parts.append(("approach", time, _positions(there, time)))
     for first, last in path.distinct:
         time = _grid(first, last, rate)
-        parts.append((excitation.name, time - first, np.asarray(path.at(time)[0])))
+        parts.append((named.name, time - first, np.asarray(path.at(time)[0])))
     if back is not None:
         time = _grid(0.0, back.duration, rate)
         parts.append(("return", time, _positions(back, time)))
@@ -110,18 +116,18 @@ def _grid(begin: float, end: float, rate: float) -> Array:
     return np.linspace(begin, end, max(round((end - begin) * rate) + 1, 2))
 
 
-def view_of_recording(model: ArmModel, path: Path, fmt: RecordingFormat | None = None) -> dict[str, Any]:
+def view_of_recording(config: ArmConfig, path: Path, fmt: RecordingFormat | None = None) -> dict[str, Any]:
     """Return an arm as it was measured.
 
     Args:
-        model: of the arm.
+        config: of the arm.
         path: the recording.
         fmt: how a file of others is to be read; as the arm's description says when None.
 
     Raises:
         RecordingError: it cannot be read, or has no samples.
     """
-    config = model.config
+    model = arm_model(config)
     fmt = config.recording if fmt is None else fmt
     recording = open_recording(path, model.chain.names, fmt=fmt, transmission=config.transmission)
     stamps, positions = [], []
@@ -140,9 +146,16 @@ def view_of_recording(model: ArmModel, path: Path, fmt: RecordingFormat | None =
     return _view(model, (stamp[kept] - stamp[0]) * 1e-9, position[kept], [], [])
 
 
-def view_at_rest(model: ArmModel) -> dict[str, Any]:
+def view_at_rest(config: ArmConfig) -> dict[str, Any]:
     """Return an arm at home, for a viewer that is told positions later."""
-    return {"figure": figure(model), "time": [], "position": [], "phases": [], "clearance": None, "notes": []}
+    return {
+        "figure": figure(arm_model(config)),
+        "time": [],
+        "position": [],
+        "phases": [],
+        "clearance": None,
+        "notes": [],
+    }
 
 
 def _view(
@@ -184,7 +197,7 @@ def _nearest(distances: Array, chosen: NDArray[np.intp]) -> dict[str, Any]:
     return {"distance": np.round(smallest, 4).tolist(), "pair": pair.tolist()}
 
 
-def _home(model: ArmModel) -> Array:
+def home_position(model: ArmModel) -> Array:
     """Return the home position, the middle of a joint's limits where it has none, or zero [rad or m], (joints,)."""
     position = np.zeros(model.chain.joints)
     for k, name in enumerate(model.chain.names):

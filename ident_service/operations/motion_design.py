@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Design
 from ident_service.config.motion_limits import motion_limits
-from ident_service.errors import UsageError
+from ident_service.errors import UsageError, plain_mistake
 from ident_service.estimation.equations import equations
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import Designed, complete_task, design_motion, family
@@ -262,7 +262,7 @@ def _changed(design: Design, changes: dict[str, Any]) -> Design:
     try:
         return Design.model_validate(design.model_dump() | changes)
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
+        wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors())
         raise UsageError(f"design: {wrong}") from None
 
 

@@ -58,6 +58,7 @@ REMEDIES: dict[str, str] = {
     "bus_silent": _LINK,
     "bus_degraded": _LINK,
     "second_host": "Stop or disconnect whatever else commands the arm.",
+    "transmission_slipped": "Check the cables or belts of the joint named, then its encoder and the motors'.",
     "frozen_encoder": _ENCODER,
     "feedback_not_finite": _ENCODER,
     "encoder_jumps": _ENCODER,

@@ -11,6 +11,7 @@ from ident_service.excitation.limit_proof import proof_of, violations
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
+from ident_service.model.kinematics import frame_origins
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
 from ident_service.motion.clearance import stop_clearance, trajectory_clearance
@@ -28,7 +29,7 @@ from ident_service.motion.ticket import (
     measures,
     skipped,
 )
-from ident_service.motion.trajectory import PathReference, plan_trajectory, rest
+from ident_service.motion.trajectory import PathReference, Reference, plan_trajectory, rest
 from ident_service.preflight.stability import INERTIA, LEAST_GAIN_MARGIN, delay_of, stability
 
 # What drives may take to notice that the host is gone where joints can fall: what falls freely has sunk 5 cm after it
@@ -40,6 +41,9 @@ LONG_SILENCE_REMEDY = (
 )
 NEAR_HOME = 0.1  # rad or m: people lead an arm home to a few hundredths
 HOLDABLE = 0.8  # of a torque limit: what holding may take, so that something is left to correct with
+# Times along a motion and along a way at which points' speeds are taken: of the shipped WAM's to a thousandth.
+_SPEEDS, _LEG_SPEEDS = 4000, 400
+_SLOWER = "Lower the joints' velocity limits, or raise driver.limits.velocity as far as the people near it allow."
 _POSTURES = 8  # of the motion, at which the coupled loop is judged
 
 
@@ -106,6 +110,8 @@ def motion_fits_check(model: ArmModel, excitation: Excitation) -> Check:
 def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excitation) -> Check:
     """Check that the motion, the way to it from home, and every stop out of it are proven to keep all limits."""
     code, remedy = "motion_proven", "Design the motion again, with larger margins or a smaller share of the limits."
+    if model.config.point_speed_limit is not None:
+        remedy = f"{remedy} {_SLOWER}"
     try:
         proof = proof_of(excitation.path, model, limits, CollisionModel(model))
         found = violations(proof, model, limits)
@@ -122,6 +128,8 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         if (peak := getattr(asked, key)) is not None:
             share = peak / getattr(limits, key)
             taken += measures(f"{key}, share of the limit", share, ("",) * len(names), names, most=np.ones(len(names)))
+    seconds = np.linspace(0.0, excitation.path.duration, _SPEEDS)
+    taken += point_speeds(model, excitation.path.at(seconds)[0], seconds, "of the motion")
     least = model.config.workspace.clearance
     for what, clearance in (("clearance", proof.clearance), ("clearance on the way from home", proof.approach)):
         if clearance is not None and clearance.pair is not None:
@@ -131,6 +139,33 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
         if nearest.distance <= 0.0:
             found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
     return failed(code, "; ".join(found), remedy, taken) if found else check_from_measures(code, taken, remedy)
+
+
+def point_speeds(model: ArmModel, position: Vector, seconds: Vector, what: str) -> list[Measure]:
+    """Compare the fastest of the arm's frames with the speed at which its own safety system stops it.
+
+    Args:
+        model: of the arm.
+        position: along a motion [rad or m], shape (samples, joints).
+        seconds: of the samples [s], shape (samples,).
+        what: suffix of the measure's name.
+
+    Returns:
+        One measure; none where no such system is described.
+    """
+    limit = model.config.point_speed_limit
+    if limit is None:
+        return []
+    steps = np.diff(frame_origins(model.chain, position), axis=0) / np.diff(seconds)[:, None, None]
+    fastest = float(np.linalg.norm(steps, axis=2).max())
+    return [measure(f"speed of elbow and tip {what} (driver.limits.velocity)", fastest, "m/s", most=limit)]
+
+
+def _leg_speeds(model: ArmModel, leg: Reference, what: str) -> list[Measure]:
+    seconds = np.linspace(0.0, leg.duration, _LEG_SPEEDS)
+    if model.config.point_speed_limit is None or not leg.duration > 0.0:
+        return []
+    return point_speeds(model, np.array([leg.at(float(time)).position for time in seconds]), seconds, what)
 
 
 @unhurried()
@@ -190,7 +225,8 @@ def path_home_check(model: ArmModel, limits: MotionLimits, position: Vector) -> 
         ((_, leg),) = PointToPointPlan(Destination.HOME).legs(model, position, limits)
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), "Move the arm by hand to where the straight path home is free.")
-    return Check(code, Verdict.PASSED, (measure("the way home, length", leg.duration, "s"),))
+    found = [measure("the way home, length", leg.duration, "s"), *_leg_speeds(model, leg, "on the way home")]
+    return check_from_measures(code, found, _SLOWER)
 
 
 def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, position: Vector) -> Check:
@@ -214,6 +250,7 @@ def paths_check(model: ArmModel, limits: MotionLimits, excitation: Excitation, p
             ("the way back", plan_trajectory(ends[1], rest(position), limits)),
         ):
             found.append(measure(f"{what}, length", leg.duration, "s"))
+            found += _leg_speeds(model, leg, f"on {what}")
             if collision.pairs:
                 clearance = trajectory_clearance(collision, leg, limits, least)
                 found.append(measure(f"{what}, clearance", clearance.lower_bound, "m", least=least))

@@ -31,6 +31,8 @@ class Cycle(NamedTuple):
         lost: frames lost so far.
         measured_torque: by the drives, told with the positions: what acted until this stamp [N m or N], shape
             (joints,), NaN where none was told; None where drives do not measure it.
+        joint_position: by encoders behind the transmission [rad or m], shape (joints,), NaN for joints without one;
+            None for an arm without any.
     """
 
     stamp_ns: int
@@ -46,3 +48,4 @@ class Cycle(NamedTuple):
     age: NDArray[np.int64]
     lost: int
     measured_torque: Vector | None = None
+    joint_position: Vector | None = None

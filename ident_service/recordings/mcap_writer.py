@@ -100,6 +100,7 @@ TOPICS: Final[dict[str, str]] = {
     "/joint_states": JOINT_STATE,
     "/joint_commands": JOINT_STATE,
     "/joint_torques": JOINT_STATE,
+    "/joint_encoders": JOINT_STATE,
     "/cycle": CYCLE,
     "/events": LOG,
     "/robot_description": STRING,
@@ -468,7 +469,7 @@ class RecordingWriter:
             error.add_note(f"the recording could not be finished either: {second}")
 
     def sample(self, cycle: Cycle) -> None:
-        """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle` and, where drives measure, `/joint_torques`.
+        """Write one cycle to `/joint_states`, `/joint_commands`, `/cycle`, and what drives measure beside.
 
         Raises:
             RecordingNotWritten: the file cannot be written.
@@ -488,6 +489,8 @@ class RecordingWriter:
         messages = [("/joint_states", state), ("/joint_commands", command), ("/cycle", timing)]
         if cycle.measured_torque is not None:
             messages.append(("/joint_torques", self._states.encode_effort(utc_ns, cycle.measured_torque)))
+        if cycle.joint_position is not None:
+            messages.append(("/joint_encoders", self._states.encode(utc_ns, cycle.joint_position, None, None)))
         self._add(cycle.stamp_ns, messages, sequence=cycle.cycle)
 
     def event(self, stamp_ns: int, level: int, message: str) -> None:

@@ -43,7 +43,8 @@ offset bytes     what
 28     4         level of an event
 32     8         stamp [ns]
 40     4 x 8     a cycle's: number, lateness [ns], compute time [ns], frames lost
-72     6 x 8 J   position, velocity, torque, reference position, reference velocity, measured torque (NaN: none)
+72     7 x 8 J   position, velocity, torque, reference position, reference velocity, measured torque (NaN: none),
+                 position by joint encoders (NaN: none)
 ...    8 J       age
 ...    J         valid
 40     ...       an event's: message in UTF-8
@@ -110,7 +111,7 @@ _TEXT_MOST: Final = 1024
 
 _FIXED: Final = struct.Struct("=8s5Q")
 _MAGIC: Final = b"IDNTRING"
-_VERSION: Final = 1
+_VERSION: Final = 2
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
@@ -243,7 +244,7 @@ TIMING: Final = struct.Struct("=4q")
 AT_TIMING: Final = BODY + HEAD.size
 AT_VECTORS: Final = AT_TIMING + TIMING.size
 AT_MESSAGE: Final = AT_TIMING
-VECTORS: Final = 6
+VECTORS: Final = 7
 
 _LEAST_BYTES: Final = 512  # room for a sentence even where an arm has one joint
 _CUT: Final = b" [cut]"
@@ -299,6 +300,7 @@ def decode(content: bytes, number: int, joints: int) -> Record | None:
         *(stamp_ns, vectors[0], velocity, vectors[2], vectors[3], vectors[4]),
         *(cycle, lateness_ns, compute_ns, valid, age, lost),
         None if np.isnan(vectors[5]).all() else vectors[5],
+        None if np.isnan(vectors[6]).all() else vectors[6],
     )
 
 
@@ -341,7 +343,8 @@ class RingWriter:
         # A record is put together here, so that it stands in shared memory half done for one copy only.
         self._stage = bytearray(self.memory.slot_bytes - 8)
         vectors = np.frombuffer(self._stage, np.float64, VECTORS * joints, AT_VECTORS).reshape(VECTORS, joints)
-        self._position, self._velocity, self._torque, self._q_reference, self._dq_reference, self._measured = vectors
+        self._position, self._velocity, self._torque, self._q_reference, self._dq_reference, *others = vectors
+        self._measured, self._joint_position = others
         behind = AT_VECTORS + 8 * VECTORS * joints
         self._age = np.frombuffer(self._stage, np.int64, joints, behind)
         self._valid = np.frombuffer(self._stage, np.bool_, joints, behind + 8 * joints)
@@ -359,14 +362,15 @@ class RingWriter:
             struct.error: an integer beyond 64 bits.
         """
         stamp_ns, position, velocity, torque, reference_position, reference_velocity = cycle[:6]
-        number, lateness_ns, compute_ns, valid, age, lost, measured = cycle[6:]
+        number, lateness_ns, compute_ns, valid, age, lost, measured, encoders = cycle[6:]
         if not (
             self._shape == position.shape == torque.shape == reference_position.shape == reference_velocity.shape
             and self._shape == valid.shape == age.shape
             and (velocity is None or velocity.shape == self._shape)
             and (measured is None or measured.shape == self._shape)
+            and (encoders is None or encoders.shape == self._shape)
         ):
-            given = (position, velocity, torque, reference_position, reference_velocity, valid, age, measured)
+            given = (position, velocity, torque, reference_position, reference_velocity, valid, age, measured, encoders)
             shapes = ", ".join(str(array.shape) for array in given if array is not None)
             raise ValueError(f"arrays of shapes {shapes} but the ring has {self._shape[0]} joints")
         self._position[:] = position
@@ -374,6 +378,7 @@ class RingWriter:
             self._velocity[:] = velocity
         self._torque[:] = torque
         self._measured[:] = np.nan if measured is None else measured
+        self._joint_position[:] = np.nan if encoders is None else encoders
         self._q_reference[:] = reference_position
         self._dq_reference[:] = reference_velocity
         self._valid[:] = valid

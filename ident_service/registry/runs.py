@@ -13,6 +13,7 @@ import re
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +23,7 @@ from ident_service.registry.database import Database, Row, note
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
-DOWNLOADABLE_KINDS: Final = frozenset({"export", "figures", "payload", "correct"})
+DOWNLOADABLE_KINDS: Final = frozenset({"export", "figures", "payload", "correct", "fleet"})
 """Kinds of jobs that make files for download, in a folder of their own below `EXPORTS`."""
 UPLOAD, COLUMNS = "upload.json", "columns.yaml"
 """Files of a run that is an uploaded recording: its announcement, and the layout of its columns."""
@@ -122,6 +123,20 @@ def runs(db: Database, arm: str | None = None, *, before: str | None = None, mos
 def recordings(db: Database, run: str) -> list[Row]:
     """Return the recordings of a run."""
     return db.rows("SELECT name, sha256, bytes, deleted FROM recordings WHERE run = ? ORDER BY name", run)
+
+
+def recordings_of(db: Database, patterns: Sequence[str]) -> list[Row]:
+    """Return run, arm and name of every recording that is kept of motions and uploads of some arms, by run.
+
+    Args:
+        db: the registry.
+        patterns: names of arms, with the wildcards of file names.
+    """
+    found = db.rows(
+        "SELECT runs.id AS run, arm, name FROM recordings JOIN runs ON runs.id = recordings.run "
+        "WHERE deleted IS NULL AND kind IN ('run', 'recording') ORDER BY runs.id, name"
+    )
+    return [row for row in found if any(fnmatchcase(str(row["arm"]), pattern) for pattern in patterns)]
 
 
 def recording_name(db: Database, run: str) -> str:

@@ -19,6 +19,7 @@ POOR = 15.0  # torque error of a joint [percent of its own torque], above which 
 USELESS = 50.0  # likewise, above which its predicted torque is of no use
 MUCH_WORSE = 1.5  # error on unseen motion over that on the fitted one
 REASONS = 3
+_SMALL = 1.0  # torque error [percent] that is no limitation, whatever the fitted one is
 
 
 @dataclass(frozen=True)
@@ -223,7 +224,8 @@ def generalises_poorly(content: Mapping[str, Any]) -> bool:
     key = "moving_relative_error_percent"
     if not all(key in one for one in (fit, *unseen)):
         key = "relative_error_percent"
-    return bool(max(one[key] for one in unseen) > MUCH_WORSE * fit[key])
+    worst = max(one[key] for one in unseen)
+    return bool(worst > _SMALL and worst > MUCH_WORSE * fit[key])
 
 
 def active_constraints(content: Mapping[str, Any]) -> list[str]:
@@ -323,7 +325,7 @@ def _line(content: Mapping[str, Any], word: Word) -> str:
         whose = "of unseen motion" if unseen else "of the fitted motion alone"
         parts.append(f"torque {whose} to {_percent(max(unseen or [content['fit']['relative_error_percent']]))}")
     if (found := content.get("feasibility")) is not None:
-        parts.append("physically feasible" if found["margin"] > 0.0 else "not physically feasible")
+        parts.append("feasible" if found["margin"] > 0.0 else "infeasible")
     if (verdicts := content.get("base_parameters", {}).get("verdicts")) is not None:
         parts.append(f"{verdicts.count('identified')} of {len(verdicts)} parameters identified")
     about = "; ".join(parts)

@@ -7,7 +7,7 @@ joint is braked less than asked while all brake.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,6 +155,14 @@ def _pucks(config: ArmConfig, driver: BarrettDriver, faults: Sequence[DriveFault
         joints = body.gears.joint_position(radians * np.array(counts))
         return joints, frame_origins(chain, joints[None, :])[0]
 
+    def joint_encoder(joint: int, counts: int) -> Callable[[int], int]:
+        # Behind the gears: what is wrong with a motor's encoder, or has slipped between them, it does not show.
+        def reading(now_ns: int) -> int:
+            motors = np.array([body.angle(motor, now_ns) for motor in range(len(pucks))])
+            return round(float(body.gears.joint_position(motors)[joint]) * counts / (2.0 * np.pi))
+
+        return reading
+
     safety = EmulatedSafetyPuck(
         driver.safety_node,
         emulation.firmware,
@@ -162,6 +170,7 @@ def _pucks(config: ArmConfig, driver: BarrettDriver, faults: Sequence[DriveFault
         heartbeat=emulation.heartbeat,
         operator=emulation.operator,
         zeroed=emulation.zeroed,
+        velocity=emulation.velocity,
     )
     at_home = np.rint(body.gears.motor_position(body.plant.position) / radians).astype(int).tolist()
     ipnm: Sequence[int | None] = emulation.ipnm or (None,) * len(pucks)
@@ -173,8 +182,9 @@ def _pucks(config: ArmConfig, driver: BarrettDriver, faults: Sequence[DriveFault
             version=emulation.firmware,
             ipnm=own,
             origin=origin if emulation.zeroed else None,
+            joint=joint_encoder(number, puck.joint_counts) if puck.joint_counts else None,
         )
-        for puck, motor, own, origin in zip(pucks, body.motors, ipnm, at_home, strict=True)
+        for number, (puck, motor, own, origin) in enumerate(zip(pucks, body.motors, ipnm, at_home, strict=True))
     ]
     at_first = configured(emulation.faults, chain.names, body.plant.period)
     return Emulator(body, faces, [0] * len(pucks), chain.names, (*at_first, *faults), [safety])

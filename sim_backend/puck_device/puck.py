@@ -7,6 +7,8 @@ host that tries is not obeyed. In its monitor (STAT 0) a puck knows its first pr
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from drivers.barrett.protocol import (
     HOST,
     MONITOR,
@@ -50,6 +52,7 @@ class EmulatedPuck:
         version: int,
         ipnm: int | None = None,
         origin: int | None = None,
+        joint: Callable[[int], int] | None = None,
     ) -> None:
         """Assemble a puck without power.
 
@@ -61,6 +64,7 @@ class EmulatedPuck:
             ipnm: counts per N m that it has, where the description says something else.
             origin: position that the motor has at first in an arm that has been zeroed [counts]; None for one that has
                 not, and whose pucks have just been switched on.
+            joint: gives the joint encoder's counts at a time [ns]; None where it reads none.
         """
         self.motor = motor
         self._node, self._safety = puck.node, safety
@@ -68,6 +72,7 @@ class EmulatedPuck:
         self._place = safety.supervise(self.set_mode)
         self._zeroed = origin is not None
         self._offset = origin or 0
+        self._joint = joint
         self.values = {
             "VERS": version,
             "ROLE": int(Role.MOTOR),
@@ -155,7 +160,7 @@ class EmulatedPuck:
         if name == "P":
             counts = self.motor.encoder(now_ns) + self._offset
             self._safety.watch_position(self._place, counts, now_ns)
-            return [position_frame(self._node, counts)]
+            return [position_frame(self._node, counts, None if self._joint is None else self._joint(now_ns))]
         return [reply(self._node, request.number, self._value(name, now_ns), wide=self._properties.is_wide(name))]
 
     def set_mode(self, mode: Mode, now_ns: int) -> None:

@@ -59,6 +59,7 @@ class EmulatedSafetyPuck:
         heartbeat: float,
         operator: float | None,
         zeroed: bool,
+        velocity: float | None = None,
     ) -> None:
         """Assemble a safety puck without power.
 
@@ -69,6 +70,7 @@ class EmulatedSafetyPuck:
             heartbeat: time without positions and torques after which it leaves ACTIVE [s].
             operator: after how long torque frames make a person press Shift-Activate [s]; None for nobody.
             zeroed: whether the arm has been zeroed before.
+            velocity: at which it trips, whatever it was told [m/s]; None for what it was told.
         """
         self.number = number
         self.mode = SafetyMode.IDLE
@@ -77,6 +79,7 @@ class EmulatedSafetyPuck:
         self._properties = Properties(version, Role.SAFETY)
         self._points = points
         self._heartbeat_ns = round(heartbeat * 1e9)
+        self._velocity = velocity
         self._operator_ns = None if operator is None else round(operator * 1e9)
         self._values = {"VERS": version, "ROLE": int(Role.SAFETY), "SN": _SERIAL, "ID": number, "ERROR": 0}
         self._values |= _DEFAULTS | {"ZERO": int(zeroed), "STAT": Status.READY if zeroed else Status.RESET}
@@ -271,6 +274,8 @@ class EmulatedSafetyPuck:
         if self._values["ZERO"]:
             fastest = float(np.linalg.norm(points - before[2], axis=1).max()) / seconds
             fault, warning = self._values["VL2"] / _UNIT, self._values["VL1"] / _UNIT
+            if self._velocity is not None:
+                fault = warning = self._velocity
         else:
             fastest, fault = float(np.abs(joints - before[1]).max()) / seconds, _JOINT_SPEED
             warning = fault

@@ -486,9 +486,78 @@ def test_the_bus_budget_is_the_published_one(name: str, rate: float, typical: fl
     assert cycle.worst * rate == pytest.approx(worst, rel=0.01)
 
 
+COUNTS = (1578399, 655360, -655360, 327680)  # a joint turn, of encoders that Barrett offers; the third turned round
+
+
+def with_joint_encoders(driver: dict[str, Any]) -> dict[str, Any]:
+    """The section with joint encoders at pucks 1 to 4."""
+    counts = (*COUNTS, None, None, None)
+    pucks = [puck | {"joint_counts": one} for puck, one in zip(driver["pucks"], counts, strict=True)]
+    return {"pucks": pucks, "joint_encoders": [1, 2, 3, 4]}
+
+
+def encoded(**changes: Any) -> Bench:
+    return Bench(wam(**with_joint_encoders(wam().model_dump(mode="json", by_alias=True)["driver"]), **changes))
+
+
+def test_joint_encoders_are_read_beside_the_motors() -> None:
+    bench = encoded()
+    with bench.arm as arm:
+        arm.enable()
+        for _ in range(60):
+            sample = arm.exchange(np.array([5.0, 5.0, -5.0, 5.0, 0.0, 0.0, 0.0]))
+    assert sample.joint_position is not None
+    assert np.isnan(sample.joint_position[4:]).all()
+    assert (np.abs(sample.position[:4] - arm._home[:4]) > 0.005).all()
+    # Motors' counts of a differential are two, each half a count off, where the arm was opened as well.
+    np.testing.assert_allclose(sample.joint_position[:4], sample.position[:4], atol=5e-4)
+    assert not [event for event in sample.events if event.code is AxisEventCode.TRANSMISSION_SLIPPED]
+
+
+@pytest.mark.parametrize(("motor", "joints"), [(3, {3}), (1, {1, 2})])
+def test_a_cable_that_slips_shows_in_the_joints_that_its_motor_moves(motor: int, joints: set[int]) -> None:
+    bench = encoded()
+    found: list[Any] = []
+    with bench.arm as arm:
+        arm.exchange(None)
+        for _ in range(40):  # a motor that turns by itself, too slowly for a jump
+            bench.behind.inject(DriveFault("encoder_offset", motor, size=0.005, duration=10.0))
+            found += arm.exchange(None).events
+    slipped = [event for event in found if event.code is AxisEventCode.TRANSMISSION_SLIPPED]
+    assert {event.axis for event in slipped} == joints  # each once
+    assert len(slipped) == len(joints)
+    assert "rad further than its motors since the arm was opened, 0.05 rad are tolerated" in slipped[0].words
+
+
+def test_an_encoder_that_freezes_at_a_differential_shows_in_the_joints_own() -> None:
+    # Both joints seem to move, by their other motor: no position stands still.
+    bench = encoded()
+    found: list[Any] = []
+    with bench.arm as arm:
+        arm.enable()
+        bench.behind.inject(DriveFault("frozen_encoder", 1, duration=10.0))
+        for _ in range(150):
+            found += arm.exchange(np.array([0.0, 8.0, 3.0, 0.0, 0.0, 0.0, 0.0])).events
+    slipped = {event.axis for event in found if event.code is AxisEventCode.TRANSMISSION_SLIPPED}
+    assert slipped & {1, 2}
+    assert slipped <= {1, 2}
+
+
+def test_a_puck_without_the_joint_encoder_of_the_description_is_shown_and_not_enabled() -> None:
+    bench = encoded()
+    puck = bench.behind.emulator.faces[2]
+    assert isinstance(puck, EmulatedPuck)
+    puck._joint = None
+    with bench.arm as arm:
+        (wrong,) = [check for check in arm.setup_checks() if not check.good]
+        assert str(wrong) == "joint encoder of puck 3 is not told, expected told"
+        with pytest.raises(DriverError, match="joint encoder of puck 3 is not told"):
+            arm.enable()
+
+
 def test_the_budget_with_joint_encoders_is_the_published_one_and_does_not_fit_at_1_khz() -> None:
     config = load_arm("wam7_pucks_1khz").model_dump(mode="json", by_alias=True)
-    config["driver"]["joint_encoders"] = [1, 2, 3, 4]
+    config["driver"] |= with_joint_encoders(config["driver"])
     found = BarrettArm(ArmConfig.model_validate(config)).bus_budget()
     assert found is not None
     cycle = found.buses[0].cycle
@@ -510,6 +579,7 @@ Change = Callable[[dict[str, Any]], None]
         (lambda tree: tree["driver"].update(heartbeat=0.003), "at least 2 cycles"),
         (lambda tree: tree["driver"].update(lost_cycles=9), "at most 5 cycles"),
         (lambda tree: tree["driver"].update(joint_encoders=[8]), "8 is none of the nodes"),
+        (lambda tree: tree["driver"].update(joint_encoders=[3]), "node 3 must be among them, and its puck"),
         (lambda tree: tree["joints"]["j1"].update(home=None), "joints.j1.home"),
     ],
 )

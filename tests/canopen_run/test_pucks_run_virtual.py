@@ -54,9 +54,15 @@ def test_an_arm_of_pucks_is_checked_run_and_identified(tmp_path: Path, firmware:
 def test_a_velocity_fault_in_the_middle_of_a_run_is_latched_and_its_recording_can_be_read(
     tmp_path: Path, capsys: Any
 ) -> None:
-    name = "fast"  # faster than its safety puck admits; preflight's own small motions are not
-    path = arm(tmp_path, name, limits={"velocity": 1.2, "torque": 8191})
+    name = "fast"  # faster than its safety puck admits, which trips earlier than it was told
+    path = arm(tmp_path, name, emulation={"velocity": 1.2})
+    slow = arm(tmp_path, "slow", limits={"velocity": 1.2, "torque": 8191})
     state, run = state_of(tmp_path, name), tmp_path / "run"
+    # What the description says is compared before anything moves.
+    assert not checked(slow, "slow", state_of(tmp_path, "slow"))
+    refused = capsys.readouterr().out
+    assert "speed of elbow and tip of the motion (driver.limits.velocity)" in refused
+    assert "raise driver.limits.velocity" in refused
     assert checked(path, name, state), capsys.readouterr().out
     capsys.readouterr()
     assert main(["run", str(path), "--out", str(run), "--state", str(state)]) == 4

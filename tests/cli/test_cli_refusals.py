@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +12,10 @@ import pytest
 from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over, quick_arm
 
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmError
+from ident_service.errors import ArmError, plain_mistake
 from ident_service.operations.commissioning import simulate
+
+ROOT = Path(__file__).resolve().parents[2]
 
 TABLE = {"format": "ident-parameters", "version": 1, "base_parameters": {"expressions": ["m1"], "values": [-1.0]}}
 
@@ -192,6 +195,31 @@ def test_words_that_cannot_be_meant(place: Path, ident: Ident, words: tuple[str,
     assert "error: " in ended.err
     assert ended.err.rstrip().endswith("--help")
     assert left_over(place.parent) == ["place"]
+
+
+def test_a_text_of_another_form_is_refused_in_words_and_without_a_pattern(place: Path, ident: Ident) -> None:
+    arm = place / "bad.yaml"
+    wrong = 'extends: planar2\nname: "bad name!"\nconstraints: {custom: 1x}\nrecording: {columns: {foo: bar}}\n'
+    arm.write_text(wrong)
+    ended = ident("config", "check", arm)
+    assert ended.code == 2
+    assert not re.search(r"[\^$]|pattern|\[A-Z", ended.err)
+    assert "'bad name!' is not a name: letters, digits, '_', '.' and '-'" in ended.err
+    assert "at most 64 characters" in ended.err
+    for words in ("as in my_constraints:bodies", "as in q1"):
+        assert words in ended.err
+
+
+def test_every_pattern_has_its_form_in_words() -> None:
+    sources = [path.read_text() for path in (ROOT / "ident_service").rglob("*.py")]
+    patterns = {found for text in sources for found in re.findall(r'Annotated.*pattern=r?"([^"]+)"', text)}
+    assert len(patterns) > 8
+    for pattern in patterns:
+        mistake = {"type": "string_pattern_mismatch", "msg": pattern, "input": "x y", "ctx": {"pattern": pattern}}
+        said = plain_mistake(mistake)
+        assert said.startswith("'x y' is not ")
+        assert "of the form" not in said, pattern
+        assert "^" not in said
 
 
 def test_an_arm_that_is_not_simulated(place: Path, ident: Ident) -> None:

@@ -96,7 +96,7 @@ def _commands(block: Block, page: str) -> Iterator[str]:
     for number, line in lines_of(block.text):
         if line.startswith("make ") or line.lstrip().startswith("#"):
             continue
-        place = f"{page}:{block.line + 1 + number}: {line}"
+        place = f"{page}:{block.line + number}: {line}"
         yield f"echo {shlex.quote('+ ' + line)}\n{line}"
         if not line.split("#")[0].rstrip().endswith("&"):
             codes = next((found.groups() for found in EXIT_CODE.finditer(line)), ("0",))
@@ -115,12 +115,13 @@ def quicker(text: str) -> str:
     return text + "control: {rate: 250}\ndesign: {base_frequency: 0.2, harmonics: 2, periods: 2, ramp: 0.5}\n"
 
 
-def quick_checkout(folder: Path) -> Path:
-    """Copy what is shipped, compiled files included, with a quicker `planar2`; return where it is."""
+def shipped_copy(folder: Path, *, quick: bool) -> Path:
+    """Copy what is shipped, compiled files included, with a quicker `planar2` or as it is; return where it is."""
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package)
     arm = folder / "configs" / "planar2.yaml"
-    arm.write_text(quicker(arm.read_text(encoding="utf-8")), encoding="utf-8")
+    if quick:
+        arm.write_text(quicker(arm.read_text(encoding="utf-8")), encoding="utf-8")
     return folder
 
 
@@ -190,7 +191,7 @@ def _ended(folder: str, words: list[str], streams: Sequence[int]) -> int:
 
 
 def walk(
-    pages: Sequence[Path], folder: Path, *, clean: bool = False, quiet: bool = True
+    pages: Sequence[Path], folder: Path, *, clean: bool = False, quick: bool = True, quiet: bool = True
 ) -> subprocess.CompletedProcess[str]:
     """Run the commands of pages in a new folder below another one.
 
@@ -198,6 +199,7 @@ def walk(
         pages: in the order in which they are read.
         folder: where everything is made.
         clean: in a clean clone with an environment of its own, instead of this one with a quicker arm.
+        quick: whether `planar2` is a quicker one, and not as it is shipped.
         quiet: whether the output is kept for the caller, instead of being shown.
 
     Returns:
@@ -215,7 +217,7 @@ def walk(
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = str(free.getsockname()[1])
-        source, text = quick_checkout(folder / "checkout"), script(pages).replace(f":{PORT}", f":{port}")
+        source, text = shipped_copy(folder / "checkout", quick=quick), script(pages).replace(f":{PORT}", f":{port}")
         environment |= {"PYTHONPATH": str(source), "PATH": f"{tools}{os.pathsep}{environment['PATH']}"}
         path = str(folder / "commands")
         program = shlex.quote(sys.executable)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.fleets import Kind, kind, write_recording
 
 from ident_service import __version__
+from ident_service.fleet import identify
 from ident_service.fleet.factor import Described, Merged, Part, Row, Settled, merge_stored, reduce_recording, settle
 from ident_service.fleet.population import (
     ArmFit,
@@ -169,6 +172,49 @@ def test_pooling_helps_an_arm_with_one_short_recording(fleet: dict[str, list[Row
     left = arm_fit(unseen, "wls").error.relative_percent
     excess = [np.sqrt(max(error**2 - left**2, 0.0)) for error in (alone, pooled)]
     assert excess[1] < 2.0 / 3.0 * excess[0]
+
+
+def test_what_follows_from_an_arms_factors_is_made_once(
+    fleet: dict[str, list[Row]], found: Population, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Other arms may change what is said of it, and a damaged file is made again; nothing else is computed twice."""
+    keys = tuple(one.key for one in fleet["3"])
+    leaves, names = (keys, False), [(f"{one.label}w", one.sha256) for one in fleet["3"]]
+    store, config = Store(str(tmp_path)), DESCRIBED.config.model_dump_json()
+
+    def made(arms: int, pooled: bool = False) -> tuple[ArmFit, dict[str, bytes], dict[str, Any]]:
+        fit = identify._kept_fit(merged(*fleet["3"]), leaves, DESCRIBED, store, None)
+        drawn = pooled_fit(fit, found.other_arms("3"), found.scale)
+        more = {"arm": "3", "pooled": pooled, "arms": arms}
+        return fit, *identify._arm_files(
+            *(fit, merged(*fleet["3"]), leaves, names, DESCRIBED, drawn, config, more, store)
+        )
+
+    first, files, summary = made(10)
+    assert sorted(path.suffix for path in (tmp_path / "results").iterdir()) == [".npz", ".zip"]
+
+    def again(*_: object, **__: object) -> None:
+        raise AssertionError("computed again")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("ident_service.fleet.population.uncertainty", again)
+        patched.setattr(identify, "arm_estimate", again)
+        second, same, told = made(10)
+        assert same == files
+        assert {**told, "negligible": None} == {**summary, "negligible": None}
+        np.testing.assert_array_equal(second.precision, first.precision)
+        other = json.loads(made(11)[1]["parameters.json"])
+        assert (other["fleet"]["arms"], other["base_parameters"]) == (
+            11,
+            json.loads(files["parameters.json"])["base_parameters"],
+        )
+        with pytest.raises(AssertionError, match="computed again"):
+            made(10, pooled=True)
+    for path in (tmp_path / "results").iterdir():
+        path.write_bytes(path.read_bytes()[:100])
+    _, mended, _ = made(10)
+    assert set(mended) == set(files)
+    assert mended["report.txt"] == files["report.txt"]
 
 
 def test_pooling_is_judged_by_its_gain() -> None:

@@ -63,7 +63,10 @@ def test_ros_replays_every_message_in_order_and_latches_the_description(
         offered = {one.topic: one.ext.offered_qos_profiles[0] for one in bag.connections}  # type: ignore[union-attr]
         assert {topic: qos.durability.name for topic, qos in offered.items()} == {
             "/robot_description": "TRANSIENT_LOCAL",
-            **dict.fromkeys(("/joint_states", "/joint_commands", "/joint_torques", "/cycle", "/events"), "VOLATILE"),
+            **dict.fromkeys(
+                ("/joint_states", "/joint_commands", "/joint_torques", "/joint_encoders", "/cycle", "/events"),
+                "VOLATILE",
+            ),
         }
         assert {qos.reliability.name for qos in offered.values()} == {"RELIABLE"}
         assert {qos.history.name for qos in offered.values()} == {"KEEP_LAST"}
@@ -81,6 +84,7 @@ def test_ros_replays_every_message_in_order_and_latches_the_description(
     assert {topic: len(found) for topic, found in read.items()} == {
         "/robot_description": 1,
         "/events": 1,
+        "/joint_encoders": 0,
         **dict.fromkeys(("/joint_states", "/joint_commands", "/joint_torques", "/cycle"), count),
     }
     state, command = read["/joint_states"][-1], read["/joint_commands"][-1]

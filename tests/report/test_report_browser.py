@@ -1,4 +1,4 @@
-"""The page in a real browser: no complaint, no request, nothing wider than the window, and zoom that works."""
+"""The page in a real browser: no complaint, no request, nothing wider than the window, and plots that are alive."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from report.conftest import Made
 
 pytestmark = pytest.mark.slow
 
+FIRST, LAST = "#torque-1-identification-1", "#torque-1-identification-2"
+OTHER = "#torque-2-validation-1"
+MOST = 1_800_000
+
 
 @pytest.fixture(scope="module")
 def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
@@ -18,98 +22,202 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
         yield found
 
 
+def show(tab: Tab, made: Made, width: int = 1280, *, dark: bool = False) -> None:
+    """Open the page with all of its sections unfolded, and wait until its plots are drawn."""
+    tab.complaints.clear()
+    tab.open(made.folder / "report.html", width, dark=dark)
+    tab.run("document.querySelectorAll('details').forEach(one => { one.open = true; })")
+    for _ in range(3):
+        tab.run("document.querySelectorAll('figure[data-series]').forEach(one => one.scrollIntoView())")
+        tab.settle()
+    for figure in (FIRST, LAST, OTHER):
+        tab.run(f"document.querySelector('{figure}').scrollIntoView({{block: 'center', behavior: 'instant'}})")
+        tab.settle()
+
+
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", [400, 1280])
 def test_it_fits_the_window_and_nobody_complains(tab: Tab, good: Made, width: int, dark: bool) -> None:
-    tab.complaints.clear()
-    tab.open(good.folder / "report.html", width, dark=dark)
+    assert (good.folder / "report.html").stat().st_size < MOST
+    show(tab, good, width, dark=dark)
     # A scroll bar at the side takes some of the width.
     assert width - 20 <= tab.run("document.documentElement.clientWidth") <= width
     assert tab.run("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
-    inside = "[...document.querySelectorAll('figure > svg')].every(s => s.getBoundingClientRect().right <= innerWidth)"
-    assert tab.run(inside)
+    inside = "[...document.querySelectorAll('figure, figure .uplot, figure:not(.wide) > .drawing > svg')]"
+    assert tab.run(f"{inside}.every(s => s.getBoundingClientRect().right <= innerWidth)")
     ground = tab.run("getComputedStyle(document.body).backgroundColor")
     assert ground == ("rgb(13, 17, 23)" if dark else "rgb(255, 255, 255)")
     assert tab.run("getComputedStyle(document.querySelector('svg rect.ground')).fill") == ground
+    # Time plots are alive, and no figure is an empty frame.
+    assert tab.run("document.querySelectorAll('figure[data-series].drawn canvas').length") == 8
+    assert tab.run(f"({PAINTED})()") == []
+    shapes = "polyline, polygon, circle, rect:not(.ground):not(.frame)"
+    empty = f"[...document.querySelectorAll('.drawing > svg')].filter(s => s.querySelectorAll('{shapes}').length < 1)"
+    assert tab.run(f"{empty}.map(s => s.closest('figure').id)") == []
     assert tab.complaints == []
 
 
-FIRST, LAST = "#torque-1-identification-1", "#torque-1-identification-2"
-OTHER = "#torque-2-validation-1"
+# The canvases without a pixel in the colour of a line: these are neither grey nor transparent.
+PAINTED = """() => [...document.querySelectorAll('figure canvas')].filter(canvas => {
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let coloured = 0;
+  for (let k = 0; k < data.length; k += 4) {
+    const [r, g, b] = data.slice(k, k + 3);
+    if (data[k + 3] > 60 && Math.max(r, g, b) - Math.min(r, g, b) > 60) coloured++;
+  }
+  return coloured < 200;
+}).map(canvas => canvas.closest('figure').id)"""
 
 
-def ticks(tab: Tab, figure: str) -> list[float]:
-    words = tab.run(f"[...document.querySelectorAll('{figure} text.tick-x')].map(t => t.textContent)")
-    return sorted(float(word.replace("\u2212", "-")) for word in words)
+def legend(tab: Tab, figure: str) -> dict[str, str]:
+    """What the legends of a figure tell, by label."""
+    pairs = (
+        f"[...document.querySelectorAll('{figure} .u-series')].filter(one => one.getClientRects().length)"
+        ".map(one => [one.querySelector('.u-label').textContent, one.querySelector('.u-value').textContent])"
+    )
+    return dict(tab.run(pairs))
 
 
-def test_keys_zoom_the_plots_of_a_recording_together(tab: Tab, good: Made) -> None:
-    tab.complaints.clear()
-    tab.open(good.folder / "report.html", 1280)
-    whole = ticks(tab, FIRST)
-    shape = f"document.querySelector('{FIRST} polygon.measured').getAttribute('points')"
-    before = tab.run(shape)
+def centre(tab: Tab, figure: str) -> tuple[float, float, float, float]:
+    """Left, middle height, width and height of a figure's upper plot in the window [px]."""
+    tab.run(f"document.querySelector('{figure}').scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    tab.settle()
+    left, top, width, height = tab.run(
+        f"(() => {{const b = document.querySelector('{figure} .u-over').getBoundingClientRect();"
+        " return [b.left, b.top, b.width, b.height]})()"
+    )
+    return left, top + 0.5 * height, width, height
+
+
+def at(tab: Tab, figure: str, share: float) -> float:
+    """Move the pointer to a share of a plot's width; return the time [s] that its legend tells."""
+    left, y, width, _ = centre(tab, figure)
+    tab.mouse("mouseMoved", left + share * width, y)
+    tab.settle()
+    return float(legend(tab, figure)["time"].removesuffix(" s").replace("\u2212", "-"))
+
+
+def span(tab: Tab, figure: str) -> tuple[float, float]:
+    return at(tab, figure, 0.02), at(tab, figure, 0.98)
+
+
+def test_values_stand_under_the_cursor_in_all_plots_of_a_recording(tab: Tab, good: Made) -> None:
+    show(tab, good)
+    middle = at(tab, FIRST, 0.5)
+    assert middle == pytest.approx(10.0, abs=0.5)
+    traced = good.evidence.recordings[0]
+    nearest = int(abs(traced.time - middle).argmin())
+    for figure, joint in ((FIRST, 0), (LAST, 1)):
+        told = legend(tab, figure)
+        assert set(told) == {"time", "measured", "predicted", "residual"}
+        trace = traced.joints[joint]
+        for name, values in (("measured", trace.torque), ("predicted", trace.predicted), ("residual", trace.residual)):
+            near = values[:, max(nearest - 3, 0) : nearest + 4]
+            slack = 1e-3 * abs(near).max()
+            for word in told[name].replace("\u2212", "-").split(" to "):
+                assert near.min() - slack <= float(word) <= near.max() + slack, (figure, told)
+    # Another recording has a time of its own.
+    assert legend(tab, OTHER)["measured"] == "\u2014"
+    assert tab.complaints == []
+
+
+def test_keys_and_buttons_zoom_the_plots_of_a_recording_together(tab: Tab, good: Made) -> None:
+    show(tab, good)
+    whole, other = span(tab, FIRST), span(tab, OTHER)
+    assert whole[1] - whole[0] > 18.0
     tab.run(f"document.querySelector('{FIRST}').focus()")
     for _ in range(3):
         tab.press("+")
-    near = ticks(tab, FIRST)
-    assert near[-1] - near[0] < 0.3 * (whole[-1] - whole[0])
-    assert ticks(tab, LAST) == near
-    assert ticks(tab, OTHER)[-1] - ticks(tab, OTHER)[0] >= 10.0
-    assert tab.run(shape) != before
+    near = span(tab, FIRST)
+    assert near[1] - near[0] == pytest.approx((whole[1] - whole[0]) / 8.0, rel=0.1)
+    assert span(tab, LAST) == pytest.approx(near, abs=0.05)
+    assert span(tab, OTHER) == pytest.approx(other, abs=0.05)
     tab.press("ArrowLeft")
-    assert ticks(tab, FIRST)[0] < near[0]
+    assert span(tab, FIRST)[0] < near[0] - 0.2
     tab.press("0")
-    assert ticks(tab, FIRST) == whole
+    assert span(tab, FIRST) == pytest.approx(whole, abs=0.05)
+    press = 'document.querySelector(\'.recording[data-recording="0"] button[title="{}"]\').click()'
+    tab.run(press.format("zoom in"))
+    tab.settle()
+    assert span(tab, LAST)[1] - span(tab, LAST)[0] == pytest.approx((whole[1] - whole[0]) / 2.0, rel=0.1)
+    tab.run(press.format("show all"))
+    tab.settle()
+    assert span(tab, LAST) == pytest.approx(whole, abs=0.05)
     assert tab.complaints == []
 
 
-def test_what_is_drawn_again_is_what_was_drawn(tab: Tab, good: Made) -> None:
-    tab.open(good.folder / "report.html", 1280)
-    extremes = (
-        "['measured', 'predicted', 'residual'].map(kind => {"
-        f"const y = document.querySelector('{FIRST} polygon.' + kind)"
-        ".getAttribute('points').split(' ').map(p => +p.split(',')[1]); return [Math.min(...y), Math.max(...y)]})"
-    )
-    before = tab.run(extremes)
-    tab.run(f"document.querySelector('{FIRST}').focus()")
-    tab.press("+")
-    tab.press("0")
-    for one, other in zip(before, tab.run(extremes), strict=True):
-        assert one == pytest.approx(other, abs=0.2)
-
-
 def test_mouse_and_wheel(tab: Tab, good: Made) -> None:
-    tab.complaints.clear()
-    tab.open(good.folder / "report.html", 1280)
-    tab.run(f"document.querySelector('{FIRST}').scrollIntoView({{block: 'center'}})")
-    left, top, width, height = tab.run(
-        f"(() => {{const b = document.querySelector('{FIRST} svg rect.frame').getBoundingClientRect();"
-        " return [b.left, b.top, b.width, b.height]})()"
-    )
-    whole, y = ticks(tab, FIRST), top + 0.5 * height
+    show(tab, good)
+    whole = span(tab, FIRST)
+    left, y, width, _ = centre(tab, FIRST)
     # A wheel over a plot that nobody has clicked scrolls the page.
     tab.mouse("mouseWheel", left + 0.5 * width, y, deltaX=0, deltaY=-120)
     tab.settle()
-    assert ticks(tab, FIRST) == whole
-    tab.run(f"document.querySelector('{FIRST}').scrollIntoView({{block: 'center', behavior: 'instant'}})")
-    tab.settle()
+    assert span(tab, FIRST) == pytest.approx(whole, abs=0.05)
+    left, y, width, _ = centre(tab, FIRST)
+    tab.mouse("mouseMoved", left + 0.4 * width, y)
     tab.mouse("mousePressed", left + 0.4 * width, y, button="left", clickCount=1)
     tab.mouse("mouseMoved", left + 0.6 * width, y, button="left")
-    assert tab.run(f"document.querySelectorAll('{FIRST} rect.selection').length") == 1
     tab.mouse("mouseReleased", left + 0.6 * width, y, button="left", clickCount=1)
     tab.settle()
-    near = ticks(tab, FIRST)
+    near = span(tab, FIRST)
     # The middle fifth of twenty seconds.
-    assert 7.0 < near[0] < near[-1] < 13.0
-    assert tab.run(f"document.querySelectorAll('{FIRST} rect.selection').length") == 0
+    assert 7.0 < near[0] < near[1] < 13.0
+    assert span(tab, LAST) == pytest.approx(near, abs=0.05)
+    left, y, width, _ = centre(tab, FIRST)
     tab.mouse("mouseWheel", left + 0.5 * width, y, deltaX=0, deltaY=120)
     tab.settle()
+    wider = span(tab, FIRST)
+    assert wider[1] - wider[0] > 1.1 * (near[1] - near[0])
+    left, y, width, _ = centre(tab, FIRST)
     for clicks in (1, 2):
         tab.mouse("mousePressed", left + 0.5 * width, y, button="left", clickCount=clicks)
         tab.mouse("mouseReleased", left + 0.5 * width, y, button="left", clickCount=clicks)
     tab.settle()
-    assert ticks(tab, FIRST) == whole
+    assert span(tab, FIRST) == pytest.approx(whole, abs=0.05)
+    assert tab.complaints == []
+
+
+def test_the_matrix_names_the_pair_under_the_pointer_and_by_keys(tab: Tab, good: Made) -> None:
+    show(tab, good)
+    base = good.estimate.base
+    names = [base.names[column] for column in base.base]
+    covariance = good.estimate.covariance
+    tab.run("document.querySelector('#correlation').scrollIntoView({block: 'center', behavior: 'instant'})")
+    tab.settle()
+    place = (
+        "(() => {const f = document.querySelector('#correlation'), a = JSON.parse(f.dataset.matrix),"
+        " b = f.querySelector('svg').getBoundingClientRect();"
+        " return [b.left + a.left + 2.5 * a.cell, b.top + a.top + 5.5 * a.cell]})()"
+    )
+    x, y = tab.run(place)
+    tab.mouse("mouseMoved", x, y)
+    tab.settle()
+    said = "document.querySelector('#correlation output').textContent"
+    head, value = tab.run(said).split(": ")
+    assert head == f"{names[5]} with {names[2]}"
+    expected = covariance[5, 2] / (covariance[5, 5] * covariance[2, 2]) ** 0.5
+    assert float(value.replace("\u2212", "-")) == pytest.approx(expected, abs=0.0051)
+    tab.run("document.querySelector('#correlation').focus()")
+    tab.press("ArrowLeft")
+    tab.press("ArrowDown")
+    assert tab.run(said).startswith(f"{names[6]} with {names[1]}: ")
+    assert tab.complaints == []
+
+
+def test_paper_shows_all_that_is_folded(tab: Tab, good: Made) -> None:
+    tab.complaints.clear()
+    tab.open(good.folder / "report.html", 1280)
+    tab.call("Emulation.setEmulatedMedia", media="print")
+    try:
+        # By the style sheet alone, before any event of printing.
+        for place in ("#files table", "#bodies svg", "#parameters details table", f"{FIRST} .drawing svg"):
+            box = f"document.querySelector('{place}').getBoundingClientRect()"
+            assert tab.run(f"{box}.height") > 10, place
+        assert tab.run("[...document.querySelectorAll('.live, .bar')].every(one => !one.getClientRects().length)")
+        assert tab.run("document.documentElement.scrollWidth - document.documentElement.clientWidth") == 0
+    finally:
+        tab.call("Emulation.setEmulatedMedia", media="")
     assert tab.complaints == []
 
 
@@ -117,10 +225,13 @@ def test_it_reads_without_a_script(tab: Tab, good: Made) -> None:
     tab.call("Emulation.setScriptExecutionDisabled", value=True)
     try:
         tab.open(good.folder / "report.html", 1280)
-        assert tab.run("document.querySelectorAll('p.hint').length") == 0
+        assert tab.run("document.querySelectorAll('.bar, canvas').length") == 0
         # All lines are there, as large as they should be.
         for kind in ("measured", "predicted", "residual"):
             assert tab.run(f"document.querySelector('{FIRST} polygon.{kind}').getBoundingClientRect().width") > 300
         assert tab.run("document.querySelector('#files h2').getBoundingClientRect().height") > 10
+        # A section that is linked to unfolds by itself.
+        tab.run("location.hash = '#files-content'")
+        assert tab.run("document.querySelector('#files table').getBoundingClientRect().height") > 10
     finally:
         tab.call("Emulation.setScriptExecutionDisabled", value=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,7 @@ from ident_service.daemon.jobs.requests import (
     Export,
     Feasible,
     Figures,
+    Fleet,
     Home,
     Identify,
     Judge,
@@ -53,11 +55,14 @@ from ident_service.registry.runs import (
     RUNS,
     known_run,
     recording_name,
+    recordings_of,
     run_file,
     run_folder,
 )
 
 JOBS = "jobs"
+_MOST_OF_FLEET: Final = 10_000  # recordings; more would be too many words for a command
+_OF_RUN: Final = r"/runs/[^-/]+-(?P<arm>[^/]+)-[0-9a-f]{6}/"  # the folder of a run, see `new_id`
 _WITHOUT_FOLDER = (
     Check,
     Watch,
@@ -78,6 +83,7 @@ _VERBS: Final = {
     "bus_scan": ("bus", "scan"),
     "bus_probe": ("bus", "probe"),
     "config_check": ("config", "check"),
+    "fleet": ("fleet", "identify"),
 }
 FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(DOWNLOADABLE_KINDS, EXPORTS)}
 
@@ -169,6 +175,8 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
         return [path, *motion, *_given_options({"seed": asked.seed, "feasible-set": asked.feasible_set})]
     if isinstance(asked, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
         return [path]
+    if isinstance(asked, Fleet):
+        return _fleet(db, state, asked, path)
     if isinstance(asked, BusLoad):
         return [path, *_given_options({"rate": asked.rate})]
     if isinstance(asked, Zero):
@@ -184,6 +192,26 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
         speed = [] if isinstance(asked, Preview) else [f"--speed={asked.speed!r}"]
         return [path, *motion, *speed, *(_until(asked) if isinstance(asked, Run) else [])]
     raise AssertionError(asked)
+
+
+def _fleet(db: Database, state: Path, asked: Fleet, described: str) -> list[str]:
+    found = recordings_of(db, asked.arms)
+    if not found:
+        raise UsageError(f"{', '.join(asked.arms)}: the registry has no recording of such arms; see the list of runs")
+    if len(found) > _MOST_OF_FLEET:
+        raise UsageError(
+            f"{len(found)} recordings, and a job takes {_MOST_OF_FLEET}: name fewer arms, or use `ident fleet "
+            "identify` with a pattern at the daemon's machine"
+        )
+    foreign = [row["run"] for row in found if not re.search(_OF_RUN, f"/runs/{row['run']}/")]
+    if foreign:
+        raise UsageError(
+            f"{', '.join(foreign[:5])}: imported runs whose names do not tell their arm (TIME-ARM-XXXXXX); use `ident "
+            "fleet identify --names` at the daemon's machine"
+        )
+    files = [str(run_file(db, state, row["run"], row["name"])) for row in found]
+    again = ["--settle-again"] if asked.settle_again else []
+    return [*files, f"--arm={described}", f"--names={_OF_RUN}", f"--store={state / 'fleet' / 'store'}", *again]
 
 
 def _until(asked: Run) -> list[str]:

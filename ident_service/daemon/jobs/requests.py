@@ -268,6 +268,21 @@ class Judge(BaseJobRequest):
     against: Annotated[int, Field(ge=1, lt=10_000)]
 
 
+ArmPattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9*?_.\-\[\]]{1,64}$")]
+
+
+class Fleet(BaseJobRequest):
+    """Identify arms of one kind together, from every recording that the registry has of them.
+
+    `arm` describes each of them; `arms` are their names, or patterns of names such as `cell*`.
+    """
+
+    kind: Literal["fleet"]
+    arm: ArmName
+    arms: Annotated[tuple[ArmPattern, ...], Field(min_length=1, max_length=1000)]
+    settle_again: bool = False
+
+
 Asked = Annotated[
     Base
     | Preview
@@ -294,7 +309,8 @@ Asked = Annotated[
     | Figures
     | Payload
     | Compare
-    | Judge,
+    | Judge
+    | Fleet,
     Field(discriminator="kind"),
 ]
 """Any request for a job; `kind` tells which."""

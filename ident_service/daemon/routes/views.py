@@ -1,6 +1,7 @@
 """Serve arms and motions as what viewers in three dimensions need: solids, joints, positions over time, clearance.
 
-The last few documents are kept, since a page is often loaded again; one is computed at a time.
+The last few documents are kept, since a page is often loaded again; one is computed at a time. What computes them is
+imported when the first is asked for, so that the service starts without.
 """
 
 from __future__ import annotations
@@ -18,17 +19,13 @@ from ident_service.config.load import arm_from_json, load_recording_format
 from ident_service.daemon.dependencies import Serving, Viewer
 from ident_service.daemon.errors import failures
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
+from ident_service.daemon.live import ARM
 from ident_service.errors import UnknownId, UsageError
-from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.motion_file import read_excitation
-from ident_service.model.arm_model import arm_model
-from ident_service.operations.arm_view import view_at_rest, view_of_motion, view_of_recording
 from ident_service.registry import arms as known
 from ident_service.registry import motions, runs
 from ident_service.results.manifest import file_sha256
-from ident_service.results.run_folder import ARM
 
-router = APIRouter(prefix="/api/v1", tags=["views"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["views"], responses=failures(404, 409))
 _KEPT: Final = 16
 _MOST_BYTES: Final = 256 * 2**20  # of a recording: half a minute of reading
 OWN: Final = "own"
@@ -142,19 +139,19 @@ def view_arm(
 ) -> Response:
     """Show an arm along a motion, the description's `own` or one by its id; without any, at home."""
     config = known.known_arm(service.db, service.state, arm).config
-    if motion is None:
-        return _answer(request, (config.sha256,), lambda: view_at_rest(arm_model(config)))
-    if motion == OWN:
-        return _answer(
-            request,
-            (config.sha256, OWN, repr(speed)),
-            lambda: view_of_motion(model := arm_model(config), excitation(model, "identification"), speed),
-        )
-    if motions.known_motion(service.db, motion)["arm"] != arm:
-        raise UnknownId(f"the motion {motion} is of another arm than {arm}")
-    path = motions.motion_path(service.db, service.state, motion)
-    key = (config.sha256, file_sha256(path), repr(speed))
-    return _answer(request, key, lambda: view_of_motion(arm_model(config), read_excitation(path), speed))
+    path = None
+    if motion is not None and motion != OWN:
+        if motions.known_motion(service.db, motion)["arm"] != arm:
+            raise UnknownId(f"the motion {motion} is of another arm than {arm}")
+        path = motions.motion_path(service.db, service.state, motion)
+    key = (config.sha256, str(motion), repr(speed), "" if path is None else file_sha256(path))
+
+    def make() -> dict[str, Any]:
+        from ident_service.operations.arm_view import view_at_rest, view_of_motion
+
+        return view_at_rest(config) if motion is None else view_of_motion(config, path, speed)
+
+    return _answer(request, key, make)
 
 
 @router.get("/runs/{run}/view", response_model=ViewAnswer)
@@ -173,7 +170,13 @@ def view_run(service: Serving, _: Viewer, request: Request, run: Id, name: FileN
     sha256 = runs.run_files(service.db, service.state, run)[chosen]
     columns = path.parent / runs.COLUMNS
     form = load_recording_format(columns) if columns.is_file() else config.recording
-    return _answer(request, (config.sha256, sha256), lambda: view_of_recording(arm_model(config), path, form))
+
+    def make() -> dict[str, Any]:
+        from ident_service.operations.arm_view import view_of_recording
+
+        return view_of_recording(config, path, form)
+
+    return _answer(request, (config.sha256, sha256), make)
 
 
 def _answer(request: Request, key: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> Response:

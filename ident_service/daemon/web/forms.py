@@ -20,7 +20,7 @@ from pydantic import ValidationError
 from ident_service.daemon.dependencies import COOKIE, service_of
 from ident_service.daemon.errors import status_of
 from ident_service.daemon.web.render import page
-from ident_service.errors import IdentError
+from ident_service.errors import IdentError, plain_mistake
 
 _MOST_FIELDS = 64
 
@@ -70,7 +70,7 @@ def words_of(error: IdentError | RequestValidationError | ValidationError) -> st
     """Return what is wrong with a request, for a person."""
     if isinstance(error, IdentError):
         return str(error)
-    return "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()[:5])
+    return "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors()[:5])
 
 
 def failure(request: Request, status: int, words: str) -> Response:

@@ -120,7 +120,7 @@
         cursor: { sync: { key: this.key, scales: ["x", null] }, drag: { x: true, y: false }, points: { show: false } },
         scales: { x: { time: false, range: (_, from, to) => [from ?? this.now[0], to ?? this.now[1]] } },
         axes: [axis(last ? { size: 34, label: "time [s]", labelSize: 18 } : { size: 26 }), axis({ label, size: 58, labelSize: 18, values: (_, ticks) => ticks.map(words) })],
-        series: [{ class: last ? "lowest" : "", label: "time", value: (_, at) => (at === null ? "\u2014" : words(at) + " s") }, ...series],
+        series: [{ class: last ? "lowest" : null, label: "time", value: (_, at) => (at === null ? "\u2014" : words(at) + " s") }, ...series],
         bands: series.map((_, k) => k).filter((k) => k % 2).map((k) => ({ series: [k + 1, k], fill: series[k].stroke })),
         hooks: {
           drawClear: [shade(stretches)],

@@ -1,0 +1,127 @@
+"""The documents hold: their commands run, every fault has its entry, tables and figures are those of the code."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from documents.walk import PORT, ROOT, Block, blocks, script, walk
+
+from ident_service.motion.faults import FAULTS, Reaction
+from ident_service.motion.state_machine import TRANSITIONS
+from ident_service.motion.ticket import CODES
+from ident_service.operations.arm_checks import TITLES
+
+DOCS = ROOT / "docs"
+# The newcomer's walk, and what else the same folder is good for; then the arm of one's own.
+WALKS = (
+    (
+        *("../README.md", "tutorial.md", "identify-recordings.md", "reidentification.md", "reference/python-api.md"),
+        *("concepts/base-parameters.md", "concepts/excitation.md", "tasks.md", "security.md", "troubleshooting.md"),
+        "reference/command-line.md",
+    ),
+    ("your-own-arm.md", "commissioning.md"),
+)
+REACTIONS = {
+    "Warning": Reaction.WARN,
+    "Controlled stop": Reaction.CONTROLLED_STOP,
+    "Damped lowering": Reaction.DAMPED_LOWERING,
+    "Quick stop": Reaction.QUICK_STOP,
+    "Torque off": Reaction.TORQUE_OFF,
+}
+
+
+def text(page: str) -> str:
+    return (DOCS / page).read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("pages", WALKS, ids=lambda pages: Path(pages[0]).stem)
+def test_the_commands_of_the_pages_run(pages: tuple[str, ...], tmp_path: Path) -> None:
+    done = walk([DOCS / page for page in pages], tmp_path)
+    assert done.returncode == 0, done.stdout[-3000:]
+    asked = sum(block.text.count("ident ") for page in pages for block in blocks(text(page)) if block.language == "sh")
+    assert asked > 9
+    assert done.stdout.count("\n+ ident ") + done.stdout.startswith("+ ident ") > 9
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(3600)
+def test_a_newcomer_gets_there_in_a_clean_clone() -> None:
+    pages = [ROOT / "README.md", *(DOCS / page for page in WALKS[0][1:3]), DOCS / "your-own-arm.md"]
+    command = [sys.executable, str(ROOT / "tests" / "documents" / "walk.py"), "--clean", *map(str, pages)]
+    subprocess.run(command, check=True)
+
+
+def test_every_page_with_commands_is_walked() -> None:
+    with_commands = {
+        path.relative_to(DOCS).as_posix()
+        for path in DOCS.rglob("*.md")
+        if any(block.language == "sh" for block in blocks(path.read_text(encoding="utf-8")))
+    }
+    assert with_commands <= {page for pages in WALKS for page in pages}
+
+
+def test_a_walk_ends_at_the_first_command_that_does_not_end_as_its_page_says(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```sh\ntrue\nfalse # exit code 1: no\n(exit 3) # exit code 0 or 3\n```\n\n"
+        "<!-- walk: skip, it is for people -->\n```sh\nexit 9\n```\n\n```yaml\n# a.yaml\nb: 1\n```\n\n"
+        "<!-- file: c.json -->\n```json\n{}\n```\n\n```sh\ncat a.yaml \\\n  c.json\nfalse\necho not reached\n```\n"
+    )
+    done = subprocess.run(["bash", "-c", script([page])], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == "page.md:25: false: exit code 1 instead of 0\n"
+    assert "# a.yaml\nb: 1\n{}\n" in done.stdout
+    assert "not reached" not in done.stdout
+    assert list(blocks("```text\nx\n```\n```yaml\nkey: 1\n```\n")) == []
+    assert list(blocks("```python\nx\n```\n")) == [Block("python", "x\n", 2)]
+
+
+def test_the_port_of_the_documents_is_that_of_the_daemon() -> None:
+    assert f"http://127.0.0.1:{PORT}" in text("tutorial.md")
+
+
+def test_the_readme_is_one_page() -> None:
+    readme = text("../README.md")
+    assert len(readme.split()) <= 700
+    assert len(re.findall(r"!\[", readme)) == 1
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for page in ("../README.md", "../CONTRIBUTING.md"):
+        for target in re.findall(
+            r"\bmake ([a-z-]+)\b", "\n".join(re.findall(r"`make [^`]+`|^make .*$", text(page), re.M))
+        ):
+            assert re.search(rf"(?m)^{target}:", makefile), (page, target)
+
+
+def test_every_fault_has_an_entry_with_three_checks() -> None:
+    page = text("troubleshooting.md").partition("## By fault code")[2]
+    entries = dict(re.findall(r"(?ms)^#### `(\w+)`\n(.*?)(?=^#|\Z)", page))
+    assert sorted(entries) == sorted(FAULTS)
+    for code, entry in entries.items():
+        begins = re.match(r"\n\*([A-Z][a-z ]+)\.\* \S.*\n\n", entry)
+        assert begins is not None, code
+        assert REACTIONS[begins[1]] is FAULTS[code].reaction, code
+        assert re.findall(r"(?m)^(\d)\. \S", entry) == ["1", "2", "3"], code
+
+
+def test_every_row_of_the_preflight_is_explained() -> None:
+    rows = re.findall(r"(?m)^\| ([^|]+) \| `(\w+)` \| [^|]+ \| [^|]+ \|$", text("commissioning.md"))
+    assert [code for _, code in rows] == list(CODES)
+    assert {code: title for title, code in rows} == TITLES
+
+
+def test_the_figure_of_the_states_is_that_of_the_code() -> None:
+    drawn = (DOCS / "images" / "states.svg").read_text(encoding="utf-8")
+    for one, many in TRANSITIONS.items():
+        assert re.search(rf"[>\s]{one.value}: {' '.join(to.value for to in many)}[;<]", drawn), "make docs-figures"
+
+
+def test_every_page_has_its_place_in_the_site() -> None:
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
+    named = re.findall(r"[\w/-]+\.md", nav)
+    assert sorted(named) == sorted(path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md"))
