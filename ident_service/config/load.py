@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -21,15 +21,14 @@ from ident_service.config.payload import Payload
 from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile, did_you_mean
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, first_problems, read_tree
+from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, arm_schema_file, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
 from ident_service.errors import ConfigError, DriverError, Problem, UsageError, plain_mistake
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
-    from ident_service.config.schema import KnownKeys
-
+_FEW = 3  # sections that are named as those in which a key belongs
 _ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
 _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _ANOTHER_UNIT = 100.0  # times between a joint's torque limit and what its motors give: no choice is so far off
@@ -329,10 +328,109 @@ def _validated(kind: type[_Described], tree: Tree, path: Path, context: dict[str
         raise ConfigError(first_problems(list(_problems(error, tree, path, section)))) from None
 
 
+def nested(schema: Mapping[str, Any], document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Yield a part of a schema and all alternatives in it, references followed.
+
+    Args:
+        schema: the part.
+        document: the whole.
+    """
+    yield schema
+    if "$ref" in schema:
+        yield from nested(document["definitions"][schema["$ref"].rpartition("/")[2]], document)
+    for words in ("anyOf", "allOf"):
+        for one in schema.get(words, ()):
+            yield from nested(one, document)
+
+
+class KnownKeys:
+    """Keys of a file, by the published schema, for messages about its mistakes."""
+
+    def __init__(self, section: str = "") -> None:
+        """Read the schema; `section` names the definition of which the file is, a description when empty."""
+        self._document = json.loads(arm_schema_file().read_text(encoding="utf-8"))
+        self._root = self._document["definitions"][section] if section else self._document
+
+    def description(self, where: Sequence[str | int], value: Any) -> str:
+        """Return the words of a key; `value` is the file's. Empty for a key that is not known."""
+        return next((str(one["description"]) for one in self._at(where, value) if "description" in one), "")
+
+    def unit(self, where: Sequence[str | int], value: Any) -> str:
+        """Return the unit of a key or, of an item in a list, of the nearest key above it; empty for none."""
+        for length in range(len(where), 0, -1):
+            if found := next((str(one["x-unit"]) for one in self._at(where[:length], value) if "x-unit" in one), ""):
+                return "" if found == "1" else found
+            if isinstance(where[length - 1], str):
+                break
+        return ""
+
+    def remedy(self, where: Sequence[str | int], value: Any) -> str:
+        """Return what to do about an unknown key: the key that is meant, where it belongs, or what is known there."""
+        *above, word = where
+        key = str(word)
+        here = self._keys_at(above, value)
+        if near := did_you_mean(key, here, 0.8):
+            return near
+        for length in range(len(above) - 1, -1, -1):
+            if key in self._keys_at(above[:length], value):
+                outer = ".".join(map(str, above[:length]))
+                place = f"in {outer}" if outer else "at the top of the file"
+                return f"; it belongs {place}, not under {above[-1]}"
+        top = self._root.get("properties", {}).items()
+        elsewhere = [one for one, part in top if any(key in one for one in self._inside(part))]
+        if 0 < len(elsewhere) <= _FEW:
+            return f"; it belongs in {' or '.join(elsewhere)}"
+        return did_you_mean(key, here) or f"; leave it out: known here are {', '.join(here)}"
+
+    def items(self, where: Sequence[str | int], value: Any) -> int | None:
+        """Return how many items a list has; None where that is free."""
+        return next((int(one["minItems"]) for one in self._at(where, value) if "minItems" in one), None)
+
+    def _keys_at(self, where: Sequence[str | int], value: Any) -> list[str]:
+        return sorted({key for one in self._at(where, value) for key in one.get("properties", {})})
+
+    def _inside(self, part: Mapping[str, Any]) -> Iterator[Iterable[str]]:
+        """Yield the keys of a section, in each of its alternatives."""
+        for one in nested(part, self._document):
+            yield one.get("properties", {})
+
+    def _at(self, where: Sequence[str | int], value: Any) -> list[Mapping[str, Any]]:
+        """Return the schemas of the value at a path, with all their alternatives that fit the value's kind."""
+        parts = self._fitting([self._root], value)
+        for step in where:
+            value = value.get(step) if isinstance(value, dict) else None
+            below: list[Mapping[str, Any]] = []
+            for one in parts:
+                if step in one.get("properties", {}):
+                    below.append(one["properties"][step])
+                elif isinstance(one.get("additionalProperties"), dict):
+                    below.append(one["additionalProperties"])
+                if isinstance(step, int) and isinstance(one.get("items"), dict):
+                    below.append(one["items"])
+            parts = self._fitting(below, value)
+        return parts
+
+    def _fitting(self, parts: Iterable[Mapping[str, Any]], value: Any) -> list[Mapping[str, Any]]:
+        found: list[Mapping[str, Any]] = []
+        for part in parts:
+            found.append(part)
+            if "$ref" in part:
+                found += self._fitting([self._document["definitions"][part["$ref"].rpartition("/")[2]]], value)
+            options = [one for words in ("anyOf", "allOf") for one in part.get(words, ())]
+            if isinstance(value, dict):
+                options = [one for one in options if fits_kind(value, one, self._document)]
+            found += self._fitting(options, value)
+        return found
+
+
+def fits_kind(value: Mapping[str, Any], part: Mapping[str, Any], document: Mapping[str, Any]) -> bool:
+    """Return whether a mapping is of the kind that a part of a schema describes."""
+    kinds = [one["properties"]["kind"] for one in nested(part, document) if "kind" in one.get("properties", {})]
+    return "kind" not in value or not kinds or any(value["kind"] == one.get("const") for one in kinds)
+
+
 def _problems(error: ValidationError, tree: Tree, path: Path, section: str = "") -> Iterator[Problem]:
     """Yield each mistake that the models found, those of one value as one, with what should stand there instead."""
-    from ident_service.config.schema import KnownKeys  # only for a file with mistakes
-
     known = KnownKeys(section)
     found: dict[KeyPath, list[ErrorDetails]] = {}
     for mistake in error.errors(include_url=False):

@@ -15,19 +15,19 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from ident_service.config.arm import ArmConfig
-from ident_service.config.quantities import Section, did_you_mean
-from ident_service.config.yaml_source import MODELINE, arm_schema_file, shipped_arms
+from ident_service.config.load import fits_kind
+from ident_service.config.quantities import Section
+from ident_service.config.yaml_source import MODELINE, shipped_arms
 
 _UNIT = re.compile(r"\[([^\]]+)\]")
 _LONGEST_EXAMPLE = 60  # characters
-_FEW = 3  # sections that are named as those in which a key belongs
 _TOP = "Top level"
 _EXTENDS = (
     "Another description, a file or the name of a shipped one, whose keys count where this one does not have them."
@@ -117,101 +117,6 @@ def _in_draft_7(schema: Any) -> Any:
     if "$ref" in found and len(found) > 1:  # draft 7 ignores what stands beside a reference
         found = {"allOf": [{"$ref": found.pop("$ref")}], **found}
     return found
-
-
-def nested(schema: Mapping[str, Any], document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
-    """Yield a part of a schema and all alternatives in it, references followed.
-
-    Args:
-        schema: the part.
-        document: the whole.
-    """
-    yield schema
-    if "$ref" in schema:
-        yield from nested(document["definitions"][schema["$ref"].rpartition("/")[2]], document)
-    for words in ("anyOf", "allOf"):
-        for one in schema.get(words, ()):
-            yield from nested(one, document)
-
-
-class KnownKeys:
-    """Keys of a file, by the published schema, for messages about its mistakes."""
-
-    def __init__(self, section: str = "") -> None:
-        """Read the schema; `section` names the definition of which the file is, a description when empty."""
-        self._document = json.loads(arm_schema_file().read_text(encoding="utf-8"))
-        self._root = self._document["definitions"][section] if section else self._document
-
-    def description(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the words of a key; `value` is the file's. Empty for a key that is not known."""
-        return next((str(one["description"]) for one in self._at(where, value) if "description" in one), "")
-
-    def unit(self, where: Sequence[str | int], value: Any) -> str:
-        """Return the unit of a key or, of an item in a list, of the nearest key above it; empty for none."""
-        for length in range(len(where), 0, -1):
-            if found := next((str(one["x-unit"]) for one in self._at(where[:length], value) if "x-unit" in one), ""):
-                return "" if found == "1" else found
-            if isinstance(where[length - 1], str):
-                break
-        return ""
-
-    def remedy(self, where: Sequence[str | int], value: Any) -> str:
-        """Return what to do about an unknown key: the key that is meant, where it belongs, or what is known there."""
-        *above, word = where
-        key = str(word)
-        here = self._keys_at(above, value)
-        if near := did_you_mean(key, here, 0.8):
-            return near
-        for length in range(len(above) - 1, -1, -1):
-            if key in self._keys_at(above[:length], value):
-                outer = ".".join(map(str, above[:length]))
-                place = f"in {outer}" if outer else "at the top of the file"
-                return f"; it belongs {place}, not under {above[-1]}"
-        top = self._root.get("properties", {}).items()
-        elsewhere = [one for one, part in top if any(key in one for one in self._inside(part))]
-        if 0 < len(elsewhere) <= _FEW:
-            return f"; it belongs in {' or '.join(elsewhere)}"
-        return did_you_mean(key, here) or f"; leave it out: known here are {', '.join(here)}"
-
-    def items(self, where: Sequence[str | int], value: Any) -> int | None:
-        """Return how many items a list has; None where that is free."""
-        return next((int(one["minItems"]) for one in self._at(where, value) if "minItems" in one), None)
-
-    def _keys_at(self, where: Sequence[str | int], value: Any) -> list[str]:
-        return sorted({key for one in self._at(where, value) for key in one.get("properties", {})})
-
-    def _inside(self, part: Mapping[str, Any]) -> Iterator[Iterable[str]]:
-        """Yield the keys of a section, in each of its alternatives."""
-        for one in nested(part, self._document):
-            yield one.get("properties", {})
-
-    def _at(self, where: Sequence[str | int], value: Any) -> list[Mapping[str, Any]]:
-        """Return the schemas of the value at a path, with all their alternatives that fit the value's kind."""
-        parts = self._fitting([self._root], value)
-        for step in where:
-            value = value.get(step) if isinstance(value, dict) else None
-            below: list[Mapping[str, Any]] = []
-            for one in parts:
-                if step in one.get("properties", {}):
-                    below.append(one["properties"][step])
-                elif isinstance(one.get("additionalProperties"), dict):
-                    below.append(one["additionalProperties"])
-                if isinstance(step, int) and isinstance(one.get("items"), dict):
-                    below.append(one["items"])
-            parts = self._fitting(below, value)
-        return parts
-
-    def _fitting(self, parts: Iterable[Mapping[str, Any]], value: Any) -> list[Mapping[str, Any]]:
-        found: list[Mapping[str, Any]] = []
-        for part in parts:
-            found.append(part)
-            if "$ref" in part:
-                found += self._fitting([self._document["definitions"][part["$ref"].rpartition("/")[2]]], value)
-            options = [one for words in ("anyOf", "allOf") for one in part.get(words, ())]
-            if isinstance(value, dict):
-                options = [one for one in options if _is_kind(value, one, self._document)]
-            found += self._fitting(options, value)
-        return found
 
 
 def reference() -> str:
@@ -341,7 +246,7 @@ def _examples(schema: Mapping[str, Any]) -> dict[tuple[str, str], str]:
             walk(value, schema["definitions"][section], section)
         for one in (*part.get("anyOf", ()), *part.get("allOf", ())):
             # Of a section that comes in kinds, the keys of its own kind alone.
-            if not isinstance(value, dict) or _is_kind(value, one, schema):
+            if not isinstance(value, dict) or fits_kind(value, one, schema):
                 walk(value, one, section)
         if isinstance(value, dict):
             for key, child in part.get("properties", {}).items():
@@ -360,11 +265,6 @@ def _examples(schema: Mapping[str, Any]) -> dict[tuple[str, str], str]:
     for path in shipped_arms().values():
         walk(yaml.safe_load(path.read_text(encoding="utf-8")), schema, "")
     return found
-
-
-def _is_kind(value: Mapping[str, Any], part: Mapping[str, Any], document: Mapping[str, Any]) -> bool:
-    kinds = [one["properties"]["kind"] for one in nested(part, document) if "kind" in one.get("properties", {})]
-    return "kind" not in value or not kinds or any(value["kind"] == one.get("const") for one in kinds)
 
 
 def main(files: list[str]) -> int:
