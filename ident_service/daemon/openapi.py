@@ -23,6 +23,7 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
         "Identify from a run": {"job": {"kind": "identify", "arm": "wam7_sim", "recordings": [{"run": _RUN}]}},
         "Export": {"job": {"kind": "export", "run": _RUN, "formats": ["urdf", "mjcf"]}},
     },
+    "Labels": {"What was different": {"tags": ["warm", "belt"], "note": "before the belt was changed"}},
     "Login": {"A token": {"token": "ident_x3J0"}},
     "MotionUpload": {
         "The content of a motion.json": {"arm": "planar2", "motion": '{"format": "ident-motion", "...": 0}'}
@@ -34,6 +35,13 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
             "description": "format: ident-arm\nversion: 1\nname: mine\nkinematics: {urdf: mine.urdf}\n",
             "files": {"mine.urdf": '<robot name="mine">...</robot>'},
         },
+    },
+    "NewDescription": {
+        "A URDF without meshes": {
+            "name": "mine",
+            "urdf": "mine.urdf",
+            "files": {"mine.urdf": "PHJvYm90IG5hbWU9Im1pbmUiPi4uLjwvcm9ib3Q+"},
+        }
     },
     "NewReidentification": {"Now, by a person": {"arm": "wam7_sim", "confirm": _CONFIRM}},
     "NewSchedule": {
