@@ -9,10 +9,8 @@ import html
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from playwright.sync_api import Page, sync_playwright
@@ -52,29 +50,6 @@ def document(page: Page, file: Path, name: str, heading: str = "", height: int =
     page.screenshot(path=IMAGES / f"{name}.png", clip={"x": 0, "y": 0, "width": 1000, "height": height})
 
 
-def daemon(page: Page, state: Path) -> None:
-    """Take a picture of an arm's page, in a daemon of its own on what the walk has left."""
-    command = [sys.executable, "-m", "ident_service", "serve", "--state", str(state), "--port", "0"]
-    serving = subprocess.Popen(command, stderr=subprocess.DEVNULL)  # noqa: S603 - this very package
-    try:
-        until = time.monotonic() + 60.0
-        while not (state / "serve.url").is_file():
-            if serving.poll() is not None or time.monotonic() > until:
-                raise SystemExit("the daemon did not start")
-            time.sleep(0.1)
-        url = (state / "serve.url").read_text().strip()
-        page.goto(f"{url}/login")
-        page.locator("input[name=token]").fill((state / "token").read_text().strip())
-        page.locator("input[name=token]").press("Enter")
-        page.wait_for_timeout(500)
-        page.goto(f"{url}/arms/planar2")
-        page.wait_for_timeout(1000)
-        page.screenshot(path=IMAGES / "tutorial-daemon.png")
-    finally:
-        serving.terminate()
-        serving.wait(60)
-
-
 def main() -> None:
     """Walk through the tutorial with the arm as it is shipped, and take its pictures."""
     from documents.walk import walk
@@ -93,11 +68,8 @@ def main() -> None:
         document(page, work / "result" / "report.html", "tutorial-identify", "Measured and predicted torque")
         terminal(page, done.stdout, "ident preflight planar2", "tutorial-preflight")
         terminal(page, done.stdout, "ident compare", "tutorial-compare")
-        daemon(page, Path(folder, "state"))
         browser.close()
         shutil.copy(work / "motion" / "joints.svg", IMAGES / "tutorial-motion.svg")
-        if not (IMAGES / "report.png").is_file():  # `make screenshots` makes that of an arm of seven joints
-            shutil.copy(IMAGES / "tutorial-report.png", IMAGES / "report.png")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from fastapi import FastAPI
 _CONFIRM: Final = {"name": "wam7_sim", "challenge": "bGV0IGl0IG1vdmU"}
 _YAML: Final = "extends: planar2\nname: bench\ncontrol: {rate: 500}\n"
 _RUN: Final = "20261101T080000Z-wam7_sim-3fa9c1"
+_URDF: Final = "PHJvYm90IG5hbWU9ImJlbmNoIi8+"  # `<robot name="bench"/>` in base 64
 
 EXAMPLES: Final[dict[str, dict[str, Any]]] = {
     "Acceptance": {"A person's word": {"run": _RUN, "note": "after the new belt, torque error 2.1 %"}},
@@ -23,7 +24,7 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
         "Identify from a run": {"job": {"kind": "identify", "arm": "wam7_sim", "recordings": [{"run": _RUN}]}},
         "Export": {"job": {"kind": "export", "run": _RUN, "formats": ["urdf", "mjcf"]}},
     },
-    "Labels": {"What was different": {"tags": ["warm", "belt"], "note": "before the belt was changed"}},
+    "Labels": {"Found again": {"tags": ["cold", "new belt"], "note": "first run of the day"}},
     "Login": {"A token": {"token": "ident_x3J0"}},
     "MotionUpload": {
         "The content of a motion.json": {"arm": "planar2", "motion": '{"format": "ident-motion", "...": 0}'}
@@ -37,11 +38,7 @@ EXAMPLES: Final[dict[str, dict[str, Any]]] = {
         },
     },
     "NewDescription": {
-        "A URDF without meshes": {
-            "name": "mine",
-            "urdf": "mine.urdf",
-            "files": {"mine.urdf": "PHJvYm90IG5hbWU9Im1pbmUiPi4uLjwvcm9ib3Q+"},
-        }
+        "A URDF without meshes": {"name": "bench", "urdf": "bench.urdf", "files": {"bench.urdf": _URDF}}
     },
     "NewReidentification": {"Now, by a person": {"arm": "wam7_sim", "confirm": _CONFIRM}},
     "NewSchedule": {
