@@ -40,9 +40,9 @@ from ident_service.fleet.storage import Store, find
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-EACH, RATE, SECONDS, ARM = 10, 1000.0, 8.0, "wam7_sim"
+EACH, RATE, SECONDS, ARM = 10, 1000.0, 60.0, "wam7_sim"
 NEW = 0.05
-TASKS, STORED = 500, 600
+TASKS, STORED = 10_000, 10_000
 
 
 def make(folder: Path, arm: int, number: int) -> None:

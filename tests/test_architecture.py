@@ -66,6 +66,8 @@ MAY_IMPORT = _may_import()
 
 # Large library: the packages, or single files, that may import it.
 DOORS: dict[str, set[str]] = {
+    "argcomplete": {"cli"},
+    "rich": {"cli"},
     "pinocchio": {"model", "sim_backend/plant.py"},
     "ruckig": {"motion"},
     "cvxpy": {"estimation"},
@@ -102,7 +104,7 @@ CANOPEN_FILES = {
 }
 HEAVY = (
     *("pinocchio", "ruckig", "cvxpy", "clarabel", "mcap", "canopen", "can", "fastapi", "jinja2", "uvicorn"),
-    *("distributed", "fsspec", "pyarrow"),
+    *("distributed", "fsspec", "pyarrow", "rich", "argcomplete"),
 )
 
 

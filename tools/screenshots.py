@@ -180,8 +180,11 @@ def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
         page.evaluate("document.getElementById('live').scrollIntoView()")
         save(page, "live", out)
         page.keyboard.press("Escape")
-        page.get_by_role("link", name=f"Back to {ARM}").wait_for()
+        page.get_by_text(f"Asked to stop: {ARM}").wait_for()
         browser.close()
+    for job in client.jobs(arm=ARM):  # until the arm has been lowered
+        if job.live:
+            client.wait(job.id)
 
 
 def save(page: Page, name: str, out: Path) -> None:

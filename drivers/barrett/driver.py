@@ -28,8 +28,8 @@ from drivers.barrett.joint_encoders import JointEncoders
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
-from drivers.can.can_link import BusLock, Link, open_links
-from drivers.can.frame_log import SessionLog, logged_links, require_format
+from drivers.can.can_link import Link, open_links
+from drivers.can.frame_log import BusSession
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, motor_coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
@@ -112,9 +112,7 @@ class BarrettArm(Arm):
         self.clock: Clock = VirtualClock() if config.driver.bus.interface == "lock_step" else RealClock()
         self._bus: PuckBus | None = None
         self._found: setup.FoundArm | None = None
-        self._lock: BusLock | None = None
-        self._log_path: Path | None = None
-        self._log: SessionLog | None = None
+        self._session = BusSession(config, open_bus)
         self._reset_state()
 
     def _reset_state(self) -> None:
@@ -155,11 +153,11 @@ class BarrettArm(Arm):
 
     def log_frames(self, path: Path) -> None:
         """Log every frame of the next session; as in the contract."""
-        self._log_path = require_format(path)
+        self._session.log_frames(path)
 
     def logged(self) -> str:
         """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
-        return "" if self._log is None or self._log.report is None else str(self._log.report)
+        return self._session.logged()
 
     def open(self) -> None:
         """Lock and open the bus, wake, check and limit the pucks, and find where the arm stands.
@@ -172,7 +170,6 @@ class BarrettArm(Arm):
         if self._bus is not None:
             raise DriverError("the arm is already open")
         self._reset_state()
-        self._log = None
         try:
             port = self._open_port()
             found = setup.found_on(port, self._driver, wakes=not self._looks)
@@ -335,22 +332,14 @@ class BarrettArm(Arm):
         elif self._port is not None:
             with suppress(Exception):
                 self._port.link.close()
-        if self._lock is not None:
-            self._lock.close()
-        self._bus = self._found = self._lock = self._port = None
-        if self._log is not None:  # last: everybody is idle, and the file may take its time
-            self._log.close()
+        self._bus = self._found = self._port = None
+        self._session.close()
 
     _port: setup.PropertyPort | None = None
 
     def _open_port(self) -> setup.PropertyPort:
         """Lock and open the bus, and listen whether another host drives this arm before anything is sent."""
-        if not self.clock.lock_step:
-            self._lock = BusLock(self._driver.bus)
-        links = self._open_bus(self._config)
-        if self._log_path is not None:
-            self._log, links = logged_links(links, self._log_path, [False])
-            self._log_path = None
+        links = self._session.open(locks=not self.clock.lock_step)
         self._port = setup.PropertyPort(links[0])
         self.clock = links[0].clock
         self._port.listen()

@@ -12,7 +12,7 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +20,9 @@ from types import TracebackType
 from typing import Final, Self
 
 from drivers.can.can_frame import Frame, pack_frames
-from drivers.can.can_link import Link
+from drivers.can.can_link import BusLock, Link
 from drivers.clock import Clock
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 
 SUFFIXES: Final = (".log", ".asc", ".blf")
@@ -70,6 +71,56 @@ def logged_links(links: Sequence[Link], path: Path, fd: Sequence[bool]) -> tuple
             link.close()
         raise
     return log, [log.link(link, number, fd=is_fd) for number, (link, is_fd) in enumerate(zip(links, fd, strict=True))]
+
+
+class BusSession:
+    """Hold what an arm has of its buses beside the links, between `open` and `close`: locks, and a log."""
+
+    def __init__(self, config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]]) -> None:
+        """Use the arm's description; nothing is opened.
+
+        Args:
+            config: with a driver on CAN buses.
+            open_bus: gives the links, in the order of the buses.
+        """
+        self._config, self._open_bus = config, open_bus
+        self._locks: list[BusLock] = []
+        self._path: Path | None = None
+        self._log: SessionLog | None = None
+
+    def log_frames(self, path: Path) -> None:
+        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        self._path = require_format(path)
+
+    def logged(self) -> str:
+        """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
+        return "" if self._log is None or self._log.report is None else str(self._log.report)
+
+    def open(self, *, locks: bool) -> list[Link]:
+        """Lock the buses, unless they are in virtual time, and open their links; whoever gets these closes them.
+
+        Raises:
+            DriverError: a bus is in use or cannot be had, or the log cannot be created; to be closed then, too.
+        """
+        self._log = None
+        if locks:
+            # One by one, so that those had are let go of where another is in use.
+            for bus in self._config.can_buses:
+                self._locks.append(BusLock(bus))
+        links = self._open_bus(self._config)
+        if self._path is not None:
+            fd = [bus.data_bitrate is not None for bus in self._config.can_buses]
+            self._log, links = logged_links(links, self._path, fd)
+            self._path = None
+        return links
+
+    def close(self) -> None:
+        """Let go of the buses and finish the log, which may take its time: last, when everybody is off."""
+        for lock in self._locks:
+            lock.close()
+        self._locks = []
+        if self._log is not None:
+            self._log.close()
 
 
 class SessionLog:

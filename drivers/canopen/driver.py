@@ -28,8 +28,8 @@ from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import HOST, Event, EventCode
-from drivers.can.can_link import BusLock, Link, open_links
-from drivers.can.frame_log import SessionLog, logged_links, require_format
+from drivers.can.can_link import Link, open_links
+from drivers.can.frame_log import BusSession
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_monitor import MonitoringArm
@@ -325,9 +325,7 @@ class CanopenArm(Arm):
         in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
         self.clock: Clock = VirtualClock() if in_step else RealClock()
         self._buses: Buses | None = None
-        self._locks: list[BusLock] = []
-        self._log_path: Path | None = None
-        self._log: SessionLog | None = None
+        self._session = BusSession(config, open_bus)
         self._reset_state()
 
     def _reset_state(self) -> None:
@@ -357,12 +355,12 @@ class CanopenArm(Arm):
             return arm.take_home()
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
-        self._log_path = require_format(path)
+        """Log every frame of the next session; as in the contract."""
+        self._session.log_frames(path)
 
     def logged(self) -> str:
         """Describe how the log of frames of the last session ended, in words; empty where none was kept."""
-        return "" if self._log is None or self._log.report is None else str(self._log.report)
+        return self._session.logged()
 
     def open(self) -> None:
         """Lock and open every bus, and configure every drive; nothing is energised.
@@ -375,14 +373,8 @@ class CanopenArm(Arm):
         if self._buses is not None:
             raise DriverError("the arm is already open")
         self._reset_state()
-        self._log = None
         try:
-            if not self.clock.lock_step:
-                self._locks = [BusLock(bus) for bus in self._driver.buses]
-            links = self._open_bus(self._config)
-            if self._log_path is not None:
-                self._log, links = logged_links(links, self._log_path, [profile.fd for profile in self._profiles])
-                self._log_path = None
+            links = self._session.open(locks=not self.clock.lock_step)
             buses = Buses(self._profiles, links, self._period_ns)
             self.clock = buses.clock
             try:
@@ -545,12 +537,9 @@ class CanopenArm(Arm):
         if self._buses is not None:
             self._leave(self._buses)
             self._buses.close()
-        for lock in self._locks:
-            lock.close()
-        self._buses, self._locks = None, []
+        self._buses = None
         self._streaming = False
-        if self._log is not None:  # last: everybody is off, and the file may take its time
-            self._log.close()
+        self._session.close()
 
     def _leave(self, buses: Buses) -> None:
         """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sqlite3
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -94,6 +93,8 @@ def _completer(parser: Parser, action: argparse.Action) -> Any:
 
 
 def _found(names: Callable[[Path, Any, argparse.Namespace], list[str]], parsed: argparse.Namespace) -> list[str]:
+    import sqlite3
+
     for key in ("state", "server", "word", "arm"):
         setattr(parsed, key, getattr(parsed, key, None))
     try:
@@ -147,6 +148,8 @@ def _folders(place: Path) -> list[str]:
 
 def _rows(state: Path, query: str) -> list[str]:
     """Read one column of the registry; none where there is no registry, or where it is locked."""
+    import sqlite3
+
     from ident_service.registry.database import FILE
 
     path = (state / FILE).absolute()

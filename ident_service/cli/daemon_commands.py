@@ -63,7 +63,7 @@ def add(verbs: VerbList) -> None:
         "completion",
         _completion,
         "print or install completion for bash, zsh or fish",
-        more='For one shell: `eval "$(ident completion bash)"`, and `ident completion fish | source`.',
+        more='For one shell: `eval "$(ident completion bash)"`, and in zsh; fish: `ident completion fish | source`.',
         examples=("bash", "zsh", "fish --install"),
     )
     sub.add_argument("shell", choices=SHELLS)

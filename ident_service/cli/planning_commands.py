@@ -317,8 +317,10 @@ def _add_bus(verbs: VerbList) -> None:
         ("store", "have all drives store what they hold", "Over the loss of power (1010h); drives are off meanwhile."),
         ("restore", "give all drives back what they were shipped with", "At the next loss of power (1011h)."),
     ):
-        sub = bus.add(name, _store, text, more=more, examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"))
+        examples = ("my_arm.yaml --dry-run", "my_arm.yaml --confirm my_arm")
+        sub = bus.add(name, _store, text, more=more, examples=examples)
         sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+        sub.add_argument("--dry-run", action="store_true", help="ask whether drives can, and write nothing")
         sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
         sub.set_defaults(stores=name == "store")
 
@@ -392,14 +394,19 @@ def _store(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.operations.drive_configuration import store_or_restore
 
-    config, stores = load_arm(arguments.arm), arguments.stores
-    _require_name(
-        arguments, config.name, "drives store what they hold" if stores else "drives lose their configuration"
-    )
-    nodes = store_or_restore(config, store=stores)
-    told = "have stored what they hold" if stores else "take back what they were shipped with when power comes next"
+    config, stores, dry = load_arm(arguments.arm), arguments.stores, arguments.dry_run
+    if not dry:
+        _require_name(
+            arguments, config.name, "drives store what they hold" if stores else "drives lose their configuration"
+        )
+    nodes = store_or_restore(config, store=stores, dry=dry)
+    if dry:
+        would = "store what they hold" if stores else "take back what they were shipped with"
+        told = f"would {would}; nothing was written"
+    else:
+        told = "have stored what they hold" if stores else "take back what they were shipped with when power comes next"
     text = f"{config.name}: drives {', '.join(map(str, nodes))} {told}\n"
-    return DONE, text, {"arm": config.name, "stored": stores, "nodes": list(nodes)}
+    return DONE, text, {"arm": config.name, "stored": stores, "written": not dry, "nodes": list(nodes)}
 
 
 def _driver_test(arguments: argparse.Namespace) -> Answer:

@@ -413,7 +413,8 @@ def _told(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -
         return "said", f"must be a list of {bound}, not {context['actual_length']}"
     if kind == "string_pattern_mismatch":
         words = known.description(where, tree.value)
-        return "said", plain_mistake(mistake) + (f"; {words}" if words else "")
+        said = plain_mistake(mistake)
+        return "said", f"{said}; {words}" if words and " that is needed here" in said else said
     return "said", plain_mistake(mistake)
 
 

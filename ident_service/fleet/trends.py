@@ -8,7 +8,11 @@ A change is tested by generalised least squares with a step at each split, and w
 wears drifts, and a step explains a drift badly. The conditions that all of the arm's recordings carry (temperature,
 operating hours) are further columns:
 
-    T^2 = s^T Cov(s)^-1 s  ~  F(d, nu),    s the step or the line's end, d parameters, nu neighbours' differences
+    T^2 = s^T Cov(s)^-1 s / m  ~  F(d, nu),    s the step or the line's end, d parameters
+
+C_t comes from a dozen blocks, and one that is too small by chance would make its recording decide alone. nu is
+Satterthwaite's for the weights that each recording has in s, and m = 1 + 4 sum_t a_t (1 - a_t) / nu_t is what estimated
+weights cost (Meier 1953), a_t the share of recording t in the information on s and nu_t its own degrees of freedom.
 
 The smallest probability of an arm's group over its splits and the line is multiplied by their number (Bonferroni), and
 those of all arms and groups are one family, controlled by Holm's method: one false alarm in a hundred fleets, not in a
@@ -239,13 +243,42 @@ def _most_likely(
         statistics.append(np.sum(found * right, axis=1))
         steps.append(found)
         deviations.append(np.sqrt(np.maximum(np.einsum("pkk->pk", covariance), 0.0)))
+    degrees, inflation = _degrees([recordings[t] for t in seen], covariances, shapes, scatter)
     every = np.concatenate(statistics)
     best = int(np.argmax(every))
-    statistic, drift = float(every[best]), best == len(splits)
+    statistic, drift = float(every[best] / inflation[best]), best == len(splits)
     split = count // 2 if drift else int(splits[best])
-    p = min(probability(statistic, size, float(max(scatter.degrees, size))) * len(shapes), 1.0)
+    p = min(probability(statistic, size, max(float(degrees[best]), size)) * len(shapes), 1.0)
     times = (float(at[0]), float(at[-1])) if drift else (float(at[split - 1]), float(at[split]))
     return p, statistic, drift, seen[split], np.concatenate(steps)[best], np.concatenate(deviations)[best], times
+
+
+def _degrees(
+    recordings: Sequence[Recorded], covariances: Array, shapes: Array, scatter: Scatter
+) -> tuple[Array, Array]:
+    """Return the degrees of freedom of a shape's coefficient, and what its T^2 is too large by for estimated weights.
+
+    Args:
+        recordings: that saw the group.
+        covariances: of its parameters, shape (recordings, parameters, parameters).
+        shapes: over the recordings, shape (shapes, recordings).
+        scatter: between recordings, whose degrees the part of it has.
+
+    Returns:
+        Of the parameter that is known least, shape (shapes,) each.
+    """
+    own = np.einsum("tkk->tk", covariances)
+    total = own + scatter.variances
+    blocks = np.array([max(one.row.blocks - 1, 1) for one in recordings], dtype=float)
+    below = own**2 / blocks[:, None] + scatter.variances**2 / max(scatter.degrees, 1)
+    of_one = total**2 / np.maximum(below, np.finfo(float).tiny)
+    weights = 1.0 / total
+    level = np.einsum("tk,pt->pk", weights, shapes) / weights.sum(axis=0)
+    parts = weights * (shapes[:, :, None] - level[:, None, :]) ** 2
+    parts = parts / np.maximum(parts.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+    degrees = 1.0 / np.sum(parts**2 / of_one, axis=1)
+    inflation = 1.0 + 4.0 * np.sum(parts * (1.0 - parts) / of_one, axis=1)
+    return np.minimum(degrees.min(axis=1), max(scatter.degrees, 1)), inflation.max(axis=1)
 
 
 def _carried(recordings: Sequence[Recorded]) -> Array:

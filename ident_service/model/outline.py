@@ -44,6 +44,7 @@ _MOST_OF_AN_OWNER = 6  # of a link of the arm, with the tools and brackets on it
 _WORTH = 0.7  # of a capsule's volume, that two in its place must not exceed
 _FINE = 8  # edges of triangles, of the link's length, before it is cut in two
 _MOST_TRIANGLES = 60_000
+_MANY, _GRID = 6_000, 150  # triangles that are simplified to a grid, and its cells along a link
 _CUTS = (0.35, 0.5, 0.65)  # where a link is cut, of its length along an axis
 _ARM = 3  # joints that make a branch an arm and not a gripper
 _WHOLE_ARM = 5  # joints of an arm that a head or another arm beside it leaves behind on a torso
@@ -428,8 +429,14 @@ def capsules_around(corners: Array) -> list[Capsule]:
     """
     if not len(corners):
         return []
-    whole = capsule_around(corners.reshape(-1, 3))
-    parts = [(_divided(corners, float(np.ptp(corners.reshape(-1, 3), axis=0).max()) / _FINE), whole)]
+    extent = float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    # Each corner once: else those of many triangles would turn the axes.
+    whole = capsule_around(np.unique(corners.reshape(-1, 3), axis=0))
+    parts = [(_divided(corners, extent / _FINE), whole)]
+    grid = extent / _GRID if len(parts[0][0]) > _MANY else 0.0
+    if grid:  # corners move by at most half of its diagonal, which is added to each radius
+        cells = np.unique(np.round(parts[0][0] / grid).astype(int).reshape(-1, 9), axis=0)
+        parts = [(cells.reshape(-1, 3, 3) * grid, whole)]
     while len(parts) < _MOST_CAPSULES:
         parts.sort(key=lambda part: -_volume(part[1]))
         for k, part in enumerate(parts):
@@ -438,7 +445,10 @@ def capsules_around(corners: Array) -> list[Capsule]:
                 break
         else:
             break
-    return [capsule for _, capsule in parts]
+    if len(parts) == 1:
+        return [whole]
+    margin = 0.5 * math.sqrt(3.0) * grid
+    return [_rounded(np.array(one.start), np.array(one.end), one.radius + margin) for _, one in parts]
 
 
 def _cut(corners: Array, around: Capsule) -> list[tuple[Array, Capsule]] | None:

@@ -119,13 +119,13 @@ def watch_text(seen: Watched) -> str:
     width = max(5, *(len(name) for name in seen.joint_names))
     lines = [
         f"{seen.cycles} cycles, {seen.lost} frames lost",
-        f"  {'joint':<{width}} {'position':>10} {'lowest':>10} {'highest':>10} {'velocity':>11} {'noise':>10} "
-        f"{'missing':>8} {'oldest':>7}  drive",
+        f"  {'joint':<{width}} {'position':>9} {'lowest':>9} {'highest':>9} {'velocity':>9} {'noise':>8} "
+        f"{'missing':>7} {'oldest':>6}  drive",
     ]
     for k, name in enumerate(seen.joint_names):
         lines.append(
-            f"  {name:<{width}} {seen.position[k]:>10.5f} {seen.lowest[k]:>10.5f} {seen.highest[k]:>10.5f} "
-            f"{seen.velocity[k]:>11.2e} {seen.noise[k]:>10.2e} {seen.missing[k]:>8d} {seen.oldest[k]:>7d}  "
+            f"  {name:<{width}} {seen.position[k]:>9.5f} {seen.lowest[k]:>9.5f} {seen.highest[k]:>9.5f} "
+            f"{seen.velocity[k]:>9.2e} {seen.noise[k]:>8.2e} {seen.missing[k]:>7d} {seen.oldest[k]:>6d}  "
             f"{_drive(seen, k)}"
         )
     return "\n".join([*lines, *(f"  {words}" for words in seen.drives), ""])

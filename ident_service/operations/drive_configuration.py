@@ -237,7 +237,7 @@ def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
 
 
 def store_or_restore(
-    config: ArmConfig, *, store: bool, open_bus: Callable[[ArmConfig], list[Link]] = open_links
+    config: ArmConfig, *, store: bool, dry: bool = False, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[int, ...]:
     """Have all drives store what they hold (1010h), or take back what they were shipped with (1011h).
 
@@ -246,6 +246,7 @@ def store_or_restore(
     Args:
         config: of the arm.
         store: whether to store; else to restore.
+        dry: whether drives are only asked whether they can.
         open_bus: gives the links, in the order of the buses.
 
     Returns:
@@ -258,7 +259,8 @@ def store_or_restore(
     """
     driver, entry = require_drives(config), od.STORED if store else od.RESTORE
     with asking(config, open_bus) as (_, links, heard):
-        every = [Objects(links[one.bus], one.node, hearing(heard, one.bus)) for one in driver.drives]
+        kind = DryRunObjects if dry else Objects
+        every = [kind(links[one.bus], one.node, hearing(heard, one.bus)) for one in driver.drives]
         for objects in every:
             _require_off(objects)
             if optional(objects.read, entry) is None:
@@ -269,6 +271,8 @@ def store_or_restore(
                     f"node {objects.node}: holds a zero (1020h), which must be lost with its power: switch the drives"
                     " off and on, store, and then zero the arm again"
                 )
+        if dry:
+            return tuple(objects.node for objects in every)
         done: list[int] = []
         for objects in every:
             objects.patience = _FLASH

@@ -326,6 +326,7 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
             **errors["fit"],
             "rows_and_filter": list(how_fitted(estimate)),
             "standstill_shares": estimate.standstill_shares.tolist(),
+            "effective_rows": _effective_rows(estimate).tolist(),
             "choices": [
                 {"option": one.option, "value": one.value, "held_out_error_percent": dict(one.held_out)}
                 for one in estimate.choices
@@ -341,6 +342,12 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
         },
     }
     return document
+
+
+def _effective_rows(estimate: Estimate) -> Array:
+    """Return the rows of `information`, those near standstill by the squares of their weights, shape (joints,)."""
+    near, rows = estimate.prepared.equations.left_out, estimate.information.rows.astype(float)
+    return rows if near is None else np.asarray(rows - (1.0 - estimate.standstill_shares**2) * near.rows)
 
 
 def convex_document(estimate: Estimate) -> dict[str, Any]:

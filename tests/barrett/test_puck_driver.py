@@ -529,6 +529,20 @@ def test_a_cable_that_slips_shows_in_the_joints_that_its_motor_moves(motor: int,
     assert "rad further than its motors since the arm was opened, 0.05 rad are tolerated" in slipped[0].words
 
 
+def test_an_encoder_that_freezes_at_a_differential_shows_in_the_joints_own() -> None:
+    # Both joints seem to move, by their other motor: no position stands still.
+    bench = encoded()
+    found: list[Any] = []
+    with bench.arm as arm:
+        arm.enable()
+        bench.behind.inject(DriveFault("frozen_encoder", 1, duration=10.0))
+        for _ in range(150):
+            found += arm.exchange(np.array([0.0, 8.0, 3.0, 0.0, 0.0, 0.0, 0.0])).events
+    slipped = {event.axis for event in found if event.code is AxisEventCode.TRANSMISSION_SLIPPED}
+    assert slipped & {1, 2}
+    assert slipped <= {1, 2}
+
+
 def test_a_puck_without_the_joint_encoder_of_the_description_is_shown_and_not_enabled() -> None:
     bench = encoded()
     puck = bench.behind.emulator.faces[2]

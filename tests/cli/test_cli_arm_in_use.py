@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli.conftest import Ident
+from helpers.tickets import write_checked_ticket
 
 from drivers.arm import Arm
 from ident_service.config.load import load_arm
@@ -25,6 +26,18 @@ def test_an_arm_that_moves_is_neither_checked_nor_watched(ident: Ident, state: P
         assert ended.code == 1
         assert f"process {mover.pid}" in ended.json["error"]["message"]
     assert not (state / "arms" / "planar2" / "ticket.json").exists()
+
+
+@pytest.mark.slow
+def test_a_run_of_an_arm_that_another_process_has_leaves_no_folder(ident: Ident, state: Path) -> None:
+    state.mkdir(mode=0o700)
+    write_checked_ticket(load_arm("planar2"), state)
+    with ControlFile.take(control_path(state, "planar2"), None) as mover:
+        ended = ident("run", "planar2")
+    assert ended.code == 1
+    assert f"in use by process {mover.pid}" in ended.err
+    assert "recording" not in ended.err
+    assert not (state / "runs").exists() or not list((state / "runs").iterdir())
 
 
 def test_what_lets_go_of_an_arm_that_is_held_is_named(ident: Ident, state: Path) -> None:

@@ -167,7 +167,8 @@ def test_identify_in_each_set(quick: Commissioned, ident: Ident, tmp_path: Path,
 def test_base(ident: Ident) -> None:
     words = ident("base", "planar2")
     assert words.code == 0
-    lines = words.out.splitlines()
+    lines = words.out.splitlines()[:-1]
+    assert words.next == ["design", "planar2"]
     assert lines[-1] == "13 base parameters of 28 link parameters"
     assert len(lines) == 14
     document = ident("base", "planar2", "--json").json

@@ -11,7 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from model.test_locked_joints import PANDA, joint, link
 
@@ -64,7 +64,7 @@ BARS = (
 
 
 @pytest.mark.slow
-def test_a_stock_urdf_simulates_without_an_edit(
+def test_of_a_stock_urdf_come_limits_and_another_truth_than_the_prior(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -84,9 +84,6 @@ def test_a_stock_urdf_simulates_without_an_edit(
     assert len(config.joints) == 7
     assert all(one.position == (-2.9, 2.9) and one.torque == 87.0 for one in config.joints.values())
     assert main(["config", "check", "panda.yaml"]) == 0
-    assert main(["simulate", "panda.yaml", "--out", "run", "--state", "state"]) == 0
-    scored = json.loads((tmp_path / "run" / "score.json").read_text())
-    assert scored["noise_free_torque_error_percent"] < 1.0
     # The truth is another arm than the prior.
     driver = config.driver
     assert isinstance(driver, SimulatedDriver)
@@ -363,7 +360,7 @@ def test_all_that_no_urdf_says_is_told_and_written(tmp_path: Path, capsys: pytes
     assert all(f"#   {line}\n" in text for line in said.splitlines())
     # The simulated brakes are written down as a question about the real ones.
     assert config.control.after_stop == "brake"
-    assert "Of a real arm say in\n# the braces of each joint `brake: true` or `brake: false`" in text
+    assert "Of a real arm say at\n# each joint `brake: true` or `brake: false`" in text
     assert main(["config", "check", str(tmp_path / "bars.yaml")]) == 0
     told = capsys.readouterr().out
     assert "after a stop: held for two seconds, then released to its brakes; they hold shoulder, elbow\n" in told
@@ -382,7 +379,7 @@ def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.Captu
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "bars.urdf").write_text(BARS.replace(BOUNDS, 'lower="-115" upper="115"'))
     assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 2
-    assert "shoulder turns from -115 to 115 rad: limits of a URDF are radians" in capsys.readouterr().err
+    assert "shoulder turns from -115 to 115 rad: its limits are to be radians" in capsys.readouterr().err
     assert not (tmp_path / "bars.yaml").exists()
 
 
@@ -475,6 +472,7 @@ def test_a_capsule_encloses_its_points(seed: int, count: int) -> None:
     assert (apart <= capsule.radius + 5e-4).all()
 
 
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 30))
 def test_capsules_enclose_every_triangle(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)

@@ -129,7 +129,7 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
         ),
         pytest.param("rate: 1000", "rate: -1", "rate", "greater than 0", id="negative rate"),
         pytest.param("order: 3", "order: 9", "order", "at most 8, not 9", id="number too large"),
-        pytest.param("name: tiny", "name: ../etc", "name", "pattern", id="name that is a path"),
+        pytest.param("name: tiny", "name: ../etc", "name", "is not a name", id="name that is a path"),
         pytest.param("version: 1", "version: 2", "version", "must be 1, not 2", id="version of the future"),
         pytest.param("convention: standard", "convention: odd", "convention", "'standard'", id="unknown choice"),
         pytest.param("kind: seeded", "kind: wobble", "validation", "'wobble'", id="unknown kind of motion"),

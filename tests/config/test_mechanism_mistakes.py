@@ -41,10 +41,10 @@ def folder(tmp_path: Path) -> Path:
         (("panda_joint7:", "elbow:"), "5:1: joints: ", "but the mechanism has panda_joint1"),
         (
             ("joints:", "driver: {kind: simulated, truth: {m1: 1, m99: 2}}\njoints:"),
-            "5:27: driver.truth: ",
+            "5:42: driver.truth: ",
             "parameters this arm does not have: m99",
         ),
-        (("joints:", "prior: {m1: 1, Q4: 2}\njoints:"), "5:1: prior", "parameters this arm does not have: Q4"),
+        (("joints:", "prior: {m1: 1, Q4: 2}\njoints:"), "5:16: prior", "parameters this arm does not have: Q4"),
     ],
 )
 def test_it_has_a_place(

@@ -7,12 +7,17 @@ import json
 import os
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from daemon.conftest import Asked, checked_before, patient_text, quick_text, serving
 from daemon.verbs_bench import with_run
 
+from ident_service.daemon.dependencies import Service
+from ident_service.daemon.jobs.queue import Progress
 from ident_service.daemon.jobs.requests import Run
+from ident_service.daemon.routes.jobs import job_answer_document
 from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import audit_log
@@ -92,6 +97,22 @@ def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, 
         assert "typed by a person" in refused.json()["error"]["message"]
         answer = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": ARM})
         assert (answer.status_code, answer.json()["reached"], holder.supported) == (200, True, True)
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_a_job_whose_arm_is_held_shows_no_progress(state: Path, held: bool) -> None:
+    """It ends when a person says so; what ends by itself says when."""
+    engine = SimpleNamespace(progress=lambda _: Progress("exciting", 0.99, 0.0))
+    numbers = {"number": 1, "motion": 1, "created": 1.0, "started": 2.0, "ended": None, "exit_code": None}
+    words = {"id": "j", "kind": "run", "arm": ARM, "state": "running", "run": "r", "created_by": "ann", "detail": ""}
+    row = {**numbers, **words, "request": {}, "words": []}
+    with ControlFile.take(control_path(state, ARM), None) as holder:
+        if held:
+            holder.wait_for_support()
+        answer = job_answer_document(cast(Service, SimpleNamespace(state=state, engine=engine)), row)
+    assert answer.held == held
+    assert answer.progress is not None
+    assert (answer.progress.fraction, answer.progress.remaining) == ((None, None) if held else (0.99, 0.0))
 
 
 @pytest.mark.timeout(300)

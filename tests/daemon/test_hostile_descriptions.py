@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -10,7 +11,8 @@ from daemon.conftest import Asked
 from daemon.served import daemon_process
 
 from ident_service.daemon.routes.checks import MOST_CHECKS
-from ident_service.errors import ConfigError
+from ident_service.errors import ConfigError, ModelError
+from ident_service.operations.description_process import _require_own_meshes
 from ident_service.registry.arms import add_arm
 
 ARM = "format: ident-arm\nversion: 1\nname: spy\nkinematics: {{{kind}: arm.xml}}\n"
@@ -100,3 +102,22 @@ def test_few_descriptions_are_checked_at_a_time(daemon: Asked) -> None:
             assert (answer.status_code, answer.headers["retry-after"]) == (503, "2"), answer.text
         assert daemon.post("/api/v1/stop").status_code == 200
     assert daemon.post("/api/v1/arms", good).status_code == 201
+
+
+@pytest.mark.parametrize(
+    "named", ["/etc/passwd", "../../secret.stl", "package://robot/meshes/arm.stl", "C:\\m\\arm.stl"]
+)
+def test_meshes_of_an_uploaded_urdf_are_those_beside_it(tmp_path: Path, named: str) -> None:
+    urdf = tmp_path / "robot.urdf"
+    mesh = f'<collision><geometry><mesh filename="{named}"/></geometry></collision>'
+    urdf.write_text(f'<robot name="r"><link name="base">{mesh}</link></robot>')
+    _require_own_meshes(urdf)
+    (found,) = ET.fromstring(urdf.read_text()).iter("mesh")  # noqa: S314 - written above
+    assert found.get("filename") == named.replace("\\", "/").rpartition("/")[2]
+
+
+def test_a_urdf_that_could_break_its_parser_is_refused(tmp_path: Path) -> None:
+    urdf = tmp_path / "robot.urdf"
+    urdf.write_text('<!DOCTYPE robot [<!ENTITY a "b">]><robot name="r"><link name="&a;"/></robot>')
+    with pytest.raises(ModelError, match="refused in a URDF"):
+        _require_own_meshes(urdf)

@@ -134,6 +134,24 @@ def test_answers_are_told_in_words() -> None:
         "    node: 1",
         "no: none",
     ]
+    steps = ["Support the arm.", "`ident acknowledge a x`, when you know the cause."]
+    assert list(lines_of({"steps": steps})) == ["steps:", *(f"  {step}" for step in steps)]
+
+
+def test_a_stop_tells_arms_and_jobs_apart() -> None:
+    class Answering(IdentClient):
+        def __init__(self, arms: list[str], jobs: list[str]) -> None:
+            self.answer = {"arms": arms, "jobs": jobs}
+
+        def post(self, *_: object, **__: object) -> Any:
+            return self.answer
+
+    def said(arms: list[str], jobs: list[str]) -> str:
+        return table()[0]["stop"](Answering(arms, jobs), parser().parse_args(["stop", "--server", "x"]))[1]
+
+    assert said(["a", "b"], ["j1"]) == "stop requested of a, b; cancelled: job j1\n"
+    assert said([], ["j1", "j2"]) == "cancelled: job j1, job j2\n"
+    assert said([], []) == "no arm is moving there\n"
 
 
 class _Evil(IdentClient):

@@ -7,14 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from daemon.conftest import Asked
 
 from ident_service.config.load import load_arm
+from ident_service.daemon.routes.views import ViewAnswer
 from ident_service.errors import UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.trajectory import FourierPath
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.collision import CollisionModel
 from ident_service.operations.arm_view import MOST_SAMPLES, figure, view_at_rest, view_of_motion, view_of_recording
+from ident_service.operations.run_archive import import_run
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_writer import RecordingWriter
 
@@ -92,3 +95,40 @@ def test_a_recording_is_thinned_and_keeps_its_ends(wam: ArmModel, tmp_path: Path
     assert time[0] == 0.0
     assert time[-1] == pytest.approx(0.01 * (count - 1), abs=0.02)
     np.testing.assert_allclose(position, np.outer(1e-2 * time, np.ones(7)), atol=1e-4)
+
+
+def test_answers_of_the_routes(daemon: Asked, wam: ArmModel, commissioned: Path) -> None:
+    import_run(daemon.service.db, daemon.service.state, commissioned, "test")
+    motion = excitation(wam, "validation").to_json()
+    other = daemon.post("/api/v1/motions", {"arm": "wam7_sim", "motion": motion}).json()["id"]
+    run = f"/api/v1/runs/{commissioned.name}/view"
+    for path, samples in (
+        ("/api/v1/arms/wam7_sim/view", 0),
+        ("/api/v1/arms/tx40/view", 0),  # which has no limits, and so no motion
+        ("/api/v1/arms/wam7_sim/view?motion=own&speed=0.5", 2),
+        (f"/api/v1/arms/wam7_sim/view?motion={other}", 2),
+        (run, 2),
+        (f"{run}?name=validation.mcap", 2),
+    ):
+        for _ in range(2):  # computed, then kept
+            answer = daemon.get(path)
+            assert answer.status_code == 200, answer.text
+            view = ViewAnswer.model_validate(answer.json())
+            assert len(view.time) >= samples
+            assert len(view.position) == (len(view.figure.joints) if samples else 0)
+    full, half = (
+        daemon.get(f"/api/v1/arms/wam7_sim/view?motion=own&speed={share}").json()["time"][-1] for share in (1, 0.5)
+    )
+    assert half == pytest.approx(2 * full, rel=1e-3)
+    for path, status in (
+        ("/api/v1/arms/nobody/view", 404),
+        ("/api/v1/arms/planar2/view?motion=none", 404),
+        (f"/api/v1/arms/planar2/view?motion={other}", 404),  # of another arm
+        ("/api/v1/arms/tx40/view?motion=own", 409),
+        ("/api/v1/arms/planar2/view?motion=own&speed=0", 422),
+        ("/api/v1/runs/none/view", 404),
+        (f"{run}?name=arm.json", 404),
+        (f"{run}?name=..%2Farm.json", 422),
+    ):
+        answer = daemon.get(path)
+        assert (answer.status_code, bool(answer.json()["error"]["message"])) == (status, True), path

@@ -121,6 +121,9 @@ def test_drives_store_and_restore_what_they_hold() -> None:
     power_cycle()
     assert held(bench, 0x3001, 1) == factory
     import_configuration(config, [dcf(**{NOMINAL: 4000})] * 2, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
+    for store in (True, False):
+        assert store_or_restore(config, store=store, dry=True, open_bus=bench.links) == (1, 2)  # type: ignore[arg-type]
+        assert bench.downloads() == []
     assert store_or_restore(config, store=True, open_bus=bench.links) == (1, 2)  # type: ignore[arg-type]
     power_cycle()
     assert held(bench, 0x3001, 1) == [4000] * 2

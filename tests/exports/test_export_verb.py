@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -16,8 +17,11 @@ from ident_service.config.load import load_arm
 from ident_service.errors import ModelError
 from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
+from ident_service.model.base_parameters import base_parameters
+from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.results.export import formats
+from ident_service.results.export.round_trip import RecordedMotion, unsupported_terms
 from ident_service.results.run_folder import write_manifest, write_results
 
 ALL = ["planar2.csv", "planar2.json", "planar2.sdf", "planar2.urdf", "planar2.xml", "planar2_dynamics.h"]
@@ -63,6 +67,50 @@ def code_of(*words: object) -> int:
         return int(end.code or 0)
 
 
+@pytest.mark.parametrize("arm", ["planar2", "threelink"])
+def test_the_torque_of_what_is_lost_is_that_of_the_motion(arm: str) -> None:
+    model = arm_model(load_arm(arm))
+    base = base_parameters(model.chain, model.layout)
+    rng = np.random.default_rng(3)
+    q, dq, ddq = rng.normal(size=(3, 200, model.chain.joints))
+    H = joint_regressor(model.chain, model.layout, q, dq, ddq)
+    kept = np.ones(q.shape, dtype=bool)
+    felt = sparsity(model.chain, model.layout, base.base)
+    known = information_of(H[:, base.base], np.zeros(q.shape), kept, felt)
+    motion = RecordedMotion(base, known, known.rows.astype(float))
+    delta = some_delta(model)
+    np.testing.assert_allclose(
+        motion.torque(delta), np.sqrt(np.mean(np.einsum("jps,p->sj", H, delta) ** 2, axis=0)), rtol=1e-9
+    )
+    # Drive inertia is part of the sum of other parameters, and is still told alone.
+    words = {one.split(" (")[0]: one for one in unsupported_terms(model, delta, {}, motion)}
+    inertia = model.layout.term_values("drive_inertia", delta)
+    offset = model.layout.term_values("offset", delta)
+    for k, name in enumerate(model.chain.names):
+        unit = "N m" if model.chain.revolute[k] else "N"
+        assert f"{abs(offset[k]):.2g} {unit} at {name}" in words["torque offset"]
+        assert f"{inertia[k] * np.sqrt(np.mean(ddq[:, k] ** 2)):.2g} {unit} at {name}" in words["drive inertia"]
+    assert unsupported_terms(model, delta, {})[0] == "drive inertia (Ia) of every joint"
+
+
+def test_the_answer_says_how_large_what_is_lost_is(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("export", run, "--format", "mjcf", "--out", tmp_path / "out", "--json") == 0
+    (offset, *_) = json.loads(capsys.readouterr().out)["files"][0]["not_carried"]
+    assert re.fullmatch(
+        r"torque offset \(fo\) of every joint: [\d.]+ N m at \w+, [\d.]+ N m at \w+; rms over the recorded motion, "
+        r"weighted as in the fit",
+        offset,
+    )
+    content = json.loads((run / "parameters.json").read_text())
+    values = dict(zip(content["link_parameters"]["names"], content["link_parameters"]["values"], strict=True))
+    told = {name: float(size) for size, name in re.findall(r"([\d.]+) N m at (\w+)", offset)}
+    for number, name in enumerate(content["arm"]["joints"], 1):
+        assert told[name] == pytest.approx(abs(values[f"fo{number}"]), rel=0.05)
+    assert offset in (tmp_path / "out" / "planar2.xml").read_text()
+
+
 def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
@@ -74,7 +122,7 @@ def test_all_formats_are_written_and_what_they_lack_is_said(
     assert names_in(tmp_path / "out") == ALL
     said = capsys.readouterr().out
     assert said.startswith(f"files: {tmp_path / 'out'}\n  planar2.urdf (urdf)\n    not in this format: gravity\n")
-    assert "  planar2.xml (mjcf)\n    not in this format: torque offset (fo) of every joint\n" in said
+    assert "  planar2.xml (mjcf)\n    not in this format: torque offset (fo) of every joint: " in said
 
 
 def test_the_answer_for_programs_names_every_file(

@@ -101,6 +101,20 @@ def test_unchanged_fleets_raise_no_alarm(scatter: float, told: float, seeds: int
     assert alarms <= 1
 
 
+def test_a_recording_that_is_too_sure_of_itself_by_chance_is_no_change() -> None:
+    """Its covariance comes from a dozen blocks, and it is off by no more than it should have said."""
+    values = fleet(5)
+    arms = {arm: [recorded(one, week) for week, one in enumerate(of_arm)] for arm, of_arm in values.items()}
+    off = np.mean(values["07"], axis=0)
+    off[[2, 3]] += 2.7 * NOISE
+    arms["07"][5] = recorded(off, 5, NOISE / 3.0)
+    found = change_points(arms, dict.fromkeys(arms, FIT), GROUPS, scatter_of(arms, GROUPS))
+    odd = min(found, key=lambda one: one.p)
+    assert (odd.arm, odd.group) == ("07", ("friction", 2))
+    assert not odd.changed
+    assert odd.p > ALPHA
+
+
 def test_the_family_is_the_whole_fleet() -> None:
     every = changes_of(fleet(11))
     assert len(every) == ARMS * len(GROUPS)

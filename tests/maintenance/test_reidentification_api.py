@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -125,7 +126,7 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
         capsys.readouterr()
         code = main([*words, "--server", url, "--state", str(state)])
         said = capsys.readouterr()
-        return code, said.out, said.err
+        return code, re.sub(r"(?m)^next: ident .*\n\Z", "", said.out), said.err
 
     with daemon_process(state) as (process, client):
         url = url_of(process, state)
@@ -137,14 +138,19 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
         assert ident("schedule", "remove", "1")[0] == 0
         assert ident("schedule", "list", ARM)[1].count("\n") == 1
         assert "maintenance: belt" in ident("maintenance", ARM, "--what", "belt")[1]
-        assert "maintenance: belt" in ident("due", "list")[1]
+        assert "maintenance: belt; `ident reidentify" in ident("due", "list")[1]
+        assert ident("maintenance", "planar2", "--what", "belt")[0] == 0
+        assert ident("schedules", "add", "planar2", "--maintenance")[0] == 0
+        assert "nothing of it has been accepted" in ident("maintenance", "planar2", "--what", "oil")[1]
+        (other,) = [row for row in client.get("/api/v1/due") if row["arm"] == "planar2"]
+        assert ident("due", "dismiss", str(other["id"]), "--note", "never commissioned")[0] == 0
         assert "cannot be sent to a daemon" in ident("maintenance", ARM, "--what", "belt", "--by", "ann")[2]
         assert ident("reidentify", ARM, "--confirm", "other")[0] == 2
         code, out, _ = ident("reidentify", ARM, "--confirm", ARM)
         assert (code, "unchanged" in out) == (0, True)
         assert ident("due", "list")[1] == "nothing is due\n"
         assert ident("maintenance", ARM, "--what", "belt again")[0] == 0
-        assert ident("due", "dismiss", "2", "--note", "the same belt")[0] == 0
+        assert ident("due", "dismiss", "3", "--note", "the same belt")[0] == 0
         assert ident("alarm", "list")[:2] == (0, "no open alarms\n")
         assert ident("alarm", "ack", "1", "--note", "x")[0] == 2
 

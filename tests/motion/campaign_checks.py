@@ -84,7 +84,7 @@ def together(cases: Sequence[Case]) -> list[Any]:
 def is_kept(case: Case, fault: Fault | Strike, outcome: Outcome, path: Path) -> None:
     """Hold one outcome to its promise."""
     which = subject(case.arm)
-    plant_stays_within_limits(which, outcome)
+    plant_stays_within_limits(which, outcome, case)
     recording_is_readable(which, outcome, path)
     promise = which.promises[case.kind]
     if outcome.fault is None:
@@ -113,10 +113,16 @@ def went_on(case: Case, promise: Promise, at_cycle: int, outcome: Outcome) -> No
         assert any(words in told for words in promise.words), told
 
 
-def plant_stays_within_limits(which: Subject, outcome: Outcome) -> None:
+def plant_stays_within_limits(which: Subject, outcome: Outcome, case: Case) -> None:
     limits, truth = which.limits, outcome.truth
     torque = np.abs([moment.torque for moment in truth])
-    assert (torque <= limits.torque * (1 + 1e-9) + which.torque_step).all()
+    most = limits.torque
+    if case.kind == "torque_sign" and limits.motors is not None and which.config.transmission is not None:
+        # Two motors that share a joint add up where they should balance: what motors give is then all that holds.
+        gears = which.config.transmission
+        jacobian = np.array(gears.ratios)[:, None] * np.array(gears.coupling)
+        most = np.maximum(most, np.abs(jacobian).T @ limits.motors.torque)
+    assert (torque <= most * (1 + 1e-9) + which.torque_step).all()
     speed, acceleration = (np.abs([getattr(moment, name) for moment in truth]) for name in ("velocity", "acceleration"))
     unseen = 1.0 / (2.0 * np.pi * np.asarray(which.config.control.velocity_cutoff)) + 2.0 * PERIOD
     gained = acceleration[-20:].max(axis=0) * unseen

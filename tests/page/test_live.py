@@ -140,6 +140,28 @@ def test_watching_thins_samples_and_keeps_the_largest_error(tmp_path: Path) -> N
     assert live.since(0)[-1].number == number
 
 
+def test_watching_tells_what_was_commanded_and_what_drives_measured(tmp_path: Path) -> None:
+    live = LiveRun(tmp_path)
+    with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
+        for k in range(500):
+            writer.sample(cycle(k)._replace(measured_torque=np.array([k + 0.25, np.nan])))
+    (frame,) = [one for one in live.since(0) if one.kind == "samples"]
+    live.close()
+    piece = json.loads(frame.data)
+    assert piece["measured"][0] == [torque + 0.25 for torque in piece["torque"][0]]
+    assert set(piece["measured"][1]) == {None}
+    expected = np.add(piece["position"][0], [0.5 if torque == 333 else 0.01 for torque in piece["torque"][0]])
+    np.testing.assert_allclose(piece["reference"][0], expected, atol=1e-5)
+    # A recording without measured torques says so instead of leaving them out one by one.
+    with RecordingWriter(tmp_path / "other.mcap", NAMES, "<robot/>", 0) as writer:
+        writer.sample(cycle(1))
+    tail = RecordingFollower(tmp_path / "other.mcap")
+    samples = tail.read()
+    assert samples is not None
+    assert samples.measured is None
+    tail.close()
+
+
 def test_a_run_that_cannot_be_read_says_so_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "run.mcap.partial").write_bytes(b"\x89MCAP0\r\n" + b"\x06" + (1 << 40).to_bytes(8, "little") + b"x" * 9)
     clock = [0.0]

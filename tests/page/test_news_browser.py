@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
 
 def test_lists_follow_what_happens(browser: Browser, reached: Reached, place: Path) -> None:
     page = log_in(browser, reached)
-    page.wait_for_load_state("load")
+    page.goto(reached.url)
     loads = list[str]()
     page.on("load", lambda _: loads.append(page.url))
     main = page.locator("#main")

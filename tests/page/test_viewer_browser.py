@@ -14,7 +14,7 @@ from daemon.conftest import commissioned as commissioned
 from daemon.conftest import quick_text
 from helpers.browser import chromium_program
 from page.conftest import Reached, listening, log_in
-from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
 from ident_service.operations.run_archive import import_run
 from ident_service.registry.arms import add_arm
@@ -45,16 +45,19 @@ async () => {
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory, commissioned: Path) -> Iterator[tuple[Browser, Reached, str]]:
+def shown(
+    browser: Browser, tmp_path_factory: pytest.TempPathFactory, commissioned: Path
+) -> Iterator[tuple[Browser, Reached, str]]:
     """A browser that draws WebGL by software, a service with an arm, and a run of it."""
     state = tmp_path_factory.mktemp("viewer") / "state"
     switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with listening(state) as reached, sync_playwright() as playwright:
+    with listening(state) as reached:
         add_arm(reached.service.db, state, quick_text(ARM), {}, "test", replace=True)
         import_run(reached.service.db, state, commissioned, "test")
-        browser = playwright.chromium.launch(executable_path=chromium_program(), args=switches)
-        yield browser, reached, commissioned.name
-        browser.close()
+        # By the driver of all tests' browser: a process may have one.
+        drawing = browser.browser_type.launch(executable_path=chromium_program(), args=switches)
+        yield drawing, reached, commissioned.name
+        drawing.close()
 
 
 @pytest.fixture

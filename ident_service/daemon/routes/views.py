@@ -25,7 +25,7 @@ from ident_service.registry import arms as known
 from ident_service.registry import motions, runs
 from ident_service.results.manifest import file_sha256
 
-router = APIRouter(prefix="/api/v1", tags=["views"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["views"], responses=failures(404, 409))
 _KEPT: Final = 16
 _MOST_BYTES: Final = 256 * 2**20  # of a recording: half a minute of reading
 OWN: Final = "own"

@@ -224,21 +224,21 @@ _BASE_ONLY = "not feasible: base parameters only"
 def _urdf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.urdf"
     said = body_notes(arm)
-    text, lost, notes = urdf_export(arm.model, arm.body(), name, said)
+    text, lost, notes = urdf_export(arm.model, arm.body(), name, said, arm.motion)
     return Export("urdf", name, text, lost, (*notes, *said))
 
 
 def _mjcf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.xml"
     said = body_notes(arm)
-    text, lost = mjcf_export(arm.model, arm.body(), name, said)
+    text, lost = mjcf_export(arm.model, arm.body(), name, said, arm.motion)
     return Export("mjcf", name, text, lost, said)
 
 
 def _sdf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.sdf"
     said = body_notes(arm)
-    text, lost, notes = sdf_export(arm.model, arm.body(), name, said)
+    text, lost, notes = sdf_export(arm.model, arm.body(), name, said, arm.motion)
     return Export("sdf", name, text, lost, (*notes, *said))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
-from ident_service.results.export.round_trip import AGREEMENT, disagreement, random_states
+from ident_service.results.export.round_trip import AGREEMENT, RecordedMotion, disagreement, random_states
 from ident_service.results.parameter_file import (
     ParameterFile,
+    information_from,
     named_link_values,
     require_base_values,
     require_consistent,
@@ -38,6 +40,7 @@ class IdentifiedArm:
         source: SHA-256 of the parameter file.
         feasible_set: that the values are held in; `none` where they are not.
         unconstrained: base parameters before that [SI], to which `sigma` belongs, shape (base,); None where unknown.
+        motion: that it was identified from; None where the file does not have it.
     """
 
     model: ArmModel
@@ -49,6 +52,7 @@ class IdentifiedArm:
     source: str
     feasible_set: str = "none"
     unconstrained: Array | None = None
+    motion: RecordedMotion | None = None
 
     @property
     def sigma_said(self) -> str:
@@ -111,6 +115,7 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
         )
     require_consistent(parameters, where)
     sigma, verdicts = table.get("standard_deviations"), table.get("verdicts")
+    known = parameters.content.get("information")
     return IdentifiedArm(
         model=model,
         base=base,
@@ -121,7 +126,19 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
         source=source,
         feasible_set=parameters.feasible_set or "none",
         unconstrained=None if (free := table.get("unconstrained_values")) is None else np.array(free, dtype=float),
+        motion=None if known is None else _motion(parameters.content, base, model, where),
     )
+
+
+def _motion(content: dict[str, Any], base: BaseParameters, model: ArmModel, where: Path) -> RecordedMotion:
+    known = content["information"]
+    rows = content.get("fit", {}).get("effective_rows", [joint["rows"] for joint in known])
+    if not len(known) == len(rows) == model.chain.joints:
+        raise ParameterError(f"{where}: its information is of {len(known)} joints, the arm has {model.chain.joints}")
+    try:
+        return RecordedMotion(base, information_from(known, base.size), np.array(rows, dtype=float))
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from None
 
 
 def read_identified(folder: Path) -> IdentifiedArm:

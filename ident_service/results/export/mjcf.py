@@ -20,6 +20,7 @@ from ident_service.model.parameter_layout import JOINT_TERMS, about_center, join
 from ident_service.results.export.bodies import joint_bodies, require_real
 from ident_service.results.export.round_trip import (
     Carried,
+    RecordedMotion,
     gravity_of,
     require_same_torques,
     supported_terms,
@@ -31,7 +32,9 @@ from ident_service.results.export.words import comments, unique
 _ATTRIBUTES = dict(zip(JOINT_TERMS, ("armature", "damping", "frictionloss"), strict=True))
 
 
-def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()) -> tuple[str, tuple[str, ...]]:
+def mjcf_export(
+    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
+) -> tuple[str, tuple[str, ...]]:
     """Return the arm as MJCF, after pinocchio has read it back with the same torques.
 
     Args:
@@ -39,6 +42,7 @@ def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] 
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
         said: of its bodies, for a comment in it.
+        motion: that the arm was identified from, which says how large the torque of what is lost is.
 
     Returns:
         The text, and what it does not carry.
@@ -51,7 +55,7 @@ def mjcf_export(model: ArmModel, delta: Array, name: str, said: tuple[str, ...] 
     has = supported_terms(model, delta, JOINT_TERMS)
     shared = _shared(model, delta)
     everything = {term: has[term] | shared[term] for term in has}
-    lost = unsupported_terms(model, delta, everything)
+    lost = unsupported_terms(model, delta, everything, motion)
     if any(joint.velocity is not None for joint in model.config.joints.values()):
         lost = (*lost, "velocity limits")
     text = _text(model, delta, has, shared, lost, said)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.friction_state import presliding_distances
+from ident_service.model.information import Information
 from ident_service.model.parameter_layout import JOINT_TERMS, TERM_SYMBOLS, Layout, WrittenArm, joint_drives
 from ident_service.model.regressor import joint_regressor
 
@@ -114,30 +117,93 @@ _WORDS: dict[JointTerm, str] = {
 }
 
 
-def unsupported_terms(model: ArmModel, delta: Array, has: Carried) -> tuple[str, ...]:
-    """Return the joint terms with a value that a file does not carry, in words."""
+_TOLD = 1e-3  # share of the joint's own torque below which nothing is told
+
+
+@dataclass(frozen=True)
+class RecordedMotion:
+    """Motion that an arm was identified from, by which the torque of what a file does not carry is measured.
+
+    Attributes:
+        base: the grouping of the parameters.
+        information: of the equations on the base parameters.
+        rows: their number per joint, each by the square of its weight, shape (joints,).
+    """
+
+    base: BaseParameters
+    information: Information
+    rows: Array
+
+    def torque(self, delta: Array) -> Array:
+        """Return the torque of link parameters over the motion, root mean square per joint [N m or N], (joints,).
+
+        Args:
+            delta: of which all that does not count is zero, shape (layout.size,).
+        """
+        beta, known = self.base.K @ delta, self.information
+        sums = [
+            float(np.linalg.norm(factor[:, :-1] @ beta[support])) ** 2
+            for support, factor in zip(known.supports, known.factors, strict=True)
+        ]
+        return np.asarray(np.sqrt(np.array(sums) / np.maximum(self.rows, 1.0)))
+
+    def in_words(self, model: ArmModel, delta: Array) -> str:
+        """Return that torque at the joints that feel it, the largest first."""
+        torques = self.torque(delta)
+        own = np.sqrt(self.information.squared_torques() / np.maximum(self.rows, 1.0))
+        told = torques > _TOLD * own
+        units = ["N m" if turns else "N" for turns in model.chain.revolute]
+        largest = [k for k in np.argsort(-torques, kind="stable") if told[k]]
+        shown = ", ".join(f"{torques[k]:.2g} {units[k]} at {model.chain.names[k]}" for k in largest)
+        less = ", less elsewhere" if (torques[~told] > 0.0).any() else ""
+        return f"{shown or 'no torque'}{less}; rms over the recorded motion, weighted as in the fit"
+
+
+def unsupported_terms(
+    model: ArmModel, delta: Array, has: Carried, motion: RecordedMotion | None = None
+) -> tuple[str, ...]:
+    """Return the joint terms with a value that a file does not carry, in words, with their torque where it is known.
+
+    Args:
+        model: the arm.
+        delta: link parameters, shape (layout.size,).
+        has: what the file carries.
+        motion: that it was identified from; None where it is not known.
+    """
     found = []
     for term in model.layout.terms:
         values = model.layout.term_values(term, delta)
         missing = (values != 0.0) & ~has.get(term, np.zeros(model.chain.joints, dtype=bool))
         if missing.any():
             joints = "every joint" if missing.all() else ", ".join(np.array(model.chain.names)[missing])
-            found.append(f"{_WORDS[term]} ({TERM_SYMBOLS[term]}) of {joints}")
+            lost = np.zeros(model.layout.size)
+            lost[model.layout.term_columns(term)] = np.where(missing, values, 0.0)
+            size = "" if motion is None else f": {motion.in_words(model, lost)}"
+            found.append(f"{_WORDS[term]} ({TERM_SYMBOLS[term]}) of {joints}{size}")
     return (*found, *presliding_left_out(model, delta))
 
 
 def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
-    """Return the drives' pre-sliding, in words, which a format without friction state does not carry."""
+    """Return the drives' pre-sliding, in words, which a format without friction state does not carry.
+
+    Args:
+        model: the arm.
+        delta: link parameters, shape (layout.size,).
+    """
     layout, ways = model.layout, presliding_distances(model)
     dry = [layout.term_values(term, delta) for term in ("coulomb", "stribeck") if term in layout.terms]
-    said = [
-        f"{name} {way:.3g} {'rad' if turns else 'm'}"
+    slides = [
+        (name, way, turns, 2.0 * abs(sum(values)))
         for name, way, turns, *values in zip(model.chain.names, ways, model.chain.revolute, *dry, strict=True)
         if way > 0.0 and any(values)
     ]
-    if not said:
+    if not slides:
         return ()
+    said = ", ".join(f"{name} {way:.3g} {'rad' if turns else 'm'}" for name, way, turns, _ in slides)
+    # Torques of drives: with a differential, several joints feel them.
+    sizes = ", ".join(f"{twice:.2g} {'N m' if turns else 'N'} at {name}" for name, _, turns, twice in slides)
     return (
-        f"pre-sliding of dry friction (distance: {', '.join(said)}): here it reverses at once, and torques after a "
-        "reversal differ by up to twice the dry friction; the torque errors of the report are with pre-sliding",
+        f"pre-sliding of dry friction (distance: {said}): here it reverses at once, and torques after a "
+        f"reversal differ by up to twice the dry friction ({sizes}); the torque errors of the report are with "
+        "pre-sliding",
     )

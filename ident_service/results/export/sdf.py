@@ -26,6 +26,7 @@ from ident_service.model.urdf import roll_pitch_yaw
 from ident_service.results.export.bodies import about_origin, joint_bodies, moved, require_real
 from ident_service.results.export.round_trip import (
     Carried,
+    RecordedMotion,
     gravity_of,
     require_same_torques,
     supported_terms,
@@ -162,7 +163,7 @@ _ENTRIES = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (
 
 
 def sdf_export(
-    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()
+    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Return the arm as SDF, after it was read back with the same torques.
 
@@ -171,6 +172,7 @@ def sdf_export(
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
         said: of its bodies, for a comment in it.
+        motion: that the arm was identified from, which says how large the torque of what is lost is.
 
     Returns:
         The text, what it does not carry, and notes.
@@ -180,7 +182,7 @@ def sdf_export(
     """
     has = supported_terms(model, delta, _TERMS)
     gravity = ("gravity",) if model.chain.gravity.any() else ()
-    lost = (*gravity, *unsupported_terms(model, delta, has))
+    lost = (*gravity, *unsupported_terms(model, delta, has, motion))
     joints = _names(model)
     text = _text(model, delta, has, joints, lost, said)
     written = read_sdf(text, name, gravity_of(model), dict(zip(joints, model.chain.names, strict=True)))

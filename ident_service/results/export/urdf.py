@@ -32,6 +32,7 @@ from ident_service.model.urdf import urdf_text
 from ident_service.results.export.bodies import about_origin, is_real, joint_bodies, moved
 from ident_service.results.export.round_trip import (
     Carried,
+    RecordedMotion,
     gravity_of,
     presliding_left_out,
     require_same_torques,
@@ -381,7 +382,7 @@ _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 
 
 def urdf_export(
-    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = ()
+    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
     """Return the identified URDF, after pinocchio has read it back with the same torques.
 
@@ -390,6 +391,7 @@ def urdf_export(
         delta: link parameters, shape (layout.size,).
         name: of the file, for errors.
         said: of its bodies, for a comment at its end.
+        motion: that the arm was identified from, which says how large the torque of what is lost is.
 
     Returns:
         The text, what it does not carry, and notes.
@@ -407,7 +409,7 @@ def urdf_export(
     else:
         text = urdf_text(model, delta)
     gravity = "gravity" if model.chain.gravity.any() else ""
-    unwritten = unsupported_terms(model, delta, has)
+    unwritten = unsupported_terms(model, delta, has, motion)
     text = _commented(text, (*presliding_left_out(model, delta), *said))
     written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model), own)
     require_same_torques(model, delta, written, has, name)

@@ -87,7 +87,7 @@ def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (
         _environment()
         .get_template(template)
         .render(
-            policy=policy,
+            policy=Markup(policy),  # noqa: S704
             style=Markup("".join([*styles, asset("report.css"), sheet()])),  # noqa: S704
             scripts=[Markup(script) for script in scripts],  # noqa: S704
             **values,
