@@ -48,7 +48,7 @@ types: $(READY)
 
 # The site: build/site/index.html opens without a server, and nothing of it comes from a network.
 docs: $(READY)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # Figures that pages show, drawn from what the code computes; they are committed.
 docs-figures: $(READY)
