@@ -118,6 +118,7 @@ _FORMS: tuple[tuple[str, str], ...] = (
         "a name: small letters, digits, '_', '.' and '-', of which the first is a letter or digit",
     ),
     ("^[A-Za-z0-9_.-]", "a name: letters, digits, '_', '.' and '-'"),
+    ("^[A-Za-z0-9*?_", "a name of an arm, or a pattern: letters, digits, '_', '.', '-', '*', '?' and [...]"),
     (r"^[A-Za-z_]\w*", "a module and its function, as in my_constraints:bodies"),
     ("^(t|(q|dq|tau)", "t, or q, dq or tau with the number of a joint, as in q1"),
     ("^[0-9A-F]{4}:", "an object of the drive and its type, as in 6077:0/i16"),

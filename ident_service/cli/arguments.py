@@ -55,7 +55,7 @@ LOCAL_ONLY: dict[str, str] = {
 }
 """Verbs that no daemon does, each with the reason; they have no option `--server`."""
 
-ANSWERLESS = frozenset({"serve", "completion"})
+ANSWERLESS = frozenset({"completion"})
 """Verbs whose answer is no JSON object; they have no option `--json`."""
 
 

@@ -85,7 +85,8 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
     if verb is None:
         why = LOCAL_ONLY.get(arguments.word, "not available on a daemon")
         raise UsageError(f"{arguments.word}: {why}; --server is for {', '.join(sorted(verbs))}")
-    given = {name for name, value in vars(arguments).items() if value != arguments.words.get_default(name)}
+    own = {action.dest for action in arguments.words._actions}  # not those of a noun that stands before it
+    given = {name for name in own & set(vars(arguments)) if vars(arguments)[name] != arguments.words.get_default(name)}
     if lost := sorted(given - carried[arguments.word] - _OURS):
         options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
         raise UsageError(f"{arguments.word} --server: {options} cannot be sent to a daemon")

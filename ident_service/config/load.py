@@ -491,7 +491,7 @@ def _told(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -
     if kind in _BOUNDS:
         words, key = _BOUNDS[kind]
         unit = known.unit(where, tree.value)
-        return "said", f"must be {words} {context[key]:g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
+        return "said", f"must be {words} {context[key]:.10g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
     if kind in ("literal_error", "enum"):
         return "wanted", str(context["expected"])
     if kind == "union_tag_invalid":

@@ -155,6 +155,7 @@ def test_help_loads_no_large_library(words: list[str]) -> None:
 IDENTIFY_LOADS = {
     *("ident_service", "drivers", "numpy", "pinocchio", "coal", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
     *("pydantic", "pydantic_core", "annotated_types", "typing_extensions", "typing_inspection"),  # configurations
+    *("jinja2", "markupsafe"),  # the report
     *("mcap", "lz4", "zstandard"),  # recordings
     # Clarabel takes LAPACK from scipy.linalg.
     *("scipy", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),

@@ -32,7 +32,7 @@ NAMES = ("nobody",)
 TABLE: dict[str, tuple[tuple[str, Sequence[str]], ...]] = {
     "accept": (("accept {} --note why", FOLDERS),),
     "acknowledge": (("acknowledge {} lease_lost", NAMES), ("acknowledge planar2 {}", NAMES)),
-    "alarm acknowledge": (("alarm acknowledge {} --note why", ("1", "one")),),
+    "alarms acknowledge": (("alarms acknowledge {} --note why", ("1", "one")),),
     "backup": (("backup {}", ("out/b.tar", "no.csv")),),
     "base-parameters": (("base-parameters {}", ARMS),),
     "bus import": (
@@ -46,11 +46,12 @@ TABLE: dict[str, tuple[tuple[str, Sequence[str]], ...]] = {
     "bus scan": (("bus scan {}", (*ARMS, "planar2")),),
     "preflight": (("preflight {} --confirm planar2", ARMS), ("preflight planar2 {} --confirm planar2", MOTIONS)),
     "compare": (("compare {0} {0}", PARAMETERS),),
+    "completion": (("completion {}", ("csh", "''")),),
     "config check": (("config check {}", ARMS),),
     "project": (("project {} --out out/c.json", PARAMETERS),),
-    "delete arm": (("delete arm {}", NAMES),),
-    "delete motion": (("delete motion {}", NAMES),),
-    "delete run": (("delete run {}", NAMES),),
+    "arms delete": (("arms delete {}", NAMES),),
+    "motions delete": (("motions delete {}", NAMES),),
+    "runs delete": (("runs delete {}", NAMES),),
     "design": (
         ("design {} --starts 1 --out out", ARMS),
         ("design planar2 --resume {} --starts 1 --out out", MOTIONS),
@@ -97,21 +98,22 @@ TABLE: dict[str, tuple[tuple[str, Sequence[str]], ...]] = {
     "resume": (("resume {}", (*NAMES, "planar2")),),
     "rollback": (("rollback {} --note why", (*NAMES, "planar2")),),
     "run": (("run {}", ARMS), ("run planar2 {}", MOTIONS)),
-    "schedule add": (("schedule add {} --hours 5", NAMES), ("schedule add planar2 --cron {}", ("daily",))),
-    **{f"schedule {word}": ((f"schedule {word} {{}}", ("7", "seven")),) for word in ("enable", "disable")},
-    "schedule remove": (("schedule remove {}", ("7", "seven")),),
+    "schedules add": (("schedules add {} --hours 5", NAMES), ("schedules add planar2 --cron {}", ("daily",))),
+    **{f"schedules {word}": ((f"schedules {word} {{}}", ("7", "seven")),) for word in ("enable", "disable")},
+    "schedules remove": (("schedules remove {}", ("7", "seven")),),
+    "schema": (("schema {}", ("arms", "''")),),
     "serve": (("serve --port 0 --tls-cert {0} --tls-key {0}", ("no.json", "nowhere")),),
     "set-home": (("set-home {} --confirm planar2", (*ARMS, "planar2")),),
     "simulate": (("simulate {} --out out", ARMS), ("simulate planar2 --motion {} --out out", MOTIONS)),
     "stop": (("stop {}", NAMES),),
     "supported": (("supported {0} --confirm {0}", (*NAMES, "planar2")),),
-    "token add": (("token add {} --role viewer", ("''",)), ("token add ann --role {}", ("king",))),
-    "token revoke": (("token revoke {}", NAMES),),
+    "tokens add": (("tokens add {} --role viewer", ("''",)), ("tokens add ann --role {}", ("king",))),
+    "tokens revoke": (("tokens revoke {}", NAMES),),
     "verify": (("verify {}", PARAMETERS), ("verify other.json --arm {}", ARMS)),
     "view": (("view {} --save out/a.rrd", FOLDERS), ("view folder --recording {} --save out/a.rrd", RECORDINGS)),
     "watch": (("watch {}", (*ARMS, "wam7")),),
 }
-NOTHING_GIVEN = {"alarm list", "due list", "jobs list", "schedule list", "token list"}
+NOTHING_GIVEN = {"alarms", "arms", "due", "jobs", "motions", "runs", "schedules", "tokens"}
 
 
 def test_the_table_has_every_verb() -> None:

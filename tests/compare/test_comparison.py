@@ -53,7 +53,7 @@ def test_the_accepted_set_is_named_by_its_arm(commissioned: Path, ident: Ident, 
     assert config is not None
     arm = config.name
     code, _, err = ident("compare", f"accepted:{arm}", folder, *state)
-    assert (code, "nothing has been accepted yet" in err) == (2, True)
+    assert (code, "no arm of this name has an accepted set" in err) == (2, True)
     assert ident("accept", folder, "--note", "good", *state)[0] == 0
     code, out, _ = ident("compare", f"accepted:{arm}", commissioned / "again", *state)
     assert (code, "\nUNCHANGED" in out) == (0, True)

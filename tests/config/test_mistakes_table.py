@@ -271,6 +271,5 @@ def test_an_arm_without_a_driver_is_told_what_a_motion_would_need(
         f"arm.yaml: bench, 2 joints, 28 parameters: {verdict}",
         f"  arm.yaml:12:3: joints.elbow: a motion needs {lacking}; {GUESSES}",
         "gains: not checked, because limits or gains are missing",
-        "next: ident identify RECORDING --arm arm.yaml",
     ]
     assert answer(GOOD, folder, capsys)[1][0] == "arm.yaml: bench, 2 joints, 28 parameters: good"

@@ -351,7 +351,9 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         fault_file(state, "quick").latch("late_cycle", "a cycle came late")
         assert main(["recover", "quick", *server]) == 3
         said = capsys.readouterr().out
-        assert str(state) not in said
+        told, _, following = said.partition("\nnext: ")
+        assert str(state) not in told
+        assert following.endswith(f"--state {state} {shlex.join(server[:2])}\n")  # as this person has given it
         commands = [shlex.split(one)[1:] for one in re.findall(r"`(ident [^`]+)`", said)]
         assert ["acknowledge", "quick", "late_cycle", *server[:2]] in commands
         for words in commands:

@@ -304,9 +304,11 @@ def test_locks_that_agree_with_a_mimic_are_taken() -> None:
     assert (held["gripper_left_joint"], held["gripper_right_joint"]) == (0.7, -0.5)
 
 
-def test_xml_that_only_pinocchio_accepts_is_told() -> None:
-    with pytest.raises(ModelError, match=r"arm\.urdf: not well-formed XML: unbound prefix"):
-        arm(PANDA.replace(' xmlns:xacro="http://www.ros.org/wiki/xacro"', "").replace("</robot>", "<xacro:x/></robot>"))
+def test_a_prefix_that_nobody_declared_is_passed_over_as_by_pinocchio() -> None:
+    loose = PANDA.replace(' xmlns:xacro="http://www.ros.org/wiki/xacro"', "").replace("</robot>", "<xacro:x/></robot>")
+    assert loose != PANDA
+    lock = {"panda_finger_joint1": 0.0}
+    assert arm(loose, lock=lock).chain.names == arm(PANDA, lock=lock).chain.names
 
 
 def test_the_description_says_what_it_means() -> None:

@@ -83,7 +83,7 @@ def test_every_kind_can_be_described(tmp_path, kind):
     ("line", "mark", "message"),
     [
         pytest.param("{kind: sunspots, at: 1}", "kind", "'lost_feedback'", id="kind"),
-        pytest.param("{kind: lost_feedback, at: -1}", "at:", "greater than or equal to 0", id="time"),
+        pytest.param("{kind: lost_feedback, at: -1}", "at:", "must be at least 0 [s], not -1", id="time"),
         pytest.param("{kind: lost_feedback, at: 1, duration: 0}", "duration", "greater than 0", id="duration"),
         pytest.param("{kind: lost_feedback, at: 1, force: 3}", "force", "unknown key 'force'", id="key"),
         pytest.param("{kind: lost_feedback}", "{", "exactly one of at and cycle", id="no time"),
@@ -147,7 +147,7 @@ def test_a_list_of_faults_is_asked_for(tmp_path):
     path.write_text(TEXT.replace("  faults:\n", "  faults: {kind: nan_position, at: 1}\n"))
     with pytest.raises(ConfigError) as caught:
         load_arm(path)
-    assert [problem.message for problem in caught.value.problems] == ["driver.faults: must be a list"]
+    assert [problem.message for problem in caught.value.problems] == ["driver.faults: must be a list, not a mapping"]
 
 
 def test_a_watchdog_without_room_for_a_late_frame_is_refused_in_its_place(tmp_path):

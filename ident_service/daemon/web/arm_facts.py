@@ -101,19 +101,36 @@ def facts_of(config: ArmConfig) -> ArmFacts:
 
 def joint_facts(config: ArmConfig) -> list[dict[str, Any]]:
     """Return the joints of a description (`JointFacts`) as JSON values; none where it has no readable mechanism."""
-    from ident_service.model.arm_model import arm_model
-
     try:
-        chain = arm_model(config).chain
+        names, revolute = _joints(config)
     except IdentError:
         return []
     found = []
-    for name, turns in zip(chain.names, chain.revolute, strict=True):
+    for name, turns in zip(names, revolute, strict=True):
         joint = config.joints.get(name)
         lower, upper = (None, None) if joint is None or joint.position is None else joint.position
         rest = (None,) * 3 if joint is None else (joint.velocity, joint.torque, joint.following_error)
         found.append(asdict(JointFacts(name, "rad" if turns else "m", lower, upper, *rest)))
     return found
+
+
+def _joints(config: ArmConfig) -> tuple[tuple[str, ...], tuple[bool, ...]]:
+    """Return the joints' names and whether they turn; the daemon loads no parser of pinocchio for them."""
+    from ident_service.model.chain import chain_from_dh
+    from ident_service.model.mechanism import count_mechanism, parse_xml, read_mechanism
+
+    kinematics = config.kinematics
+    if kinematics.dh is not None:
+        chain = chain_from_dh(kinematics.dh, config.gravity)
+        return chain.names, chain.revolute
+    if kinematics.urdf is not None:
+        count_mechanism(kinematics.urdf, "urdf")
+        kinds = {joint.get("name"): joint.get("type") for joint in parse_xml(kinematics.urdf.text).iter("joint")}
+        return tuple(config.joints), tuple(kinds.get(name) != "prismatic" for name in config.joints)
+    if kinematics.mjcf is not None:
+        found = read_mechanism(kinematics.mjcf, "mjcf", kinematics)
+        return found.names, found.revolute
+    return (), ()
 
 
 def home_svg(service: Service, arm: str) -> str:
