@@ -478,8 +478,8 @@ class ArmConfig(ExtendedSection):
     """Access to the arm: `simulated`, `canopen`, `barrett`, or the name of another distribution's driver. Left out for
     an arm that is identified from recordings only."""
     unattended_motion: Literal["refused", "allowed"] = "refused"
-    """Whether a scheduled re-identification may move the arm with nobody there. `allowed` is for the simulator, and for
-    a cell whose fence and interlock take the drives' power away as soon as a person can reach in."""
+    """Permission for a scheduled re-identification to move the arm with nobody there. `allowed` is for the simulator,
+    and for a cell whose fence and interlock take the drives' power away as soon as a person can reach in."""
 
     @property
     def can_buses(self) -> tuple[CanBus, ...]:

@@ -34,7 +34,7 @@ def keys(schema: dict[str, Any]) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 
 def is_number(part: dict[str, Any], schema: dict[str, Any]) -> bool:
-    """Whether a value, or each of a list or mapping of them, can be a number."""
+    """Return whether a value, or each of a list or mapping of them, can be a number."""
     if "$ref" in part:
         return is_number(schema["definitions"][part["$ref"].rpartition("/")[2]], schema)
     inside = [*part.get("anyOf", ()), *part.get("allOf", ())]

@@ -1,4 +1,4 @@
-"""What viewers in three dimensions are told: where joints are, and how near bodies come."""
+"""Viewers in three dimensions get the places of joints and the distances of bodies."""
 
 from __future__ import annotations
 

@@ -133,7 +133,7 @@ def test_a_change_that_makes_no_torque_is_no_alarm() -> None:
 
 
 def test_a_slow_drift_is_found_and_told_from_a_step() -> None:
-    """Of an effect that no single date shows: from week to week it is less than the noise."""
+    """Find a drift that no single date shows: from week to week it is less than the noise."""
     values = fleet(5)
     for week in range(COUNT):
         values["07"][week][[2, 3]] += 0.012 * week

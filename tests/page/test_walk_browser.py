@@ -40,7 +40,7 @@ NOW = time.time()
 
 @dataclass
 class Told:
-    """What a page's browser complained of."""
+    """Collect the complaints of a page's browser."""
 
     words: list[str] = field(default_factory=list)
 
@@ -200,7 +200,7 @@ COLOURS: dict[str, Any] = {
 
 
 def violations(axe: Axe, page: Page, options: dict[str, Any]) -> list[str]:
-    """What axe-core finds on a page."""
+    """Return the findings of axe-core on a page."""
     answer = axe.run(page, options=options).response
     return [
         f"axe {one['id']}: {one['help']}: {node['html'][:120]}"

@@ -70,7 +70,7 @@ PAINTED = """() => [...document.querySelectorAll('figure canvas')].filter(canvas
 
 
 def legend(tab: Tab, figure: str) -> dict[str, str]:
-    """What the legends of a figure tell, by label."""
+    """Return the values in the legends of a figure, by label."""
     pairs = (
         f"[...document.querySelectorAll('{figure} .u-series')].filter(one => one.getClientRects().length)"
         ".map(one => [one.querySelector('.u-label').textContent, one.querySelector('.u-value').textContent])"
