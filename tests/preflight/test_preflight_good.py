@@ -100,13 +100,15 @@ def test_another_word_is_not_the_name() -> None:
 
 
 @pytest.mark.slow
-def test_a_driver_that_does_not_tell_about_its_drives_skips_the_watchdog_unasked() -> None:
+def test_a_driver_that_does_not_tell_about_its_drives_gets_no_ticket_and_nobody_is_asked() -> None:
     flight = Flight()
     flight.arm.shown = lambda sample: replace(sample, status=())
-    check = check_of(flight.ticket(), "watchdog")
-    assert check.verdict is Verdict.SKIPPED
-    assert "by hand" in check.remedy
+    ticket = flight.ticket()
+    check = check_of(ticket, "watchdog")
+    assert check.verdict is ticket.verdict is Verdict.FAILED
+    assert "Sample.status" in check.remedy
     assert flight.questions == []
+    assert ticket.valid_for(ticket.subject, ticket.created) == ["checks failed: watchdog"]
 
 
 def test_the_ticket_is_stamped_by_the_clock_it_is_given(good: Flown) -> None:
