@@ -164,8 +164,8 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
         worst = int(np.argmax(payload.body.torque_share))
         lines += [
             "",
-            f"the nearest physical body, p = {payload.body.p:.2g}, at most {payload.body.torque_share[worst]:.2%} of the "
-            f"torque of joint {names[worst]} away",
+            f"the nearest physical body, p = {payload.body.p:.2g}, at most {payload.body.torque_share[worst]:.2%} of "
+            f"the torque of joint {names[worst]} away",
         ]
         values, words = rounded(payload.body.delta[: len(INERTIAL)]), body_words(payload)
         body = [f"{name} {value:.4g}" for name, value in zip(payload.base.names, values, strict=False)]
