@@ -172,8 +172,9 @@ def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
         (
             "time," + ",".join(f"pos_{k}" for k in range(7)) + ",eff_0",
             "unknown columns 'time', 'pos_0', 'pos_1', 'pos_2', 'pos_3', 'pos_4', 'pos_5', 'pos_6' and 1 more; no"
-            " column 't' (time in seconds); no joints; expected a header t,q1..qN,tau1..tauN, or the names of these columns in"
-            " recording.columns of the description (or --columns): columns: {t: NAME, q1: NAME, tau1: NAME, ...}",
+            " column 't' (time in seconds); no joints; expected a header t,q1..qN,tau1..tauN, or the names of"
+            " these columns in recording.columns of the description (or --columns): columns: {t: NAME, q1: NAME, "
+            "tau1: NAME, ...}",
         ),
     ],
 )
