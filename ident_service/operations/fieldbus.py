@@ -461,7 +461,8 @@ def _of_drive(driver: CanopenDriver, number: int, objects: Objects) -> Probed:
 
 
 def _of_file(driver: CanopenDriver, number: int, file: TextFile) -> Probed:
-    mistake = data_sheet(file.text).mistake
+    sheet = data_sheet(file.text)
+    mistake = sheet.mistake or ("" if sheet.entries else "it lists no object")
     why = f"is no EDS: {mistake}" if mistake else ""
     return Probed(file.name, driver.drives[number].node, why, _capabilities_from_sheet(driver, number, file))
 
@@ -615,20 +616,6 @@ def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps({"format": _KEPT_FORMAT, "version": 1, "drives": known}, indent=1) + "\n")
     return words
-
-
-# The rest of a probe is what the description makes of it.
-_OF_THE_DRIVE = (
-    "family",
-    "firmware",
-    "mode",
-    "target",
-    "count",
-    "torque_limit",
-    "speed_limit",
-    "watchdogs",
-    "status_timer",
-)
 
 
 # The rest of a probe is what the description makes of it.
