@@ -1,7 +1,6 @@
 """Read the entries of an EDS or DCF (CiA 306-1) as far as possible, in spite of oddities in makers' files.
 
-Lines that are none of an ini file are passed over, and so is every value that is none: a file says what it says, and the
-drive has the last word.
+Lines that are none of an ini file are passed over, and so is every value that is none: the drive has the last word.
 """
 
 from __future__ import annotations
@@ -133,7 +132,7 @@ def _sections(text: str) -> dict[str, dict[str, str]]:
 
 
 def _place(name: str) -> tuple[int, int | None] | None:
-    """Return index and sub-index of a section, of which an object's own has none; None for a section of another kind."""
+    """Return index and sub-index (None for an object's own) of a section; None for a section of another kind."""
     match = _OBJECT.fullmatch(name)
     return None if match is None else (int(match[1], 16), None if match[2] is None else int(match[2], 16))
 

@@ -533,7 +533,8 @@ def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"
     facts["torque_frames"] = f"{shares}, as far as its file and family know"
-    facts["status_reports"] = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    by_itself = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    facts["status_reports"] = "with each position" if can.beside else by_itself
     if (brake := can.family.brake) is not None:
         held = can.found.get(parse_entry(brake, ""))
         facts["brake"] = f"{named(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
@@ -575,6 +576,7 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
             "shares": can.shares,
             "dummies": list(can.dummies),
             "status_timer": can.event,
+            "status_with_position": can.beside,
             "problems": [{"where": problem.where, "why": problem.why} for problem in can.problems],
             "changes": [{"where": change.where, "why": change.why} for change in can.changes],
             "missing": list(can.notes),

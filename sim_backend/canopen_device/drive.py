@@ -168,8 +168,7 @@ class TorqueLoop:
         number = self._objects.number
         values = self._objects.values
         cyclic = number(0x6061) in self._personality.modes
-        target = self._personality.target
-        asked = number(target >> 8, target & 0xFF) + number(0x60B2) if cyclic else 0
+        asked = self._personality.asked(self._objects) + number(0x60B2) if cyclic else 0
         if follows := number(0x6061) == _CSP and 0x607A00 in self._objects.entries:
             count = self._personality.torque(1.0, self._objects)
             most, self._motor.holds = self._personality.reach(self._objects) * count, True
@@ -205,9 +204,8 @@ class TorqueLoop:
         self._sum, self._told_ns = 0.0, now_ns
 
     def _exceeds_max_speed(self, demand: int, now_ns: int) -> bool:
-        speed = self._motor.speed(now_ns)
-        limited = 0x608000 in self._objects.entries
-        return limited and speed * demand > 0.0 and abs(speed) * _RPM > self._objects.number(0x6080)
+        speed, most = self._motor.speed(now_ns), self._personality.fastest(self._objects)
+        return most is not None and speed * demand > 0.0 and abs(speed) * _RPM > most
 
 
 _RAMP = "ramp"

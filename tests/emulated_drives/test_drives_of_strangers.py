@@ -9,7 +9,9 @@ from __future__ import annotations
 import random
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,10 +118,8 @@ def test_compact_arrays_have_their_elements_and_the_values_of_a_dcf() -> None:
         "[1003]\nObjectType=8\nDataType=7\nAccessType=ro\nCompactSubObj=3\nDefaultValue=5\n"
         "[1003Value]\nNrOfEntries=1\n2=0x7\n[1010]\nObjectType=0x8\nSubNumber=2\n[1010sub1]\nDataType=7\n"
     )
-    assert {key: one.number(1) for key, one in sheet.entries.items()} == {
-        **{0x100300: 3, 0x100301: 5, 0x100302: 7, 0x100303: 5},
-        0x101001: None,
-    }
+    values = [(key, one.number(1)) for key, one in sorted(sheet.entries.items())]
+    assert values == [(0x100300, 3), (0x100301, 5), (0x100302, 7), (0x100303, 5), (0x101001, None)]
     assert [sheet.entries[key].configured for key in (0x100301, 0x100302)] == [False, True]
     assert sheet.mistake is None  # although it has no [DeviceInfo]
 
@@ -147,8 +147,9 @@ def written_by_a_stranger(text: str) -> str:
 
 def test_a_strangers_drive_is_emulated_probed_and_moved_like_the_plain_one() -> None:
     """Where no makers' file is at hand, too: the shipped one."""
-    bench = Bench(arm_of("", text=EDS, torque_frames="shared", watchdog="rpdo_timer"))
-    strange = Bench(arm_of("", text=written_by_a_stranger(EDS), torque_frames="shared", watchdog="rpdo_timer"))
+    described: dict[str, Any] = {"torque_frames": "shared", "drive": {"watchdog": "rpdo_timer"}}
+    bench = Bench(arm_of("", text=EDS, **described))
+    strange = Bench(arm_of("", text=written_by_a_stranger(EDS), **described))
     for one in (bench, strange):
         with one.arm as arm:
             arm.enable()
@@ -222,10 +223,8 @@ def tried(name: str, text: str) -> bool:
 @given(st.sampled_from(sorted(CAPABLE)), st.integers(0, 2**32))
 def test_a_file_with_nonsense_gets_a_report_and_drives_that_are_opened_or_refused(name: str, seed: int) -> None:
     text = (SHEETS / name).read_text(encoding="latin-1")
-    try:
+    with suppress(IdentError):  # the description does not go with the file, or the file lists nothing
         tried(name, spoiled(text, random.Random(seed)))  # noqa: S311 - nothing secret
-    except IdentError as error:  # the description does not go with the file, or the file lists nothing
-        assert str(error)
 
 
 @needs_sheets
@@ -234,8 +233,6 @@ def test_a_file_with_nonsense_gets_a_report_and_drives_that_are_opened_or_refuse
 def test_many_files_with_nonsense(name: str) -> None:
     text, opened = (SHEETS / name).read_text(encoding="latin-1"), 0
     for seed in range(40):
-        try:
+        with suppress(IdentError):
             opened += tried(name, spoiled(text, random.Random(seed)))  # noqa: S311 - nothing secret
-        except IdentError as error:
-            assert str(error)
     assert bool(opened) == (name in CAPABLE)

@@ -34,14 +34,14 @@ def sheet(name: str) -> dict[str, str]:
     return {"name": name, "text": (SHEETS / name).read_text(encoding="latin-1")}
 
 
-def arm_of(*names: str, text: str | None = None, watchdog: str | None = None, **changes: Any) -> ArmConfig:
-    """Two drives made from these files, described as they are; `text` and `watchdog` are in place of theirs."""
+def arm_of(*names: str, text: str | None = None, drive: dict[str, Any] | None = None, **changes: Any) -> ArmConfig:
+    """Two drives made from these files, described as they are; `text` and keys of `drive` are in place of theirs."""
     drives = []
     files = [sheet(name) if text is None else {"name": "strange.eds", "text": text} for name in names]
     for node, name, file in zip((1, 2), names * 2, files * 2, strict=False):
         guard, _, own = CAPABLE.get(name, ("heartbeat", 0, {}))
         one = {"node": node, "counts": 65536, "rated_torque": 1.0, "max_torque": 2.0, "max_speed": 6000.0}
-        drives.append(one | {"watchdog": watchdog or guard, "eds": file} | own)
+        drives.append(one | {"watchdog": guard, "eds": file} | own | (drive or {}))
     section = {
         "drives": drives,
         "eds": files[0],
