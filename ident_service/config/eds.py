@@ -147,7 +147,7 @@ def _is_container(section: Mapping[str, str], divided: bool) -> bool:
         return False
     if kind in _CONTAINERS:
         return divided or bool(subs) or "datatype" not in section
-    return divided and "datatype" not in section or (kind is None and bool(subs))
+    return (divided and "datatype" not in section) or (kind is None and bool(subs))
 
 
 def _listed(section: Mapping[str, str], sub: int, values: Mapping[str, str]) -> Iterator[tuple[int, DataSheetEntry]]:
