@@ -36,7 +36,7 @@ FOREIGN: dict[str, Frame] = {
     "foreign_nmt": Frame(0x000, bytes([0x01, 0x01])),
     "foreign_heartbeat": Frame(0x77F, b"\x05"),
 }
-QUICK_STOP = bytes([0x02, 0x00, 10])  # control word and mode
+QUICK_STOP = bytes([0x02, 0x00])  # control word, before the mode
 NOTICE = Frame(0x081, bytes.fromhex("01 ff 00 00 00 00 00 00"))  # without a bit of the error register
 WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN, "full_queue")
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
@@ -94,6 +94,10 @@ POSITION_PROMISES: dict[str, Promise] = {
     )
     for kind, promise in CANOPEN_PROMISES.items()
 }
+
+
+def is_quick_stop(frame: Frame) -> bool:
+    return 0x300 < frame.identifier < 0x380 and frame.data[:2] == QUICK_STOP
 
 
 class EmulatedArm(WatchedArm):
@@ -162,7 +166,7 @@ class EmulatedArm(WatchedArm):
 
     def left_alone(self) -> None:
         """Longer than the drives wait for torque frames, and for a ramp."""
-        told = [{frame.identifier for frame in tap.sent if frame.data == QUICK_STOP} for tap in self.taps]
+        told = [{frame.identifier for frame in tap.sent if is_quick_stop(frame)} for tap in self.taps]
         self.told_to_brake = sum(len(nodes) for nodes in told)
         self.behind.settle(self.clock.now_ns() + 50_000_000)
         self.states = self.behind.emulator.states
