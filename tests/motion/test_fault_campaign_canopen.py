@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign_bench import Case, Outcome, Strike, play, subject, windows
-from campaign_canopen import CANOPEN_PROMISES, WIRE, EmulatedArm, of_joint
+from campaign_canopen import CANOPEN_PROMISES, FOREIGN, WIRE, EmulatedArm, of_joint
 from campaign_checks import keep_their_promises, keeps_its_promise, together
 from test_fault_campaign import STATES
 
@@ -26,7 +26,7 @@ from sim_backend.emulator.faults import DRIVE_FAULTS
 from sim_backend.emulator.motor import Power
 
 SEED = 11
-DRIVES = {"bench canopen": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
+DRIVES = {"bench canopen": 2, "bench positions": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
 # At the end of this stop j7 stands still against more than the friction guess, which is taken for a frozen encoder
 # (decision 0008). A stop that a person asks for in the same cycle ends so too.
 REMAINING = {"wam canopen-lost_status-exciting-0.64-None"}
@@ -48,6 +48,9 @@ def sample() -> list[Case]:
     rng = random.Random(SEED)  # noqa: S311 - not for secrets
     small, large, divided = list(cases("bench canopen", 1, 1)), list(cases("wam canopen", 1, 1)), list(two_buses())
     chosen = [rng.choice([case for case in small if case.kind == kind]) for kind in CANOPEN_PROMISES]
+    # While it moves, drives that are given positions react in their own way.
+    moving = [case for case in cases("bench positions", 1, 1) if case.state is State.EXCITING]
+    chosen += rng.sample([case for case in moving if case.kind not in FOREIGN], 12)
     # Early in its motion: simulating the WAM up to the fault is what takes time.
     chosen += [Case("wam canopen", "stuck_torque", State.EXCITING, 0.2 * rng.random(), 1)]
     chosen += rng.sample([case for case in large if case.state is State.EXCITING and case.share < 0.2], 1)
@@ -140,7 +143,7 @@ def test_all_ends_of_an_arm_without_brakes(case: Case, tmp_path: Path) -> None:
 
 def campaign() -> list[Any]:
     """All cases; one that is known to fail must go on failing, or be taken off the list."""
-    every = [*cases("bench canopen", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
+    every = [*cases("bench canopen", 2, 2), *cases("bench positions", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
     fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
     return [pytest.param(case, id=str(case), marks=fails if str(case) in REMAINING else ()) for case in every]
 
