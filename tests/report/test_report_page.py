@@ -152,7 +152,7 @@ def test_tables_say_what_their_rows_and_columns_are(good: Made, bare: Made) -> N
 
 def test_nothing_leaves_the_page(good: Made) -> None:
     page = good.page
-    vendored = files("ident_service").joinpath("daemon/web/vendored/uPlot.iife.min.js").read_text()
+    vendored = files("ident_service").joinpath("vendored/uPlot.iife.min.js").read_text()
     assert vendored in page
     for pattern in (
         r"https?://",

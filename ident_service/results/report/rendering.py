@@ -103,8 +103,8 @@ def asset(name: str) -> str:
 
 @cache
 def vendored(name: str) -> str:
-    """Return a file of uPlot, its licence before it; there is one copy, which the daemon's pages bring along."""
-    place = files("ident_service").joinpath("daemon", "web", "vendored")
+    """Return a file of uPlot, its licence before it; there is one copy, which the daemon's pages show, too."""
+    place = files("ident_service").joinpath("vendored")
     licence = place.joinpath("uPlot.LICENSE.txt").read_text(encoding="utf-8").strip()
     return f"/* uPlot\n{licence} */\n{place.joinpath(name).read_text(encoding='utf-8')}"
 
