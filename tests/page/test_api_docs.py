@@ -6,6 +6,7 @@ import pytest
 from page.conftest import Reached
 from playwright.sync_api import Browser, ConsoleMessage, Request, expect
 
+
 @pytest.mark.slow
 @pytest.mark.timeout(200)
 def test_the_api_can_be_browsed_without_network_or_token(browser: Browser, reached: Reached) -> None:
