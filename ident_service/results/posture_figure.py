@@ -500,7 +500,8 @@ def _grid(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> float:
         canvas.line("grid", axes.left, at, axes.left + axes.width, at)
         canvas.text("soft", axes.left - 5, at + 3.5, number(value, 6), size=10, anchor="end")
     across, up = (f"{_NAMES[axis]} [m]" for axis in view)
-    canvas.text("soft", axes.left + axes.width / 2, axes.top + axes.height + 31, across, anchor="middle")
+    # At the end, as the scale bar stands at the beginning.
+    canvas.text("soft", axes.left + axes.width, axes.top + axes.height + 31, across, anchor="end")
     canvas.text("soft", axes.left - 30, axes.top - 8, up, anchor="middle")
     return step
 
