@@ -60,7 +60,7 @@ docs-pictures: $(READY)
 
 # What a newcomer does, in a clean clone, by the documents' own commands.
 walk: $(READY)
-	$(BIN)/python tests/documents/walk.py --clean README.md $(addprefix docs/,tutorial.md your-own-arm.md identify-recordings.md)
+	$(BIN)/python tests/documents/walk.py --clean README.md $(addprefix docs/,tutorial.md identify-recordings.md your-own-arm.md)
 
 bench: $(READY)
 	$(BIN)/python -m benchmarks
