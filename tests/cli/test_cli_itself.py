@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from cli.conftest import COARSE, Commissioned, Ident, left_over, quick_arm
+from cli.conftest import COARSE, Commissioned, Ident, Samples, left_over, quick_arm
 
 from ident_service import __version__
 from ident_service.cli import main, parser
@@ -75,11 +75,17 @@ def test_version(ident: Ident) -> None:
     assert ident("--version").out == f"ident-service {__version__}\n"
 
 
+@pytest.fixture
+def short(samples: Samples, tmp_path: Path) -> Path:
+    """A recording of a tenth of the samples, where the folder is of interest and not what is found."""
+    return Samples(samples.time[::10], samples.position[::10], samples.torque[::10]).write(tmp_path / "short.csv")
+
+
 @pytest.mark.slow
 def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
-    quick: Commissioned, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    quick: Commissioned, short: Path, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
+    words = ("identify", short, "--arm", quick.arm, "--json")
 
     def parent(*more: object) -> Path:
         return Path(ident(*words, *more).json["folder"]).parent
@@ -93,8 +99,10 @@ def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
 
 
 @pytest.mark.slow
-def test_runs_of_the_same_second_get_folders_of_their_own(quick: Commissioned, ident: Ident, state: Path) -> None:
-    words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--json")
+def test_runs_of_the_same_second_get_folders_of_their_own(
+    quick: Commissioned, short: Path, ident: Ident, state: Path
+) -> None:
+    words = ("identify", short, "--arm", quick.arm, "--json")
     folders = {ident(*words).json["folder"] for _ in range(3)}
     assert len(folders) == 3
     assert {str(path) for path in (state / "runs").iterdir()} == folders

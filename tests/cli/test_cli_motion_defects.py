@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.conftest import Ident, left_over, quick_arm, run_main
+from cli.conftest import COARSE, Ident, left_over, quick_arm, run_main
 
 QUICK = ("--starts", 1, "--workers", 1)
 
@@ -74,14 +74,14 @@ def test_a_search_without_time_says_so_and_is_no_success(tmp_path: Path, ident: 
 @pytest.mark.slow
 def test_blanks_in_an_expression_do_not_matter(tmp_path: Path, ident: Ident) -> None:
     words = ("--parameter", "Lzz2-0.25*m2", "--out", tmp_path / "m", "--json")
-    assert ident("design", quick_arm(tmp_path), *QUICK, *words).json["criterion"] == "a_optimal"
+    assert ident("design", quick_arm(tmp_path, *COARSE), *QUICK, *words).json["criterion"] == "a_optimal"
 
 
 @pytest.fixture(scope="module")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """A motion of the small arm, as its file says it."""
     folder = tmp_path_factory.mktemp("designed")
-    assert run_main("design", quick_arm(folder), *QUICK, "--out", folder / "m") == 0
+    assert run_main("design", quick_arm(folder, *COARSE), *QUICK, "--out", folder / "m") == 0
     return dict(json.loads((folder / "m" / "motion.json").read_text()))
 
 
