@@ -165,9 +165,7 @@ class _Whitened:
         return (V[:, others] / (1.0 - shares[others])) @ V[:, others].T, V[:, ~others] * np.sqrt(shares[~others])
 
 
-def _left_out(
-    clusters: Sequence[_Whitened], fit: LeastSquares, asked: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _left_out(clusters: Sequence[_Whitened], fit: LeastSquares, asked: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return what `jackknife` does, of combinations `asked`, shape (base, combinations)."""
     along = fit.inverse.T @ asked
     variances = np.maximum(np.sum(along**2, axis=0), np.finfo(float).tiny)
