@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import os
 import re
-import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemBytecodeCache, PackageLoader, StrictUndefined
-from jinja2.bccache import Bucket
+from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ident_service.results.plots import printable, sheet
@@ -130,22 +125,6 @@ def _readable(value: Any) -> Any:
     return value if value.isprintable() else printable(value)
 
 
-class _CompiledTemplates(FileSystemBytecodeCache):
-    """Keep compiled templates where Python keeps this package's own modules; compiling takes 0.1 s of every report."""
-
-    def dump_bytecode(self, bucket: Bucket) -> None:
-        """Write a compiled template where there is room for it."""
-        with suppress(OSError):
-            super().dump_bytecode(bucket)
-
-
-def _compiled_templates() -> _CompiledTemplates | None:
-    place = Path(__file__).parent / "__pycache__"
-    if sys.dont_write_bytecode or not os.access(place, os.W_OK):
-        return None
-    return _CompiledTemplates(str(place), "%s.jinja")
-
-
 @cache
 def _environment() -> Environment:
     environment = Environment(
@@ -155,7 +134,6 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         finalize=_readable,
-        bytecode_cache=_compiled_templates(),
     )
     environment.globals |= {"drawing": drawing}
     return environment
