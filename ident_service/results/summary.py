@@ -35,7 +35,7 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
     if "choose" in (smoothing.cutoff, smoothing.decimate, options.edge):
         chosen = "Rows and filter: chosen for each recording from the spectra of its positions; its ends are left out."
         return (chosen,)
-    thinned = f", {_one_of(int(smoothing.decimate))}" if smoothing.decimate != 1 else ""
+    thinned = f", thinned out to one of {_said(smoothing.decimate)}" if smoothing.decimate != 1 else ""
     rows = f"All rows: every sample of a recording but {_said(options.edge)} s at its ends and at gaps{thinned}."
     slow = f"is not faster than {reversal.speed:g} rad/s (or m/s)" if reversal.speed else "stands still"
     near = f", and without those within {reversal.window:g} s of them" if reversal.window else ""
@@ -92,14 +92,6 @@ def noise_and_model(noise: Array | None, variances: Array) -> str:
 def wrapped(sentences: Iterable[str]) -> list[str]:
     """Wrap sentences into lines for a terminal."""
     return [line for sentence in sentences for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")]
-
-
-def _one_of(count: int) -> str:
-    """Return in words that one sample of `count` is kept."""
-    if count in (2, 3):
-        return "every second" if count == 2 else "every third"
-    ending = "th" if count % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(count % 10, "th")
-    return f"every {count}{ending}"
 
 
 def _said(value: float | str) -> str:
