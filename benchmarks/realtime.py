@@ -2,8 +2,8 @@
 
 `make bench-realtime`, or `python -m benchmarks.realtime [TRIES]`, about a minute a try: the WAM at 500 Hz as
 `docs/fieldbus.md` has it, but lowered after a stop, as nobody is there to confirm that it is supported; planar2 behind
-two drives at 1 kHz; and the same given positions at 250 Hz. `ident emulate`, `ident preflight`, then `ident run` again and again (10 times). What stalls
-the machine meanwhile is in the figures.
+two drives at 1 kHz; and the same given positions at 250 Hz. `ident emulate`, `ident preflight`, then `ident run` again
+and again (10 times). What stalls the machine meanwhile is in the figures.
 """
 
 from __future__ import annotations
