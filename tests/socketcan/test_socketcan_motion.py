@@ -203,22 +203,21 @@ def makers_arm(folder: Path, names: tuple[str, ...], interface: str, channel: st
     return load_arm(path)
 
 
-def brought_up(config: ArmConfig, path: Path) -> list[str]:
-    """Probe drives, open, enable and stop them, all over a real bus; their states once they are enabled."""
+def bring_up(config: ArmConfig, path: Path) -> None:
+    """Probe drives, open, enable and stop them, all over a real bus."""
     with emulated(path, "node 2: pre operational", "node 2: pre operational") as drives:
         probe = bus_probe(config)
         assert probe.good, probe_text(config, probe)
         with make_arm(config) as arm:
             arm.enable()
             samples = [arm.exchange(np.zeros(2)) for _ in range(20)]
-            states = [str(status) for status in arm.drive_status()]
+            assert all(status & AxisStatus.POWERED for status in arm.drive_status())
             arm.stop(StopKind.TORQUE_OFF)
             for _ in range(5):
                 arm.exchange(None)
             assert not any(status & AxisStatus.POWERED for status in arm.drive_status())
         assert any(sample.valid.all() for sample in samples)
     assert drives["unsent"] == 0
-    return states
 
 
 @pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
@@ -229,7 +228,7 @@ def test_drives_of_makers_are_probed_and_brought_up_over_a_real_bus(
     config = makers_arm(tmp_path, names, "raw", can_interface)
     for left in reversed(range(TRIES)):
         try:
-            brought_up(config, tmp_path / "makers.yaml")
+            bring_up(config, tmp_path / "makers.yaml")
             break
         except DriverError as error:
             print(f"{names}: {error}")
