@@ -170,12 +170,14 @@ class OperationMode:
         display: entry that tells the mode in effect.
         wanted: value of `display` in that mode.
         enabling: bits of the control word without which the drive does not follow its target in that mode.
+        at_once: whether its target acts when its frame comes, not at SYNC, so that the host's delays are in it.
     """
 
     sent: int
     display: Entry
     wanted: int
     enabling: int = 0
+    at_once: bool = False
 
 
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h
