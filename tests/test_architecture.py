@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import hashlib
+import json
 import re
 import subprocess
 import sys
@@ -210,6 +212,32 @@ def test_the_files_are_where_this_test_looks() -> None:
     assert len(files) > 50
 
 
+def test_scripts_of_others_stand_in_one_place_with_version_licence_and_checksum() -> None:
+    place = ROOT / "ident_service" / "vendored"
+    documents = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(place.glob("*.json"))]
+    told = {name: digest for one in documents for name, digest in one["sha256"].items()}
+    found = {path.name: path for path in place.iterdir() if path.suffix != ".json"}
+    assert {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()} == told
+    for one in documents:
+        assert one["licence"] == "MIT"
+        assert any(name.endswith("LICENSE.txt") for name in one["sha256"])
+        heads = [found[name].read_text(encoding="utf-8")[:400] for name in one["sha256"] if name.endswith(".js")]
+        # three.js says its revision alone: 185 of 0.185.1.
+        assert any(one["version"] in head for head in heads) or one["package"] == "three"
+    minified = {path for package in PACKAGES for path in (ROOT / package).rglob("*min.*")}
+    assert {path.parent for path in minified} == {place}
+    # Other files are read where a package may import from, too.
+    foreign = [
+        f"{file} reads files of {package or place}"
+        for file in python_files()
+        for package, place in re.findall(
+            r'files\("ident_service\.?(\w*)[\w.]*"\)\.joinpath\("?(\w*)', (ROOT / file).read_text(encoding="utf-8")
+        )
+        if (package or place) not in {"vendored", package_of(file), *MAY_IMPORT[package_of(file)]}
+    ]
+    assert foreign == []
+
+
 def test_every_file_is_short_enough_to_read() -> None:
     files = [file for file in python_files() if file != ONE_FILE]
     lines = {file: len((ROOT / file).read_text(encoding="utf-8").splitlines()) for file in files}
@@ -378,7 +406,7 @@ def test_identification_loads_cvxpy_only_when_it_is_used() -> None:
         ("sim_backend.plant_process", {"numpy", "pydantic", "pinocchio"}),
         ("ident_service.recordings.recorder_main", {"numpy", "mcap"}),
         ("ident_service.operations.target_process", {"numpy", "pydantic", "mcap", "yaml"}),
-        ("ident_service.daemon.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2"}),
+        ("ident_service.daemon.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2", "uvicorn"}),
     ],
 )
 def test_what_runs_beside_an_arm_loads_no_more_than_it_needs(program: str, needed: set[str]) -> None:

@@ -20,11 +20,11 @@ from typing import Any, Final
 # Of each package: its document, and which of its files become which of ours.
 PACKAGES: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "rapidoc": (
-        "vendored.json",
+        "rapidoc.json",
         {
             "package/dist/rapidoc-min.js": "rapidoc-min.js",
             "package/dist/rapidoc-min.js.LICENSE.txt": "rapidoc-min.js.LICENSE.txt",
-            "package/LICENSE.txt": "LICENSE.txt",
+            "package/LICENSE.txt": "rapidoc.LICENSE.txt",
         },
     ),
     "uplot": (
@@ -45,7 +45,7 @@ PACKAGES: Final[dict[str, tuple[str, dict[str, str]]]] = {
         },
     ),
 }
-PLACE = Path(__file__).resolve().parents[1] / "ident_service" / "daemon" / "web" / "vendored"
+PLACE = Path(__file__).resolve().parents[1] / "ident_service" / "vendored"
 
 
 def main(words: list[str]) -> None:

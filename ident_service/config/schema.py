@@ -9,13 +9,14 @@ out any, at any depth; `ident config check` knows which are missing.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import inspect
 import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -267,13 +268,23 @@ def _examples(schema: Mapping[str, Any]) -> dict[tuple[str, str], str]:
     return found
 
 
-def main(files: list[str]) -> int:
-    """Write the schema and the reference into two files."""
-    schema, page = map(Path, files)
-    schema.write_text(json.dumps(arm_schema(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    page.write_text(reference(), encoding="utf-8")
+def main(words: Sequence[str] | None = None) -> int:
+    """Write the schema and the reference into the checkout that this file is of, or where they are asked for."""
+    root = Path(__file__).resolve().parents[2]
+    parser = argparse.ArgumentParser(prog="python -m ident_service.config.schema", description=main.__doc__)
+    parser.add_argument("schema", nargs="?", type=Path, default=root / "configs" / "ident-arm.schema.json")
+    parser.add_argument("page", nargs="?", type=Path, default=root / "docs" / "reference-description.md")
+    given = parser.parse_args(words)
+    schema, page = given.schema, given.page
+    for one in (schema, page):
+        if not one.parent.is_dir():
+            parser.error(f"{one}: there is no folder {one.parent}; name the two files, of the schema and of the page")
+    made = {schema: json.dumps(arm_schema(), indent=1, ensure_ascii=False) + "\n", page: reference()}
+    for path, text in made.items():
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

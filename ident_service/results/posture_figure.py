@@ -247,10 +247,22 @@ def draw_workspace(canvas: Canvas, axes: Axes, view: tuple[int, int], box: Array
 
 _SIDE, _TOP_VIEW = (0, 2), (0, 1)
 _NAMES = "xyz"
-_WIDTH, _TALLEST, _SHORTEST = 520.0, 560.0, 240.0
-_LEFT, _GAP, _RIGHT, _TOP, _BOTTOM = 58.0, 62.0, 16.0, 100.0, 46.0
+_LEFT, _GAP, _RIGHT, _BOTTOM = 58.0, 62.0, 16.0, 46.0
 _AROUND = 0.5  # how much is shown around the arm, as a share of the space it moves in
 _MOST_POSTURES, _MOST_WAYPOINTS = 24, 3000  # more can neither be told apart nor seen
+
+
+@dataclass(frozen=True)
+class _Format:
+    """Sizes of a drawing of two views [px]: of a view, and the room above it."""
+
+    width: float
+    tallest: float
+    shortest: float
+    top: float
+
+
+_PAGE, _NARROW = _Format(520.0, 560.0, 240.0, 100.0), _Format(220.0, 260.0, 160.0, 48.0)
 
 
 def stick_figure(postures: Postures, title: str = "The arm along its motion") -> str:
@@ -267,14 +279,10 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
     Returns:
         A self-contained SVG.
     """
-    low, high = _extent(postures)
-    span = high - low
-    scale = min(_WIDTH / span[0], _TALLEST / max(span[1], span[2]))
-    height = float(np.clip(scale * max(span[1], span[2]), _SHORTEST, _TALLEST))
-    canvas = Canvas(_LEFT + 2 * _WIDTH + _GAP + _RIGHT, _TOP + height + _BOTTOM)
+    shown = _evenly(len(postures.times), _MOST_POSTURES)
+    canvas = _views(postures, shown, _PAGE)
     canvas.text("ink strong", 16, 25, title, size=16)
     first, last = postures.times[0], postures.times[-1]
-    shown = _evenly(len(postures.times), _MOST_POSTURES)
     total = len(postures.times)
     count = f"{len(shown)} of {total} postures, {number(first, 4)} s to" if total > 1 else "one posture at"
     canvas.text("soft", 16, 44, f"{count} {number(last, 4)} s", size=12)
@@ -282,24 +290,36 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
     if words:
         canvas.line("closest", 18, 63, 42, 63)
         canvas.text("warn strong", 50, 67, words, size=12.5)
-    _legend(canvas, _LEFT + 2 * _WIDTH + _GAP, postures)
-    for place, (view, name) in enumerate(((_SIDE, "side view"), (_TOP_VIEW, "top view"))):
-        half = 0.5 / scale * np.array([_WIDTH, height])
-        middle = 0.5 * (low + high)[list(view)]
-        left = _LEFT + place * (_WIDTH + _GAP)
-        axes = Axes(
-            left, _TOP, _WIDTH, height,
-            middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1],
-        )  # fmt: skip
-        canvas.text("ink strong", left, _TOP - 8, name, size=12.5)
-        _view(canvas, axes, view, postures, shown)
+    _legend(canvas, _LEFT + 2 * _PAGE.width + _GAP, postures)
     about = f"Side and top view of an arm in {len(shown)} postures of its motion, with the path of its tool."
     names = ", ".join(obstacle.name for obstacle in postures.obstacles)
     about += f" Obstacles: {names}." if names else ""
     return canvas.svg(title, about + (f" {words}." if words else ""))
 
 
-def spike_figure(mechanism: Chain, joint: int, time: float, residual: float, position: Array) -> str:
+def _views(postures: Postures, shown: Sequence[int], form: _Format) -> Canvas:
+    """Draw both views beside each other, on the same scale."""
+    low, high = _extent(postures)
+    span = high - low
+    scale = min(form.width / span[0], form.tallest / max(span[1], span[2]))
+    height = float(np.clip(scale * max(span[1], span[2]), form.shortest, form.tallest))
+    canvas = Canvas(_LEFT + 2 * form.width + _GAP + _RIGHT, form.top + height + _BOTTOM)
+    for place, (view, name) in enumerate(((_SIDE, "side view"), (_TOP_VIEW, "top view"))):
+        half = 0.5 / scale * np.array([form.width, height])
+        middle = 0.5 * (low + high)[list(view)]
+        left = _LEFT + place * (form.width + _GAP)
+        axes = Axes(
+            left, form.top, form.width, height,
+            middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1],
+        )  # fmt: skip
+        canvas.text("ink strong", left, form.top - 8, name, size=12.5)
+        _view(canvas, axes, view, postures, shown)
+    return canvas
+
+
+def spike_figure(
+    mechanism: Chain, joint: int, time: float, residual: float, position: Array, *, inline: bool = False
+) -> str:
     """Draw the posture in which a joint has its largest residual, with the joint marked, from the side and from above.
 
     Args:
@@ -308,14 +328,19 @@ def spike_figure(mechanism: Chain, joint: int, time: float, residual: float, pos
         time: since the recording's first sample [s].
         residual: of the joint [N m or N].
         position: of all joints then [rad or m], shape (joints,).
+        inline: for a page that has the style sheet once.
 
     Returns:
-        A self-contained SVG.
+        An SVG, self-contained where it is not for such a page.
     """
     name, unit = mechanism.names[joint], "N m" if mechanism.revolute[joint] else "N"
     frames = frame_origins(mechanism, position[None])
     posture = Postures(frames, np.array([time]), branches(mechanism), marked=(1 + 2 * joint,))
-    return stick_figure(posture, f"{name}: residual of {number(residual, 3)} {unit} at {number(time, 4)} s")
+    canvas = _views(posture, [0], _NARROW)
+    canvas.circle("dot", 22.0, 16.0, 5.0)
+    canvas.text("ink", 33.0, 20.0, name, size=12.5)
+    title = f"{name}: residual of {number(residual, 3)} {unit} at {number(time, 4)} s"
+    return canvas.svg(title, f"Side and top view of the arm in this posture, with {name} marked.", inline=inline)
 
 
 @dataclass(frozen=True)
@@ -459,7 +484,11 @@ def _closest_words(postures: Postures) -> str:
 
 def _grid(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> float:
     """Draw round coordinates [m], equally far apart both ways; return their distance [m]."""
-    values = round_values(axes.low_x, axes.high_x, 8)
+    most = int(axes.width / 60.0)
+    values = round_values(axes.low_x, axes.high_x, most)
+    while len(values) < 2:  # a round step can be longer than half of the range
+        most += 1
+        values = round_values(axes.low_x, axes.high_x, most)
     step = values[1] - values[0]
     for value in values:
         at = float(axes.x(value))
@@ -471,7 +500,8 @@ def _grid(canvas: Canvas, axes: Axes, view: tuple[int, int]) -> float:
         canvas.line("grid", axes.left, at, axes.left + axes.width, at)
         canvas.text("soft", axes.left - 5, at + 3.5, number(value, 6), size=10, anchor="end")
     across, up = (f"{_NAMES[axis]} [m]" for axis in view)
-    canvas.text("soft", axes.left + axes.width / 2, axes.top + axes.height + 31, across, anchor="middle")
+    # At the end, as the scale bar stands at the beginning.
+    canvas.text("soft", axes.left + axes.width, axes.top + axes.height + 31, across, anchor="end")
     canvas.text("soft", axes.left - 30, axes.top - 8, up, anchor="middle")
     return step
 

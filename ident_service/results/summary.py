@@ -35,7 +35,7 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
     if "choose" in (smoothing.cutoff, smoothing.decimate, options.edge):
         chosen = "Rows and filter: chosen for each recording from the spectra of its positions; its ends are left out."
         return (chosen,)
-    thinned = f", every {_said(smoothing.decimate)}th" if smoothing.decimate != 1 else ""
+    thinned = f", thinned out to one of {_said(smoothing.decimate)}" if smoothing.decimate != 1 else ""
     rows = f"All rows: every sample of a recording but {_said(options.edge)} s at its ends and at gaps{thinned}."
     slow = f"is not faster than {reversal.speed:g} rad/s (or m/s)" if reversal.speed else "stands still"
     near = f", and without those within {reversal.window:g} s of them" if reversal.window else ""

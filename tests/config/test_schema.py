@@ -14,10 +14,11 @@ from config.test_config_mistakes import GOOD
 
 from ident_service.cli import main
 from ident_service.config.schema import arm_schema, reference
+from ident_service.config.schema import main as write_published
 from ident_service.config.yaml_source import MODELINE, arm_schema_file, shipped_arms
 
 ROOT = Path(__file__).parents[2]
-RENEW = "run: python -m ident_service.config.schema configs/ident-arm.schema.json docs/reference-description.md"
+RENEW = "run: python -m ident_service.config.schema"
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,21 @@ def is_number(part: dict[str, Any], schema: dict[str, Any]) -> bool:
 def test_the_published_files_are_those_of_the_models(schema: dict[str, Any]) -> None:
     assert json.loads(arm_schema_file().read_text()) == schema, RENEW
     assert (ROOT / "docs" / "reference-description.md").read_text() == reference(), RENEW
+
+
+def test_the_command_that_the_page_names_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = [arm_schema_file(), ROOT / "docs" / "reference-description.md"]
+    files = [tmp_path / "schema.json", tmp_path / "page.md"]
+    assert write_published([str(one) for one in files]) == 0
+    for made, published in zip(files, before, strict=True):
+        assert made.read_bytes() == published.read_bytes()
+    with pytest.raises(SystemExit) as refused:
+        write_published([str(tmp_path / "nowhere" / "schema.json")])
+    assert refused.value.code == 2
+    assert f"there is no folder {tmp_path / 'nowhere'}" in capsys.readouterr().err
+    # Without arguments it takes the checkout's own files.
+    assert write_published([]) == 0
+    assert [path.read_text() for path in before] == [path.read_text() for path in files]
 
 
 def test_every_key_says_what_it_is_in_which_unit_and_what_counts_without_it(schema: dict[str, Any]) -> None:

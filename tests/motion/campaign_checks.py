@@ -176,8 +176,9 @@ def ends_in_time(which: Subject, outcome: Outcome) -> None:
     stop = stop + 2.0 * limits.acceleration / limits.jerk
     controlled = float(stop.max()) + SETTLE + REST_CYCLES * which.period + HOLD
     if which.config.control.after_stop is not None:
-        # From one end of a joint's range to the other, and as long again for what the compensation takes to go.
-        controlled += 2.0 * float(((limits.upper - limits.lower) / (SPEED * limits.velocity)).max()) + RESTING
+        # From one end of each joint's range to the other, one after the other, because gravity compensation goes only
+        # while the fastest joint is slow; and as long again for what it takes to go.
+        controlled += 2.0 * float(((limits.upper - limits.lower) / (SPEED * limits.velocity)).sum()) + RESTING
     promised = {Reaction.CONTROLLED_STOP: controlled, Reaction.DAMPED_LOWERING: controlled + LOWER_AFTER + LOWER}
     # Every reaction on the way there may have taken its time.
     reactions = [FAULTS[message.split(":")[0]].reaction for message in outcome.story.errors]

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
+from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.conftest import commissioned as commissioned
-from daemon.conftest import quick_text
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, Response, expect
 
@@ -32,7 +32,7 @@ from ident_service.registry.runs import label_run
 from ident_service.registry.tokens import add_token
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
-ARM, FAILING, RECORDED = "quick", "failing", "recorded"
+ARM, FAILING, RECORDED, MOVING = "quick", "failing", "recorded", "patient"
 SIZES = ((1280, 860), (400, 800))
 FAULT = "  faults: [{kind: encoder_offset, joint: elbow, at: 15.0, size: 0.6}]\n"
 NOW = time.time()
@@ -88,6 +88,8 @@ def story(place: Path, commissioned: Path) -> Iterator[Story]:
         add_schedule(db, ARM, DueRule(cron="0 6 * * mon"), "test", NOW)
         add_schedule(db, ARM, DueRule(maintenance=True), "test", NOW)
         add_event(db, ARM, "belt changed", "tension 40 N", "test", NOW)
+        client.add_arm(patient_text(MOVING))
+        checked_before(place, patient_text(MOVING))
         verdict = Verdict("changed", "changed: friction of joint elbow")
         again = enter_concluded(db, ARM, 1, "none", commissioned.name, verdict, NOW - 60.0, "test", NOW)
         yield Story(
@@ -116,6 +118,14 @@ def story(place: Path, commissioned: Path) -> Iterator[Story]:
         )
 
 
+# As the page of the arm asks, whichever of its steps comes next.
+CONFIRM = """([address, kind]) => {
+  const form = document.createElement("form");
+  Object.assign(form, { method: "post", action: address });
+  form.innerHTML = `<input name="kind" value="${kind}"><input name="speed" value="1">`;
+  document.body.append(form);
+  form.submit();
+}"""
 OVERLAP = """() => {
   const bar = document.getElementById('stop').getBoundingClientRect();
   const found = [];
@@ -140,10 +150,11 @@ EMPTY = """() => {
     if (text(section).length - (head ? text(head).length : 0) < 3) found.push(`section ${start(section)}`);
   }
   for (const table of document.querySelectorAll('main table:not(.u-legend)')) {
+    if (table.closest('[hidden]')) continue;
     if (!table.tBodies.length || !table.tBodies[0].rows.length) found.push(`table ${start(table)}`);
   }
   const filled = document.querySelectorAll('main pre:not([hidden]), main dd');
-  for (const one of filled) if (!text(one)) found.push(start(one));
+  for (const one of filled) if (!text(one) && !one.closest('[hidden]')) found.push(start(one));
   for (const box of document.querySelectorAll('.chart')) if (!box.querySelector('canvas')) found.push('no plot');
   for (const image of document.images) {
     if (image.loading !== 'lazy' && !image.naturalWidth) found.push(`image ${image.src}`);
@@ -162,35 +173,102 @@ def loaded(page: Page, address: str) -> None:
 
 
 def test_every_page_is_whole_at_every_size(browser: Browser, story: Story) -> None:
-    page, told, axe = log_in(browser, story.reached), Told(), Axe()
+    page = log_in(browser, story.reached)
+    told, found = heard(page), list[str]()
+    for name, address in story.pages.items():
+        loaded(page, story.reached.url + address)
+        found += complaints(page, name, told)
+    assert found == []
+
+
+def test_the_pages_of_a_motion_are_whole_before_and_while_the_arm_moves(browser: Browser, story: Story) -> None:
+    page = log_in(browser, story.reached)
+    told, found = heard(page), list[str]()
+    for kind in ("check", "home", "run", "rehearse"):
+        page.goto(f"{story.reached.url}/arms/{MOVING}")
+        with page.expect_navigation():
+            page.evaluate(CONFIRM, [f"/arms/{MOVING}/confirm", kind])
+        page.get_by_label("Type the arm's name").wait_for()
+        if page.locator("#viewer").count():
+            expect(page.locator("#viewer-status")).not_to_contain_text("Loading")
+        found += complaints(page, f"{kind}?", told)
+    page.goto(f"{story.reached.url}/arms/{MOVING}")
+    with page.expect_navigation():
+        page.evaluate(CONFIRM, [f"/arms/{MOVING}/confirm", "run"])
+    page.get_by_label("Type the arm's name").fill(MOVING)
+    page.keyboard.press("Enter")
+    page.wait_for_url("**/jobs/*")
+    page.locator("#plots .uplot canvas").first.wait_for()
+    expect(page.locator("#viewer-status")).to_contain_text("As measured")
+    found += complaints(page, "live", told)
+    expect(page.locator("#viewer-status")).to_contain_text("As measured")  # it moves still
+    page.keyboard.press("Escape")
+    page.get_by_role("link", name=f"Back to {MOVING}").wait_for()
+    expect(page.locator("#state")).not_to_have_text("done")
+    assert found == []
+
+
+def test_pages_without_a_login_are_whole(browser: Browser, story: Story) -> None:
+    page = browser.new_context().new_page()
+    page.set_default_timeout(60_000)
+    told = heard(page)
+    page.goto(f"{story.reached.url}/login")
+    found = complaints(page, "login", told)
+    page.get_by_label("Token").fill("wrong")
+    page.get_by_role("button", name="Log in").click()
+    page.get_by_role("alert").wait_for()
+    # Chromium tells of the refusal that was asked for.
+    told.words.clear()
+    found += complaints(page, "login refused", told)
+    page.goto(f"{story.reached.url}/api/docs")
+    page.get_by_text("Stop all arms, under control").first.wait_for()
+    found += complaints(page, "API", told, stop=False)
+    assert found == []
+
+
+def heard(page: Page) -> Told:
+    """Collect what a page's browser complains of from now on."""
+    told = Told()
     page.on("console", told.hear)
     page.on("response", told.see)
     page.on("pageerror", lambda error: told.words.append(str(error)))
-    found = list[str]()
-    for name, address in story.pages.items():
-        loaded(page, story.reached.url + address)
-        for width, height in SIZES:
-            page.set_viewport_size({"width": width, "height": height})
-            for scheme in ("light", "dark"):
-                page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
-                where = f"{name}, {width} px, {scheme}"
-                if (wide := page.evaluate("document.documentElement.scrollWidth")) > width:
-                    found.append(f"{where}: {wide} px wide")
+    return told
+
+
+def complaints(page: Page, name: str, told: Told, *, stop: bool = True) -> list[str]:
+    """Return what is wrong with the page that is shown, at both widths, light and dark.
+
+    Args:
+        page: loaded.
+        name: of the page, for the findings.
+        told: what its browser complained of; emptied.
+        stop: whether the page has the bar that stops all arms.
+    """
+    axe, found = Axe(), list[str]()
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+            where = f"{name}, {width} px, {scheme}"
+            if (wide := page.evaluate("document.documentElement.scrollWidth")) > width:
+                found.append(f"{where}: {wide} px wide")
+            if stop:
                 bar = page.get_by_role("button", name="Stop all arms").bounding_box()
                 assert bar is not None
                 assert bar["height"] >= 44
                 assert 0 <= bar["x"] <= bar["x"] + bar["width"] <= width
+        if stop:
             found += [f"{where}: below the stop bar: {one}" for one in page.evaluate(OVERLAP)]
-            # Structure at each width; colours in each scheme, dark now.
-            options: dict[str, Any] = {"resultTypes": ["violations"]}
-            found += [f"{where}: {one}" for one in violations(axe, page, options)]
-            page.emulate_media(color_scheme="light")
-        found += [f"{name}: light: {one}" for one in violations(axe, page, COLOURS)]
-        found += [f"{name}: empty: {one}" for one in page.evaluate(EMPTY)]
-        found += [f"{name}: {one}" for one in told.words]
-        told.words.clear()
-        page.set_viewport_size({"width": 1280, "height": 860})
-    assert found == []
+        # Structure at each width; colours in each scheme, dark now.
+        options: dict[str, Any] = {"resultTypes": ["violations"]}
+        found += [f"{where}: {one}" for one in violations(axe, page, options)]
+        page.emulate_media(color_scheme="light")
+    found += [f"{name}: light: {one}" for one in violations(axe, page, COLOURS)]
+    found += [f"{name}: empty: {one}" for one in page.evaluate(EMPTY)]
+    found += [f"{name}: {one}" for one in told.words]
+    told.words.clear()
+    page.set_viewport_size({"width": 1280, "height": 860})
+    return found
 
 
 COLOURS: dict[str, Any] = {

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from helpers.browser import chromium_program
 from report.chromium import Tab, chromium
@@ -202,6 +204,90 @@ def test_the_matrix_names_the_pair_under_the_pointer_and_by_keys(tab: Tab, good:
     tab.press("ArrowLeft")
     tab.press("ArrowDown")
     assert tab.run(said).startswith(f"{names[6]} with {names[1]}: ")
+    assert tab.complaints == []
+
+
+def said(tab: Tab, figure: str) -> str:
+    return str(tab.run(f"document.querySelector('{figure} output').textContent")).replace("\u2212", "-")
+
+
+def pointed(tab: Tab, figure: str, share: float, *, plot: int = 0) -> str:
+    """Move the pointer to a share of the width of a drawn plot; return what is said below it."""
+    tab.run(f"document.querySelector('{figure}').scrollIntoView({{block: 'center', behavior: 'instant'}})")
+    tab.settle()
+    x, y = tab.run(
+        f"(() => {{const f = document.querySelector('{figure}'), s = f.querySelector('svg');"
+        f" const [l, t, w, h] = JSON.parse(f.dataset.values)[{plot}].box, b = s.getBoundingClientRect();"
+        f" const scale = b.width / s.viewBox.baseVal.width;"
+        f" return [b.left + scale * (l + {share} * w), b.top + scale * (t + 0.5 * h)]}})()"
+    )
+    tab.mouse("mouseMoved", x, y)
+    tab.settle()
+    return said(tab, figure)
+
+
+def test_friction_spectrum_and_timing_tell_the_values_under_the_cursor(tab: Tab, good: Made) -> None:
+    show(tab, good)
+    friction = good.evidence.friction[0]
+    told = re.fullmatch(
+        r"velocity (\S+) rad/s: friction recorded (\S+) N m at (\S+) rad/s, model (\S+) N m",
+        pointed(tab, "#friction-1", 0.8),
+    )
+    assert told is not None
+    velocity, recorded, at_velocity, model = map(float, told.groups())
+    span_of = np.ptp(friction.torque)
+    assert model == pytest.approx(
+        np.interp(velocity, friction.curve_velocity, friction.curve_torque), abs=0.02 * span_of
+    )
+    near = np.hypot(
+        (friction.velocity - at_velocity) / np.ptp(friction.velocity), (friction.torque - recorded) / span_of
+    )
+    assert near.min() < 0.01
+    fitted, unseen = (one.spectra[0] for one in good.evidence.recordings)
+    pattern = r"frequency (\S+) Hz: density identification (\S+) \(N m\)\u00b2/Hz, validation (\S+) \(N m\)\u00b2/Hz"
+    told = re.fullmatch(pattern, pointed(tab, "#residual-1", 0.5))
+    assert told is not None
+    frequency, *densities = map(float, told.groups())
+    for spectrum, density in zip((fitted, unseen), densities, strict=True):
+        place = int(np.abs(np.log(spectrum.frequency / frequency)).argmin())
+        around = spectrum.density[max(place - 1, 0) : place + 2]
+        assert 0.9 * around.min() <= density <= 1.1 * around.max()
+    lag = re.match(r"lag (\S+) s: autocorrelation identification (\S+), ", pointed(tab, "#residual-1", 0.0, plot=1))
+    assert lag is not None
+    assert float(lag[2]) == pytest.approx(1.0, abs=0.02)
+    # By keys: the lag goes on, and the other plot can be reached.
+    tab.run("document.querySelector('#residual-1').focus()")
+    tab.press("ArrowRight")
+    assert said(tab, "#residual-1").startswith("lag 0.0")
+    assert said(tab, "#residual-1") != lag[0]
+    tab.press("ArrowUp")
+    assert said(tab, "#residual-1").startswith("frequency ")
+    timing = good.evidence.timing[0]
+    bar = int(np.argmax(timing.counts))
+    middle = (0.5 * (timing.edges[bar] + timing.edges[bar + 1]) - timing.edges[0]) / np.ptp(timing.edges)
+    assert pointed(tab, "#timing-1", float(middle)).endswith(f": {timing.counts[bar]} steps")
+    assert tab.complaints == []
+
+
+@pytest.mark.parametrize("width", [400, 1280])
+def test_the_posture_of_the_largest_residual_can_be_shown(tab: Tab, good: Made, width: int) -> None:
+    show(tab, good, width)
+    for place, traced in enumerate(good.evidence.recordings, 1):
+        for joint, spike in enumerate(traced.spikes, 1):
+            assert spike is not None
+            figure = f"#torque-{place}-{traced.role}-{joint}"
+            summary = tab.run(f"document.querySelector('{figure} summary').textContent")
+            summary = summary.replace("\u2212", "-").replace("\xa0", " ")
+            told = re.fullmatch(r"Show the posture of the largest residual in motion, (\S+) N m at (\S+) s", summary)
+            assert told is not None, summary
+            assert float(told[1]) == pytest.approx(spike.residual, rel=5e-3)
+            assert float(told[2]) == pytest.approx(spike.time, rel=5e-3)
+            box = tab.run(
+                f"(() => {{const b = document.querySelector('{figure} details svg').getBoundingClientRect();"
+                " return [b.width, b.height]})()"
+            )
+            assert box[0] > 300
+            assert box[1] > 100
     assert tab.complaints == []
 
 

@@ -78,7 +78,7 @@ def test_spikes_are_the_largest_residuals_of_joints_in_motion(alone: Made, tmp_p
         drawn = Svg.of(text)
         drawn.require_sound()
         assert drawn.title.startswith(f"{alone.model.chain.names[k]}: residual of ")
-        assert len(drawn.all("circle", "dot")) == 2  # the joint, in both views
+        assert len(drawn.all("circle", "dot")) == 3  # the joint, in both views and in the legend
         # The posture is that of the motion then.
         expected = waves(1, alone.model.chain.joints).derivative(np.array([spike.time]), 0)[0]
         np.testing.assert_allclose(spike.position, expected, atol=1e-3)

@@ -95,7 +95,7 @@ def test_three_rows_and_figures_are_shown_and_the_others_folded(good: Made) -> N
     assert table.all("details")[-1].one("summary").words == f"{good.estimate.base.size - 3} more rows"
     names = tuple(f"j{k}" for k in range(6))
     traced = good.evidence.recordings[0]
-    many = replace(traced, joints=tuple(traced.joints[0] for _ in names), spectra=())
+    many = replace(traced, joints=tuple(traced.joints[0] for _ in names), spectra=(), spikes=())
     estimates = tuple(replace(one, validation=(), moving_validation=()) for one in good.evidence.estimates)
     evidence = replace(good.evidence, joints=names, revolute=(True,) * 6, recordings=(many,), friction=(), posed=None)
     evidence = replace(evidence, estimates=estimates)
@@ -152,7 +152,7 @@ def test_tables_say_what_their_rows_and_columns_are(good: Made, bare: Made) -> N
 
 def test_nothing_leaves_the_page(good: Made) -> None:
     page = good.page
-    vendored = files("ident_service").joinpath("daemon/web/vendored/uPlot.iife.min.js").read_text()
+    vendored = files("ident_service").joinpath("vendored/uPlot.iife.min.js").read_text()
     assert vendored in page
     for pattern in (
         r"https?://",

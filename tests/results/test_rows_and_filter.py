@@ -31,7 +31,7 @@ def said(**changes: Any) -> str:
     ("changes", "words"),
     [
         ({}, "every sample of a recording but 0.5 s at its ends and at gaps."),
-        ({"smoothing": {"decimate": 25}}, "at its ends and at gaps, every 25th."),
+        ({"smoothing": {"decimate": 25}}, "at its ends and at gaps, thinned out to one of 25."),
         ({}, "of that joint is not faster than 0.05 rad/s (or m/s), and without those within 0.2 s of them."),
         ({"reversal": {"speed": 0.1, "window": 0}}, "a drive of that joint is not faster than 0.1 rad/s (or m/s)."),
         ({"reversal": {"speed": 0, "window": 0}}, "without rows in which a drive of that joint stands still."),

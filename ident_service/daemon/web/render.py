@@ -88,12 +88,12 @@ def viewer_file() -> bytes:
 @lru_cache(maxsize=1)
 def viewer_version() -> str:
     """Return the part of the viewer's address that changes with its version."""
-    told = json.loads(_vendored().joinpath("vendored.json").read_text(encoding="utf-8"))
+    told = json.loads(_vendored().joinpath("rapidoc.json").read_text(encoding="utf-8"))
     return f"{told['package']}-{told['version']}"
 
 
 def _vendored() -> Traversable:
-    return files(__package__).joinpath("vendored")
+    return files("ident_service").joinpath("vendored")
 
 
 @lru_cache(maxsize=1)

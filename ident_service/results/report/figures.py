@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, WEAK_BELOW
+from ident_service.model.chain import Chain
 from ident_service.recordings.quality import MUCH_JITTER
 from ident_service.results.evidence.evidence import (
     Evidence,
@@ -34,6 +35,7 @@ from ident_service.results.plots import (
     range_around,
     round_values,
 )
+from ident_service.results.posture_figure import spike_figure
 
 _LONGEST_NAME = 22
 WIDTH = 560.0  # px; two beside each other on a wide screen, one on a narrow one
@@ -52,6 +54,7 @@ class Figure:
         canvas: the drawing.
         data: that the page's script needs, by the name of an attribute.
         wide: whether it needs the whole width of a page.
+        more: heading and drawing of what a reader may unfold below it, for a page that has the style sheet.
     """
 
     slug: str
@@ -61,10 +64,29 @@ class Figure:
     canvas: Canvas
     data: dict[str, Any] = field(default_factory=dict)
     wide: bool = False
+    more: tuple[str, str] | None = None
 
     def svg(self, *, inline: bool = False) -> str:
         """Return the drawing as a file of its own, or for a page that has the style sheet."""
         return self.canvas.svg(self.title, self.description, inline=inline)
+
+
+def _readable(axes: Axes, x: str, y: str, names: Mapping[str, str], *, logs: tuple[bool, bool] = (False, False)) -> Any:
+    """Return what the page's script needs to tell the values of a plot under a cursor.
+
+    Args:
+        axes: of the plot.
+        x: quantity that lies across, its unit in brackets.
+        y: quantity that stands upright, likewise.
+        names: of what is drawn, by the kind of its shapes.
+        logs: whether the axes show the logarithm of x, and of y.
+    """
+    return {
+        "box": [axes.left, axes.top, axes.width, axes.height],
+        "x": [round(float(axes.low_x), 9), round(float(axes.high_x), 9), int(logs[0]), x],
+        "y": [round(float(axes.low_y), 9), round(float(axes.high_y), 9), int(logs[1]), y],
+        "names": names,
+    }
 
 
 GOOD = {
@@ -95,12 +117,12 @@ def _name(canvas: Canvas, name: str) -> None:
     canvas.text("ink strong", 4, 16, name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + "...", size=13)
 
 
-def torque_figures(evidence: Evidence, recording: int) -> list[Figure]:
-    """Draw one figure per joint of a recording."""
-    return [_torque_figure(evidence, recording, joint) for joint in range(len(evidence.joints))]
+def torque_figures(evidence: Evidence, recording: int, mechanism: Chain | None = None) -> list[Figure]:
+    """Draw one figure per joint of a recording, with the posture of its largest residual where there is a mechanism."""
+    return [_torque_figure(evidence, recording, joint, mechanism) for joint in range(len(evidence.joints))]
 
 
-def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
+def _torque_figure(evidence: Evidence, recording: int, joint: int, mechanism: Chain | None) -> Figure:
     traced = evidence.recordings[recording]
     trace, name = traced.joints[joint], evidence.joints[joint]
     unit = "N m" if evidence.revolute[joint] else "N"
@@ -129,6 +151,16 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
         for part in shown.runs:
             _band(canvas, axes, kind, shown.time[part], values[:, part])
         canvas.clip(None)
+    series: dict[str, Any] = {"joint": joint, "name": name, "unit": unit}
+    spike = traced.spikes[joint] if traced.spikes else None
+    posture = None
+    if spike is not None and time[0] <= spike.time <= time[1]:
+        canvas.circle("spike", float(under.x(spike.time)), float(under.y(spike.residual)), 4.0)
+        series["spike"] = [round(spike.time, 4), spike.residual]
+        if mechanism is not None:
+            said = f"{number(spike.residual)} {unit} at {number(spike.time, 4)} s"
+            drawn = spike_figure(mechanism, joint, spike.time, spike.residual, spike.position, inline=True)
+            posture = (f"Show the posture of the largest residual in motion, {said}", drawn)
     largest = float(np.abs(trace.residual).max())
     size = float(np.abs(trace.torque).max())
     words = f"{name}: torque up to {number(size)} {unit}, residual up to {number(largest)} {unit}."
@@ -138,7 +170,8 @@ def _torque_figure(evidence: Evidence, recording: int, joint: int) -> Figure:
         description=f"Over {number(time[1] - time[0])} s. {words}",
         caption=words,
         canvas=canvas,
-        data={"series": {"joint": joint, "name": name, "unit": unit}},
+        data={"series": series},
+        more=posture,
     )
 
 
@@ -203,6 +236,9 @@ def friction_figures(evidence: Evidence) -> list[Figure]:
             if branch.any():
                 x, y = friction.curve_velocity[branch], friction.curve_torque[branch]
                 canvas.polyline("second", axes.x(x), axes.y(y))
+        readable = _readable(
+            axes, f"velocity [{speed}]", f"friction [{torque}]", {"cloud": "recorded", "second": "model"}
+        )
         words = f"{name}: {len(friction.velocity)} points, off the curve by "
         words += f"{number(friction_scatter(evidence, drive))} {torque} rms."
         figures.append(
@@ -212,6 +248,7 @@ def friction_figures(evidence: Evidence) -> list[Figure]:
                 description=words,
                 caption=words,
                 canvas=canvas,
+                data={"values": [readable]},
             )
         )
     return figures
@@ -250,7 +287,10 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
     above = Axes(
         LEFT, _RESIDUAL_TOP, wide, _RESIDUAL_HEIGHT, np.log10(low), np.log10(high), *range_around(*densities, least=1.0)
     )
-    draw_frame(canvas, above, x="frequency [Hz]", y=f"density of the residual [{unit}]", x_log=True, y_log=True)
+    across, upright = "frequency [Hz]", f"density of the residual [{unit}]"
+    draw_frame(canvas, above, x=across, y=upright, x_log=True, y_log=True)
+    names = {kind: one.role for kind, one in zip(kinds, shown, strict=True)}
+    readable = [_readable(above, across, f"density [{unit}]", names, logs=(True, True))]
     for kind, spectrum, density in zip(kinds, spectra, densities, strict=True):
         canvas.polyline(kind, above.x(np.log10(spectrum.frequency)), above.y(density))
     longest = max(float(spectrum.lag[-1]) for spectrum in spectra)
@@ -258,6 +298,7 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
         LEFT, _RESIDUAL_TOP + _RESIDUAL_HEIGHT + _RESIDUAL_BETWEEN, wide, _RESIDUAL_HEIGHT, 0.0, longest, -1.05, 1.05
     )
     draw_frame(canvas, below, x="lag [s]", y="autocorrelation of the residual")
+    readable.append(_readable(below, "lag [s]", "autocorrelation", names))
     white = max(spectrum.white for spectrum in spectra)
     for level in (-white, white):
         canvas.line("limit", LEFT, float(below.y(level)), LEFT + wide, float(below.y(level)))
@@ -270,6 +311,7 @@ def _residual_figure(evidence: Evidence, joint: int, shown: list[PredictionTrace
         description=words,
         caption=words,
         canvas=canvas,
+        data={"values": readable},
     )
 
 
@@ -321,12 +363,18 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
     )
     late = timing.source == "cycle"
     what = "lateness of a cycle" if late else "deviation of a step from the period"
-    draw_frame(canvas, axes, x=f"{what} [{unit}]", y="cycles" if late else "steps", y_log=True)
+    counted = "cycles" if late else "steps"
+    draw_frame(canvas, axes, x=f"{what} [{unit}]", y=counted, y_log=True)
     bottom = _TIMING_TOP + _TIMING_HEIGHT
     for count, log, begin, end in zip(timing.counts, logs, timing.edges[:-1], timing.edges[1:], strict=True):
         if count:
             x, right, y = float(axes.x(scale * begin)), float(axes.x(scale * end)), float(axes.y(log))
             canvas.rectangle("good", x + 0.5, y, max(right - x - 1.0, 1.0), bottom - y)
+    ends = np.round(scale * timing.edges, 6).tolist()
+    bars = _readable(axes, f"{'lateness' if late else 'deviation'} [{unit}]", counted, {}, logs=(False, True))
+    bars["bars"] = [
+        [begin, end, int(count)] for begin, end, count in zip(ends, ends[1:], timing.counts, strict=False) if count
+    ]
     words = timing_words(timing, deviation)
     return Figure(
         slug=f"timing-{place}",
@@ -334,6 +382,7 @@ def _timing_figure(place: int, timing: Timing, deviation: float | None) -> Figur
         description=words,
         caption=f"{words} The period is {number(scale / timing.rate)} {unit}.",
         canvas=canvas,
+        data={"values": [bars]},
     )
 
 
@@ -722,11 +771,11 @@ class Figures:
         return torque + self.residual + self.friction + self.doubt + self.bodies + self.timing
 
 
-def figures(evidence: Evidence, parameters: ParameterFile) -> Figures:
-    """Draw all figures of a report."""
+def figures(evidence: Evidence, parameters: ParameterFile, mechanism: Chain | None = None) -> Figures:
+    """Draw all figures of a report; postures where there is a mechanism to draw."""
     doubt = (deviation_figure(parameters), correlation_figure(parameters))
     return Figures(
-        torque=tuple(tuple(torque_figures(evidence, place)) for place in range(len(evidence.recordings))),
+        torque=tuple(tuple(torque_figures(evidence, place, mechanism)) for place in range(len(evidence.recordings))),
         residual=tuple(residual_figures(evidence)),
         friction=tuple(friction_figures(evidence)),
         doubt=tuple(figure for figure in doubt if figure is not None),

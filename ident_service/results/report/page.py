@@ -14,6 +14,7 @@ import numpy as np
 from ident_service.config.arm import ArmConfig
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW, Verdict
+from ident_service.model.arm_model import arm_model
 from ident_service.recordings.quality import MUCH_JITTER
 from ident_service.results.assessment import POOR, USELESS, Assessment, JointAssessment, Word, assess
 from ident_service.results.evidence.evidence import Array, Condition, Evidence, PredictionTrace
@@ -275,7 +276,7 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     content = parameters.content
     found = assess(content)
     order = [one.place for one in found.joints] or list(range(len(evidence.joints)))
-    drawn = figures(evidence, parameters)
+    drawn = figures(evidence, parameters, arm_model(config, bodies=False).chain)
     simulated = isinstance(config.driver, SimulatedDriver)
     link_values = content.get("link_parameters", {})
     return render(

@@ -68,7 +68,12 @@ class Table:
 
 def drawing(figure: Figure) -> Markup:
     """Return a drawing for a page that has the style sheet; its texts are quoted by the canvas."""
-    return Markup(figure.svg(inline=True))  # noqa: S704
+    return inline(figure.svg(inline=True))
+
+
+def inline(svg: str) -> Markup:
+    """Return a drawing that was made for a page that has the style sheet; its texts are quoted by the canvas."""
+    return Markup(svg)  # noqa: S704
 
 
 def render(template: str, scripts: Sequence[str] = (), styles: Sequence[str] = (), **values: Any) -> str:
@@ -103,8 +108,8 @@ def asset(name: str) -> str:
 
 @cache
 def vendored(name: str) -> str:
-    """Return a file of uPlot, its licence before it; there is one copy, which the daemon's pages bring along."""
-    place = files("ident_service").joinpath("daemon", "web", "vendored")
+    """Return a file of uPlot, its licence before it; there is one copy, which the daemon's pages show, too."""
+    place = files("ident_service").joinpath("vendored")
     licence = place.joinpath("uPlot.LICENSE.txt").read_text(encoding="utf-8").strip()
     return f"/* uPlot\n{licence} */\n{place.joinpath(name).read_text(encoding='utf-8')}"
 
@@ -135,5 +140,5 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=_readable,
     )
-    environment.globals |= {"drawing": drawing}
+    environment.globals |= {"drawing": drawing, "inline": inline}
     return environment

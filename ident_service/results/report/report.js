@@ -1,6 +1,7 @@
 "use strict";
 // Draws time plots by uPlot over the static ones: values under the cursor, and zoom for all plots of a recording
-// together. Names the pair of parameters under the pointer in the correlation matrix. Without this script the page shows all.
+// together. Names the pair of parameters under the pointer in the correlation matrix, and the values under it in the other
+// plots, from the shapes that are drawn. Without this script the page shows all.
 (() => {
   const LEAST = 8; // stretches that can be seen at least
   const HEIGHTS = { torque: 210, residual: 160 };
@@ -69,6 +70,20 @@
     ctx.restore();
   };
 
+  // The largest residual in motion, whose posture can be unfolded.
+  const ring = (spike) => (plot) => {
+    const [time, value] = spike, { min, max } = plot.scales.x;
+    if (time < min || time > max) return;
+    const { ctx } = plot;
+    ctx.save();
+    ctx.strokeStyle = css("bad");
+    ctx.lineWidth = 1.6 * devicePixelRatio;
+    ctx.beginPath();
+    ctx.arc(plot.valToPos(time, "x", true), plot.valToPos(value, "y", true), 4 * devicePixelRatio, 0, 2 * Math.PI);
+    ctx.stroke();
+    ctx.restore();
+  };
+
   // Lowest and highest of a stretch are two series of which the legend shows one.
   const pair = (label, kind, width) => [
     { class: "lowest", stroke: () => css(kind), width, points: { show: false } },
@@ -112,7 +127,7 @@
       this.show(this.now[0] + by, this.now[1] + by);
     }
 
-    options(figure, label, height, series, stretches, last) {
+    options(figure, label, height, series, stretches, last, spike) {
       const axis = (more) => ({ stroke: () => css("soft"), grid: { stroke: () => css("line"), width: 1 }, ticks: { show: false }, ...more });
       return {
         width: figure.clientWidth, height,
@@ -124,6 +139,7 @@
         bands: series.map((_, k) => k).filter((k) => k % 2).map((k) => ({ series: [k + 1, k], fill: series[k].stroke })),
         hooks: {
           drawClear: [shade(stretches)],
+          draw: spike ? [ring(spike)] : [],
           setScale: [(plot, key) => {
             const { min, max } = plot.scales.x;
             if (key === "x" && min !== null && (min !== this.now[0] || max !== this.now[1])) this.show(min, max);
@@ -148,7 +164,7 @@
           this.options(figure, "torque [" + about.unit + "]", HEIGHTS.torque, both, stretches),
           [this.of.time, ...band(this.of, joint.torque), ...band(this.of, joint.predicted)], place),
         new uPlot(
-          this.options(figure, "residual [" + about.unit + "]", HEIGHTS.residual, pair("residual", "residual", 1), stretches, true),
+          this.options(figure, "residual [" + about.unit + "]", HEIGHTS.residual, pair("residual", "residual", 1), stretches, true, about.spike),
           [this.of.time, ...band(this.of, joint.residual)], place),
       ];
       this.plots.push(...made);
@@ -223,6 +239,102 @@
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
     for (const one of groups.values()) one.plots.forEach((plot) => plot.redraw());
   });
+
+  // Values under the pointer, or where arrows have moved the cursor to: each kind of shape at that place.
+  const quantity = ([, , , name]) => /^(.*?)(?: \[(.*)\])?$/.exec(name).slice(1);
+  const value = ([low, high, log], share) => {
+    const at = low + share * (high - low);
+    return log ? 10 ** at : at;
+  };
+  const told = (at, digits, unit) => {
+    const small = at && Math.abs(at) < 1e-3;
+    const text = small ? at.toExponential(digits - 1).replaceAll("-", "\u2212") : words(Number(at.toPrecision(digits)));
+    return text + (unit ? " " + unit : "");
+  };
+
+  class Reading {
+    constructor(figure, about) {
+      [this.left, this.top, this.width, this.height] = about.box;
+      this.about = about;
+      const points = (one) => (one.points ? [...one.points].map(({ x, y }) => [x, y]) : [[one.cx.baseVal.value, one.cy.baseVal.value]]);
+      this.shapes = Object.entries(about.names).map(([kind, name]) => {
+        const found = [...figure.querySelectorAll(`.drawing .${kind}`)].filter((one) => one.points || one.cx);
+        return [name, found.flatMap(points).filter(([x, y]) => this.holds(x, y)), found.some((one) => one.cx)];
+      });
+    }
+
+    holds(x, y) {
+      return x >= this.left - 1 && x <= this.left + this.width + 1 && y >= this.top - 1 && y <= this.top + this.height + 1;
+    }
+
+    at(x, y) {
+      const { about } = this, [across, unit] = quantity(about.x), [upright, other] = quantity(about.y);
+      const xOf = (px) => value(about.x, (px - this.left) / this.width);
+      const yOf = (py) => value(about.y, (this.top + this.height - py) / this.height);
+      const digits = about.y[2] ? 2 : 3;
+      const here = `${across} ${told(xOf(x), 3, unit)}`;
+      if (about.bars) {
+        const bar = about.bars.find(([begin, end]) => xOf(x) >= begin && xOf(x) < end);
+        if (!bar) return `${here}: no ${upright}`;
+        return `${across} ${told(bar[0], 3)} to ${told(bar[1], 3, unit)}: ${bar[2]} ${bar[2] === 1 ? upright.replace(/s$/, "") : upright}`;
+      }
+      const parts = [];
+      for (const [name, points, cloud] of this.shapes) {
+        const far = cloud && y !== null ? ([a, b]) => Math.hypot(a - x, b - y) : ([a]) => Math.abs(a - x);
+        const nearest = points.reduce((best, one) => (best === null || far(one) < far(best) ? one : best), null);
+        if (nearest === null || (!cloud && far(nearest) > 0.05 * this.width)) continue;
+        parts.push(`${name} ${told(yOf(nearest[1]), digits, other)}` + (cloud ? ` at ${told(xOf(nearest[0]), 3, unit)}` : ""));
+      }
+      return `${here}: ${upright} ${parts.join(", ") || "none here"}`;
+    }
+  }
+
+  const hinted = new Set();
+  for (const figure of document.querySelectorAll("figure[data-values]")) {
+    const svg = figure.querySelector("svg"), section = figure.closest("section");
+    const line = document.createElementNS(svg.namespaceURI, "line");
+    line.setAttribute("class", "cursor");
+    const said = document.createElement("output");
+    figure.querySelector(".drawing").after(said);
+    figure.tabIndex = 0;
+    let readings = null, now = null, place = 0;
+    const tell = (x, y) => {
+      readings ??= JSON.parse(figure.dataset.values).map((about) => new Reading(figure, about));
+      const reading = readings[place];
+      now = Math.min(Math.max(x, reading.left), reading.left + reading.width);
+      for (const [name, at] of [["x1", now], ["x2", now], ["y1", reading.top], ["y2", reading.top + reading.height]]) {
+        line.setAttribute(name, at);
+      }
+      svg.append(line);
+      said.textContent = reading.at(now, y);
+    };
+    const point = (event) => {
+      const box = svg.getBoundingClientRect(), scale = svg.viewBox.baseVal.width / box.width;
+      const x = (event.clientX - box.left) * scale, y = (event.clientY - box.top) * scale;
+      readings ??= JSON.parse(figure.dataset.values).map((about) => new Reading(figure, about));
+      const found = readings.findIndex((one) => one.holds(x, y));
+      if (found < 0) return;
+      place = found;
+      tell(x, y);
+    };
+    svg.addEventListener("pointermove", point);
+    svg.addEventListener("pointerdown", point);
+    figure.addEventListener("keydown", (event) => {
+      const step = { ArrowUp: [0, -1], ArrowDown: [0, 1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] }[event.key];
+      if (!step || event.ctrlKey || event.altKey || event.metaKey || event.target !== figure) return;
+      event.preventDefault();
+      const count = JSON.parse(figure.dataset.values).length;
+      place = Math.min(Math.max(place + step[1], 0), count - 1);
+      tell((now ?? 0) + step[0] * 6, null);
+    });
+    if (section && !hinted.has(section)) {
+      hinted.add(section);
+      const hint = document.createElement("p");
+      hint.className = "hint bar";
+      hint.textContent = "Values stand below a plot while the pointer is over it; in one that was chosen by Tab, arrows move the cursor.";
+      figure.closest(".figures").before(hint);
+    }
+  }
 
   // The pair under the pointer, or the one that arrows have moved to.
   for (const figure of document.querySelectorAll("figure[data-matrix]")) {

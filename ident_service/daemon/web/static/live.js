@@ -111,6 +111,7 @@ function showJob(text) {
   byId("phase").textContent = progress ? progress.phase : "";
   const pre = byId("log");
   if (pre.textContent !== log) {
+    pre.closest("section").hidden = false;
     const atEnd = pre.scrollTop + pre.clientHeight >= pre.scrollHeight - 4;
     pre.textContent = log;
     if (atEnd) pre.scrollTop = pre.scrollHeight;
