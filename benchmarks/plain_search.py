@@ -10,6 +10,7 @@ knows neither jerk nor supply, nor whether the arm can follow. All of that is in
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 
 import numpy as np
 import pinocchio as pin
@@ -19,6 +20,7 @@ from ident_service.config.motion_design import Design
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.excitation.trajectory import FourierPath, FourierSeries
 from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.collision import CollisionModel
 from ident_service.model.pinocchio_models import pinocchio_model
 from ident_service.model.regressor import joint_regressor
@@ -60,14 +62,14 @@ class PlainSearch:
         self._time = np.arange(_SAMPLES) / _SAMPLES / design.base_frequency
 
     def run(self, criterion: str, seed: int, seconds: float) -> FourierPath:
-        """Search for the smallest condition number or the largest determinant."""
-        rng, end = np.random.default_rng(seed), time.monotonic() + seconds
+        """Search for the smallest condition number or the largest determinant, for some seconds of CPU time."""
+        rng, end = np.random.default_rng(seed), time.process_time() + seconds
         best, motion = np.inf, None
         size = self._model.chain.joints * (2 * self._design.harmonics + 1)
 
         def value(x: Array) -> float:
             nonlocal best, motion
-            if time.monotonic() > end:
+            if time.process_time() > end:
                 raise _OutOfTime
             path = self._scaled(x)
             found = min(self._value(path, criterion), _NOTHING)
@@ -75,12 +77,10 @@ class PlainSearch:
                 best, motion = found, path
             return found
 
-        try:
+        with one_blas_thread(), suppress(_OutOfTime):
             while True:
                 begin = min((rng.normal(size=size) for _ in range(_RANDOM)), key=value)
                 minimize(value, begin, method="SLSQP", options={"maxiter": _ITERATIONS, "eps": _STEP})
-        except _OutOfTime:
-            pass
         if motion is None:
             raise RuntimeError("not one motion in the time given")
         return motion

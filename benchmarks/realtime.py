@@ -1,9 +1,9 @@
 """How often a motion reaches its end on this computer, as it is: drives in another process, the machine's own clock.
 
 `make bench-realtime`, or `python -m benchmarks.realtime [TRIES]`, about a minute a try: the WAM at 500 Hz as
-`docs/fieldbus.md` has it, but lowered after a stop, as nobody is there to confirm that it is supported; and planar2
-behind two drives at 1 kHz. `ident emulate`, `ident preflight`, then `ident run` again and again (10 times). What stalls
-the machine meanwhile is in the figures.
+`docs/fieldbus.md` has it, but lowered after a stop, as nobody is there to confirm that it is supported; planar2 behind
+two drives at 1 kHz; and the same given positions at 250 Hz. `ident emulate`, `ident preflight`, then `ident run` again
+and again (10 times). What stalls the machine meanwhile is in the figures.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,26 +40,29 @@ def wam(folder: Path) -> Path:
     return _written(folder, tree | {"realtime": _REALTIME})
 
 
-def planar(folder: Path) -> Path:
-    """Write planar2 behind two drives; its motion takes 10 s."""
+def planar(folder: Path, streams: str = "torque") -> Path:
+    """Write planar2 behind two drives, that are given torques at 1 kHz or positions at 250 Hz; a motion takes 10 s."""
     shipped = shipped_arms()["planar2"]
     truth = yaml.safe_load(Path(shipped).read_text(encoding="utf-8"))["driver"]["truth"]
     motion = {"kind": "seeded", "seed": 1, "base_frequency": 0.2, "harmonics": 5, "periods": 2}
+    positions = streams == "position"
     drive = {"counts": 65536, "rated_torque": 0.1, "max_torque": 3.0, "max_speed": 6000.0}
     driver = {
         "kind": "canopen",
+        "streams": streams,
         "eds": str(Path(shipped).with_name("emulated_drive.eds")),
-        "buses": [{"interface": "ident_wire", "channel": f"planar{os.getpid()}"}],
+        "buses": [{"interface": "ident_wire", "channel": f"{streams}{os.getpid()}"}],
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": 1, "truth": truth},
         **_PATIENCE,
-        "lost_cycles": 10,  # 10 ms, as at half of the rate
+        "lost_cycles": 5 if positions else 10,  # 20 or 10 ms
     }
     return _written(
         folder,
         {
             "extends": "planar2",
-            "name": "planar_here",
+            "name": "positions_here" if positions else "planar_here",
+            "control": {"rate": 250.0 if positions else 1000.0},
             "realtime": _REALTIME,
             "transmission": {"ratios": [20.0, 20.0]},
             "motions": {"identification": motion, "validation": motion},
@@ -145,12 +149,12 @@ def _written(folder: Path, tree: dict[str, Any]) -> Path:
 
 
 def main() -> None:
-    """Measure both arms."""
+    """Measure all arms."""
     tries = int(sys.argv[1]) if len(sys.argv) > 1 else TRIES
     rows = list[Row]()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        for made_arm in (wam, planar):
+        for made_arm in (wam, planar, partial(planar, streams="position")):
             rows += measure(made_arm(folder), tries, folder / "state")
     load = os.getloadavg()[1]
     rows.append(Row("load of this computer in the last five minutes, this included", load, ""))

@@ -406,7 +406,7 @@ def test_identification_loads_cvxpy_only_when_it_is_used() -> None:
         ("sim_backend.plant_process", {"numpy", "pydantic", "pinocchio"}),
         ("ident_service.recordings.recorder_main", {"numpy", "mcap"}),
         ("ident_service.operations.target_process", {"numpy", "pydantic", "mcap", "yaml"}),
-        ("ident_service.daemon.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2"}),
+        ("ident_service.daemon.app", {"numpy", "pydantic", "mcap", "yaml", "fastapi", "jinja2", "uvicorn"}),
     ],
 )
 def test_what_runs_beside_an_arm_loads_no_more_than_it_needs(program: str, needed: set[str]) -> None:

@@ -41,6 +41,7 @@ EMERGENCY_SLOTS = (od.LAST_EMERGENCY, od.ERROR_REGISTER, *(VENDOR_BYTE,) * 5)
 _VALUES: dict[Entry, Callable[[random.Random], int]] = {
     od.POSITION: lambda draw: draw.randint(-40_000, 40_000),
     od.TARGET_TORQUE: lambda draw: draw.randint(-100, 100),
+    od.TARGET_TORQUE_WIDE: lambda draw: draw.randint(-100, 100) << 16,
     od.TARGET_POSITION: lambda draw: draw.randint(-40_000, 40_000),
     od.TORQUE_ACTUAL: lambda draw: draw.randint(-100, 100),
     od.STATUS_WORD: lambda draw: draw.choice((0x1637, 0x1E37)),
@@ -101,18 +102,21 @@ def _budget(driver: CanopenDriver, rate: float) -> Budget:
 def _lines(profile: BusProfile) -> Iterator[Line]:
     nodes, rate = profile.nodes, profile.rate
     yield _line(profile, "SYNC", (SYNC,), (), rate, cyclic=True)
-    alone = tuple(frame.cob_id for frame in profile.torque_frames if len(frame.nodes) == 1)
+    alone: dict[Entry, list[int]] = {}
+    for frame in profile.torque_frames:
+        if len(frame.nodes) == 1:
+            alone.setdefault(frame.target, []).append(frame.cob_id)
     for frame in profile.torque_frames:
         if len(frame.nodes) > 1:
             whose = f"torques of nodes {', '.join(map(str, frame.nodes))}"
             yield _line(profile, whose, (frame.cob_id,), (frame.target,) * len(frame.nodes), rate, cyclic=True)
-    if alone:
-        target = profile.torque_frames[0].target
-        whose = "torques" if target is od.TARGET_TORQUE else "target positions"
-        yield _line(profile, f"{whose}, one drive each", alone, (target,), rate, cyclic=True)
-    yield _line(profile, "positions", tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
-    status = profile.status_slots
-    yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
+    for target, ids in alone.items():
+        whose = "target positions" if target is od.TARGET_POSITION else "torques"
+        yield _line(profile, f"{whose}, one drive each", tuple(ids), (target,), rate, cyclic=True)
+    name = "positions" if profile.status_slots else "positions with status"
+    yield _line(profile, name, tuple(TPDO1 + n for n in nodes), profile.position_slots, rate, cyclic=True)
+    if status := profile.status_slots:
+        yield _line(profile, "status reports", tuple(TPDO2 + n for n in nodes), status, 1.0 / profile.status_inhibit)
     guarded = tuple(HEARTBEAT + n for n in profile.guarded)
     if beats := tuple(HEARTBEAT + n for n in nodes if HEARTBEAT + n not in guarded):
         yield _line(profile, "heartbeats of the drives", beats, (HEARTBEAT_STATE,), 1.0 / profile.heartbeat_drives)

@@ -18,7 +18,14 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.object_dictionary import Entry, Kind, pdo_entry
 from drivers.canopen.sdo import DOES_NOT_EXIST, Objects, SdoRefused
 from ident_service.config.canopen import CanopenDrive, CanopenDriver, WatchdogKind
-from ident_service.config.drive_family import Family, PositionPath, TorqueLimit, TorquePath, family_from
+from ident_service.config.drive_family import (
+    Family,
+    PositionPath,
+    TorqueLimit,
+    TorquePath,
+    TorqueUnit,
+    family_from,
+)
 from ident_service.config.eds import DataSheet
 from ident_service.errors import DriverError
 
@@ -56,7 +63,8 @@ def parse_entry(text: str, name: str, unit: str = "") -> Entry:
 
 
 DRIVE_PROFILE = 402  # low word of 1000h
-TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "cNm": 1e-2, "mA": 1e-3}
+TORQUE_UNITS = {"mNm": 1e-3, "uNm": 1e-6, "cNm": 1e-2, "mA": 1e-3, "own": 1.0}
+_TURNS, _STEPS, _MINUTES, _SECONDS = 0xB4, 0xB5, 0x47, 0x03  # of 60A9h (CiA 303-2)
 _SAME = 0.01  # of a torque's unit: rounding, not another unit
 _ABSURD = 5.0  # between two sayings of one rated torque
 _MOST_TIMES = 20.0  # the rated torque, which no drive's peak torque comes near
@@ -75,7 +83,6 @@ _INDISPENSABLE: Sequence[tuple[Entry, str]] = (
     (pdo_entry(od.RPDO_COB_ID, 2), "control words have no frame"),
     (od.TPDO_COB_ID, "positions have no frame"),
     (od.TPDO_COUNT, "positions have no frame"),
-    (pdo_entry(od.TPDO_COB_ID, 2), "status reports have no frame"),
 )
 # What happens without these.
 _OPTIONAL: Sequence[tuple[Entry, str]] = (
@@ -94,6 +101,7 @@ _OPTIONAL: Sequence[tuple[Entry, str]] = (
 _OTHERS: Sequence[Entry] = (
     *(od.DEVICE_TYPE, od.PRODUCT, od.REVISION, od.SERIAL, od.SYNC_WINDOW, od.SYNC_OVERFLOW, od.GUARD_TIME),
     *(od.LIFE_FACTOR, od.HEARTBEAT_CONSUMER, od.HEARTBEAT_PRODUCER, od.RPDO_DEADLINE, pdo_entry(od.TPDO_PERIOD, 2)),
+    *(pdo_entry(od.TPDO_COB_ID, 2), od.VELOCITY_UNIT),
     *(od.TARGET_POSITION, od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
 )
 
@@ -152,9 +160,11 @@ class Capabilities:
         torque: how torques are streamed, or positions (`driver.streams`); None for no way.
         count: a count of the target [N m]; None where nothing tells it.
         limit: of the torque, in the drive; None for none.
-        speed: entry of the largest speed; None where the drive has none.
+        speed: entry of the largest speed; None where the drive has none, or nobody knows its unit.
+        speed_size: how many of its unit a turn per minute is.
         watchdogs: kinds that it has, the most trusted first.
         event: whether it has an event timer for status reports; else they come with every n-th SYNC.
+        beside: whether its status is sent with its position.
         dummies: indices of what may take the room of others' torques, in the order in which they are tried.
         shares: whether its data sheet or its family lets it share torque frames.
         problems: why it cannot be driven.
@@ -168,8 +178,10 @@ class Capabilities:
     count: float | None
     limit: TorqueLimit | None
     speed: Entry | None
+    speed_size: float
     watchdogs: tuple[WatchdogKind, ...]
     event: bool
+    beside: bool
     dummies: tuple[int, ...]
     shares: bool
     problems: tuple[Problem, ...]
@@ -184,7 +196,7 @@ class Capabilities:
         count = unknown if self.count is None else f"{self.count:.6g} N m"
         limit = unknown if self.limit is None else named(self.limit.entry)
         speed = "none" if self.speed is None else where(self.speed)
-        status = "by timer" if self.event else "by SYNC"
+        status = "with the position" if self.beside else "by timer" if self.event else "by SYNC"
         return (
             f"{self.family.name}, {torque}, a count {count}, torque limit {limit}, speed limit {speed}, "
             f"watchdogs {' '.join(self.watchdogs) or 'none'}, status {status}"
@@ -258,6 +270,7 @@ def entries_from_sheet(
 
 def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
     texts = [path.target for path in family.torque] + [path.slope for path in family.torque if path.slope]
+    texts += [text for path in family.torque for text in path.writes]
     texts += [text for path in family.torque if path.by for text in (path.by.entry, path.by.display)]
     texts += [text for one in family.torque_limit for text in (one.entry, one.per, one.negative) if text]
     texts += [*family.speed_limit, *([family.unit.rated] if family.unit and family.unit.rated else [])]
@@ -316,8 +329,11 @@ def assess(
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
     notes += _other_limits(family, found, drive, limit)
-    speeds = [parse_entry(text, "largest speed", "turns per minute") for text in family.speed_limit]
-    speed = next((entry for entry in speeds if found.has(entry)), None)
+    speed, size = None, 1.0
+    for entry in [parse_entry(text, "largest speed") for text in family.speed_limit]:
+        if found.has(entry) and (own := speed_size(entry, found.get(od.VELOCITY_UNIT), drive)) is not None:
+            speed, size = entry, own
+            break
     if speed is None:
         notes.append("no speed limit in the drive: only the host monitors it")
     watchdogs = tuple(_watchdogs(family, found, drive))
@@ -327,6 +343,7 @@ def assess(
             problems.append(Problem("6077h", "nobody knows what a count of the torque that it measures is"))
         problems += _unit_problems(family, found, count)
         changes += _unit_changes(family, found, drive, count)
+        changes += _frame_changes(torque, drive)
         if limit is None:
             tried = ", ".join(sorted({named(one.entry) for one in family.torque_limit})) or "none is known"
             problems.append(Problem(tried, "missing; the drive itself must limit the torque"))
@@ -342,8 +359,11 @@ def assess(
             changes.append(Problem("driver.zero", words))
         if driver.torque_reports != "none" and not found.has(od.TORQUE_ACTUAL):
             changes.append(Problem("driver.measured_torque", "it does not report its torque (6077h): set it to none"))
-    event = found.has(pdo_entry(od.TPDO_PERIOD, 2))
-    if not event:
+    event, beside = found.has(pdo_entry(od.TPDO_PERIOD, 2)), driver.status_frame == "position"
+    if not (beside or found.has(pdo_entry(od.TPDO_COB_ID, 2))):
+        words = "1801h:01 is missing, so that its status has no frame of its own: set it to position"
+        changes.append(Problem("driver.status.frame", words))
+    elif not (beside or event):
         notes.append("1801h:05 is missing: status reports come with every n-th SYNC")
     listed = frozenset() if sheet is None else sheet.dummies
     dummies = sorted((int(text, 16) for text in family.dummies or ()), key=lambda dummy: dummy not in listed)
@@ -354,8 +374,10 @@ def assess(
         count,
         limit,
         speed,
+        size,
         watchdogs,
         event,
+        beside,
         tuple(dummies),
         any(dummy in listed for dummy in dummies) and _identifier_is_free(sheet),
         tuple(problems),
@@ -397,6 +419,35 @@ def _no_position(found: DriveEntries) -> str:
     )
 
 
+def _frame_changes(path: TorquePath | PositionPath, drive: CanopenDrive) -> Iterator[Problem]:
+    """Tell where torque frames, which the description decides, are not as the drive's target needs them."""
+    if isinstance(path, PositionPath):
+        return
+    needed = path.shift if path.wide else None
+    if drive.torque_shift != needed:
+        words = "takes 16 bits: leave it out" if needed is None else f"takes 32 bits: set it to {needed}"
+        yield Problem("drives.torque_shift", f"{named(path.target)} {words}")
+
+
+def speed_size(entry: Entry, unit: int | None, drive: CanopenDrive) -> float | None:
+    """Return how many of an entry's unit a turn per minute is; None where nobody knows.
+
+    Args:
+        entry: of the largest speed; the largest profile velocity (607Fh) is in the unit of velocities, by CiA 402-2
+            counts per second.
+        unit: what 60A9h says of that, as CiA 303-2 numbers units; None or 0 where it says nothing.
+        drive: its section of the description.
+    """
+    if entry.index != od.MAX_VELOCITY.index:
+        return 1.0
+    per_second = drive.counts / 60.0
+    if not unit:
+        return per_second
+    prefix, what, time = (unit >> shift & 0xFF for shift in (24, 16, 8))
+    plain = {(_TURNS, _MINUTES): 1.0, (_TURNS, _SECONDS): 1.0 / 60.0, (_STEPS, _SECONDS): per_second}.get((what, time))
+    return None if plain is None else plain / 10.0 ** ((prefix ^ 0x80) - 0x80)
+
+
 def _limits(limit: TorqueLimit, found: DriveEntries) -> bool:
     return all(found.has(parse_entry(text, "")) for text in (limit.entry, limit.per, limit.negative) if text)
 
@@ -408,21 +459,36 @@ def _other_limits(
     most = 1000.0 * drive.max_torque / drive.rated_torque
     for limit in family.torque_limit:
         held = None if limit is chosen or limit.per else found.get(parse_entry(limit.entry, ""))
-        if held is not None and held < most:
-            share = held * drive.rated_torque / 1000.0
+        if held is not None and limit.held(held) < most:
+            share = limit.held(held) * drive.rated_torque / 1000.0
             yield f"{named(limit.entry)} is {held}: it may keep to {share:.4g} N m, below drives.max_torque"
 
 
 def _count(family: Family, found: DriveEntries, drive: CanopenDrive) -> float | None:
     """Return the torque of one count of the target [N m]; None where it is unknown."""
     unit = family.unit
-    if unit is None or (unit.unit == "mA" and drive.torque_constant is None):
+    if unit is None or next(_unknown(unit, drive), None):
         return None
-    factor = TORQUE_UNITS[unit.unit] * (drive.torque_constant or 1.0 if unit.unit == "mA" else 1.0)
+    factor = torque_unit(unit, drive)
     if unit.rated is None:
         return factor * (unit.count or 0.0)
     held = found.get(parse_entry(unit.rated, ""))
     return None if not held else held * factor * 1e-3
+
+
+def torque_unit(unit: TorqueUnit, drive: CanopenDrive) -> float:
+    """Return what one unit of a torque is [N m]; what a description does not say counts as 1."""
+    constant = drive.torque_constant or 1.0 if unit.of_current else 1.0
+    return TORQUE_UNITS[unit.unit] * constant * (drive.current_unit or 1.0 if unit.unit == "own" else 1.0)
+
+
+def _unknown(unit: TorqueUnit, drive: CanopenDrive) -> Iterator[Problem]:
+    """Tell what a description lacks to convert counts of a current to torques."""
+    of = "a count" if unit.rated is None else named(unit.rated)
+    if unit.of_current and drive.torque_constant is None:
+        yield Problem("drives.torque_constant", f"{of} is of a current: give it [N m/A]")
+    if unit.unit == "own" and drive.current_unit is None:
+        yield Problem("drives.current_unit", f"{of} is in the drive's own unit of current: give it [A]")
 
 
 def _unit_problems(family: Family, found: DriveEntries, count: float | None) -> Iterator[Problem]:
@@ -439,9 +505,7 @@ def _unit_changes(family: Family, found: DriveEntries, drive: CanopenDrive, coun
     unit = family.unit
     if unit is None or unit.writable:
         return
-    if unit.unit == "mA" and drive.torque_constant is None:
-        of = "a count" if unit.rated is None else named(unit.rated)
-        yield Problem("drives.torque_constant", f"{of} is of a current: give it [N m/A]")
+    yield from _unknown(unit, drive)
     if count is None or not found.asked:
         return
     thousand = 1e3 * count
@@ -452,7 +516,7 @@ def _unit_changes(family: Family, found: DriveEntries, drive: CanopenDrive, coun
         words = f"{drive.max_torque:g} N m are {drive.max_torque / thousand:.3g} times what a thousand counts are"
         yield Problem("drives.max_torque", f"{words}, more than any drive gives; is it of the motor, in N m?")
     current = found.get(od.RATED_CURRENT)
-    if unit.unit != "mA" and current and drive.torque_constant is not None:
+    if not unit.of_current and current and drive.torque_constant is not None:
         by_current = 1e-3 * current * drive.torque_constant
         if factor := _factor(thousand, by_current, _ABSURD - 1.0):
             words = f"with 6075h it makes {by_current:g} N m, but a thousand counts are {thousand:g} N m{factor}"

@@ -183,6 +183,7 @@ _COUNTS_PER_LINE = (1.0, 4.0)
 _GENTLER = 0.5  # of the wanted deceleration, that a drive's own may be: the ramp takes twice as long
 _MODE_PATIENCE, _MODE_AGAIN_NS = 0.5, 10_000_000  # s for drives that show it while off, ns between two reads
 _ROUNDING = 1e-6
+_TARGETS = (od.TARGET_TORQUE, od.TARGET_TORQUE_WIDE, od.TARGET_POSITION)
 _LETS_GO, _STAYS = 2, 6  # values of 605Ah: a ramp, then power off, or hold on
 IDENTITY = {"vendor": od.VENDOR, "product": od.PRODUCT, "revision": od.REVISION, "serial": od.SERIAL}
 
@@ -290,9 +291,9 @@ class DriveConfiguration:
         target = parse_entry(self.torque.target, "target position" if self.positions else "target torque", "counts")
         found = []
         for pdo in self.profile.pdos(self.drive.node):
-            own = tuple(target if slot in (od.TARGET_TORQUE, od.TARGET_POSITION) else slot for slot in pdo.slots)
+            own = tuple(target if slot in _TARGETS else slot for slot in pdo.slots)
             found.append(replace(pdo, slots=own))
-            if od.STATUS_WORD in pdo.slots and not self.can.event:
+            if pdo.sent and pdo.number == 2 and not self.can.event:
                 found[-1] = replace(pdo, type=self.profile.status_syncs, inhibit=0, timer=0)
         return found
 
@@ -423,7 +424,7 @@ def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
     for text in (limit.entry, limit.negative):
         try:
             if text is not None:
-                objects.ensure(Write(parse_entry(text, "largest torque"), value))
+                objects.ensure(Write(parse_entry(text, "largest torque"), limit.held(value)))
         except SdoRefused as refused:
             words = f"drives.max_torque is {setup.drive.max_torque:g} N m"
             raise SdoRefused(
@@ -435,7 +436,9 @@ def _largest_torque(objects: Objects, setup: DriveConfiguration) -> None:
 
 def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     """Set the mode of operation, and give the drive a moment to report it; before it is enabled it must have."""
-    by, clock, mode = setup.torque.by, objects.clock, setup.torque.mode
+    by, clock, mode, path = setup.torque.by, objects.clock, setup.torque.mode, setup.torque
+    for text, value in path.writes.items():
+        objects.ensure(Write(parse_entry(text, f"what mode {mode} needs"), value))
     entry, display = (od.MODE, od.MODE_DISPLAY) if by is None else map(_mode_entry, (by.entry, by.display))
     if not objects.holds(wanted := Write(entry, mode)):
         objects.write(wanted)  # the display is what reads it back; 6060h itself may be write-only
@@ -443,7 +446,7 @@ def _mode(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     last = clock.now_ns() + (round(_MODE_PATIENCE * 1e9) if shows else 0)
     while objects.read(display) != mode and clock.now_ns() < last:
         clock.sleep_until_ns(clock.now_ns() + _MODE_AGAIN_NS)
-    return OperationMode(mode if by is None else objects.read(od.MODE), display, mode)
+    return OperationMode(mode if by is None else objects.read(od.MODE), display, mode, path.enabling)
 
 
 def _mode_entry(text: str) -> Entry:
@@ -528,16 +531,18 @@ def _max_speed(objects: Objects, setup: DriveConfiguration) -> None:
     """
     if (entry := setup.can.speed) is None:
         return
+    size = setup.can.speed_size
     try:
-        objects.ensure(Write(entry, round(setup.drive.max_speed)))
+        # Not 0, which would be no torque at all, however coarse the unit is.
+        objects.ensure(Write(entry, min(max(1, round(setup.drive.max_speed * size)), 0xFFFF_FFFF)))
     except SdoRefused as refused:
         if refused.code not in READ_ONLY:
             raise
-        held = objects.read(entry)
+        held = objects.read(entry) / size
         if held < round(setup.motor.speed):
             raise DriverError(
-                f"node {objects.node}: gives no torque above {held} turns per minute ({entry.index:04X}h, which cannot"
-                f" be set), but its motor turns at {setup.motor.speed:.0f} at the joints' limits; lower"
+                f"node {objects.node}: gives no torque above {held:.0f} turns per minute ({entry.index:04X}h, which"
+                f" cannot be set), but its motor turns at {setup.motor.speed:.0f} at the joints' limits; lower"
                 " joints.NAME.velocity"
             ) from None
 

@@ -427,7 +427,7 @@ class CanopenArm(Arm):
         self._no_torque()
         self._streaming, self._stop = True, StopCommand()
         try:
-            reports = self._driver.status.inhibit, self._driver.status.period
+            reports = self._driver.report_delay, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
             buses.forget_modes()
             tell = self._names, self._driver.bring_up, now_ns, reports, option, buses.other_modes

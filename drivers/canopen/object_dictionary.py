@@ -133,6 +133,7 @@ FOLLOWING_WINDOW = Entry(0x6065, 0, Kind.U32, "following error window", "counts"
 FOLLOWING_TIMEOUT = Entry(0x6066, 0, Kind.U16, "following error timeout", "ms")
 VELOCITY = Entry(0x606C, 0, Kind.I32, "velocity", "drive's unit")
 TARGET_TORQUE = Entry(0x6071, 0, Kind.I16, "target torque", "per mille of rated torque")
+TARGET_TORQUE_WIDE = Entry(0x6071, 0, Kind.I32, "target torque of 32 bits", "shifted counts")  # of makers
 MAX_TORQUE = Entry(0x6072, 0, Kind.U16, "largest torque", "per mille of rated torque")
 MAX_CURRENT = Entry(0x6073, 0, Kind.U16, "largest current", "per mille of rated current")
 TARGET_POSITION = Entry(0x607A, 0, Kind.I32, "target position", "counts")
@@ -144,6 +145,7 @@ CURRENT_ACTUAL = Entry(0x6078, 0, Kind.I16, "current", "per mille of rated curre
 DC_LINK = Entry(0x6079, 0, Kind.U32, "voltage of the DC link", "mV")
 LOWER_LIMIT = Entry(0x607D, 1, Kind.I32, "lowest position", "counts")
 UPPER_LIMIT = Entry(0x607D, 2, Kind.I32, "highest position", "counts")
+MAX_VELOCITY = Entry(0x607F, 0, Kind.U32, "largest velocity", "drive's unit")
 MAX_SPEED = Entry(0x6080, 0, Kind.U32, "largest speed of the motor", "turns per minute")
 QUICK_STOP_DECELERATION = Entry(0x6085, 0, Kind.U32, "deceleration of quick stop", "drive's unit")
 TORQUE_SLOPE = Entry(0x6087, 0, Kind.U32, "torque slope", "per mille of rated torque per s")
@@ -151,6 +153,7 @@ ENCODER_COUNTS = Entry(0x608F, 1, Kind.U32, "encoder counts", "per ENCODER_TURNS
 ENCODER_TURNS = Entry(0x608F, 2, Kind.U32, "turns of the motor for ENCODER_COUNTS")
 GEAR_MOTOR = Entry(0x6091, 1, Kind.U32, "turns of the motor for GEAR_SHAFT")
 GEAR_SHAFT = Entry(0x6091, 2, Kind.U32, "turns of the driving shaft")
+VELOCITY_UNIT = Entry(0x60A9, 0, Kind.U32, "unit of velocities", "prefix, unit, unit of time")
 TORQUE_OFFSET = Entry(0x60B2, 0, Kind.I16, "torque offset", "per mille of rated torque")
 PERIOD_NUMBER = Entry(0x60C2, 1, Kind.U8, "interpolation period", "10^PERIOD_POWER s")
 PERIOD_POWER = Entry(0x60C2, 2, Kind.I8, "power of ten of the interpolation period")
@@ -165,11 +168,13 @@ class OperationMode:
         sent: in 6060h.
         display: entry that tells the mode in effect.
         wanted: value of `display` in that mode.
+        enabling: bits of the control word without which the drive does not follow its target in that mode.
     """
 
     sent: int
     display: Entry
     wanted: int
+    enabling: int = 0
 
 
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h

@@ -40,6 +40,7 @@ from drivers.canopen.cia402 import (
     nmt_words,
     state_of,
 )
+from drivers.canopen.object_dictionary import Entry
 from drivers.canopen.pdo_mapping import (
     EMERGENCY,
     HEARTBEAT,
@@ -152,6 +153,11 @@ class _Packed:
     cob_id: int
     drives: tuple[int, ...]
     pack: Callable[..., bytes] = field(repr=False)
+    shift: int
+
+
+def _packing(slots: Sequence[Entry]) -> struct.Struct:
+    return struct.Struct("<" + "".join(slot.kind.value[1:] for slot in slots))
 
 
 # Bits of the status word whose setting and clearing are reported as events.
@@ -185,15 +191,15 @@ class BusCodec:
         self._events: list[Event] = []
         self._status_cycles = math.ceil(profile.status_timeout * profile.rate)
         # With the torque that it measures, a report is one number longer.
-        self._positions = struct.Struct("<ih" if len(profile.position_slots) > 1 else "<i")
-        self._reports = struct.Struct("<Hh" if len(profile.status_slots) > 1 else "<H")
+        self._positions, self._reports = _packing(profile.position_slots), _packing(profile.status_slots)
+        self._tells_status, self._tells_torque = (
+            entry in profile.position_slots for entry in (od.STATUS_WORD, od.TORQUE_ACTUAL)
+        )
         self._notices = dict(zip(profile.nodes, profile.notices, strict=True))
         self._strangers: set[int] = set()
         self._foreign: set[int] = set()
         self._frames = [
-            _Packed(
-                frame.cob_id, frame.drives, struct.Struct("<" + frame.target.kind.value[1:] * len(frame.drives)).pack
-            )
+            _Packed(frame.cob_id, frame.drives, _packing((frame.target,) * len(frame.drives)).pack, frame.shift)
             for frame in profile.torque_frames
         ]
         self._sync = Frame(SYNC)
@@ -201,7 +207,7 @@ class BusCodec:
         for drive in self.drives:
             for base, handler in (
                 (TPDO1, self._on_position),
-                (TPDO2, self._on_status),
+                *(((TPDO2, self._on_status),) if profile.status_slots else ()),
                 (EMERGENCY, self._on_emergency),
                 (HEARTBEAT, self._on_heartbeat),
                 (SDO_REPLY, self._on_upload),
@@ -222,7 +228,7 @@ class BusCodec:
             DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.
         """
         try:
-            return [Frame(one.cob_id, one.pack(*[counts[k] for k in one.drives])) for one in self._frames]
+            return [Frame(one.cob_id, one.pack(*[counts[k] << one.shift for k in one.drives])) for one in self._frames]
         except (struct.error, IndexError, TypeError) as error:
             raise DriverError(f"bus {self.profile.number}: targets {list(counts)} cannot be sent: {error}") from None
 
@@ -313,9 +319,11 @@ class BusCodec:
             drive.duplicates += 1
             self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
         else:
-            drive.position, *measured = self._positions.unpack(frame.data)
-            if measured:
-                drive.torque, drive.torques = measured[0], drive.torques + 1
+            drive.position, *others = self._positions.unpack(frame.data)
+            if self._tells_torque:
+                drive.torque, drive.torques = others[-1], drive.torques + 1
+            if self._tells_status:
+                self._take_status(drive, others[0])
             drive.seen = drive.answered = True
             self._missing -= 1
             drive.age = 0

@@ -34,7 +34,7 @@ _RESTRICTED = (
 )
 _NOT_VALID, _NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID entry
 _EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
-_UNUSED = (3, 4)  # some drives command their axis by these out of the box
+_UNUSED = ((False, 3), (True, 3), (False, 4), (True, 4))  # some drives command their axis by these out of the box
 _MOST_16 = 0xFFFF
 _MOST_SYNCS = 240  # of a synchronous transmission type
 _STAYS_OPERATIONAL = 1  # 1029h:01 (CiA 301, 7.5.2.32)
@@ -77,12 +77,14 @@ class TorqueFrame:
         drives: whose targets it carries, in the order of its slots; numbers in the arm's list of drives.
         nodes: the same drives as node numbers.
         target: entry that each of them takes from it.
+        shift: bits by which counts are shifted in it.
     """
 
     cob_id: int
     drives: tuple[int, ...]
     nodes: tuple[int, ...]
     target: Entry = od.TARGET_TORQUE
+    shift: int = 0
 
     @property
     def length(self) -> int:
@@ -180,7 +182,7 @@ class BusProfile:
         status_period: of a drive's status report without a change [s].
         status_inhibit: least time between two of them [s].
         position_slots: entries that a drive sends at every SYNC.
-        status_slots: entries of its status report.
+        status_slots: entries of its status report; none where the status is sent with the position.
     """
 
     number: int
@@ -235,12 +237,14 @@ class BusProfile:
         slots = tuple(frame.target if other == node else od.DUMMY_INT16 for other in frame.nodes)
         deadline = _whole(self.torque_deadline, 1e-3) if self.watchdog(node) == "rpdo_timer" else 0
         inhibit, period = _whole(self.status_inhibit, 1e-4), _whole(self.status_period, 1e-3)
-        return [
+        found = [
             Pdo(1, False, frame.cob_id, _EVERY_SYNC, slots, timer=deadline),
             Pdo(2, False, RPDO2 + node, _ON_RECEPTION, (od.CONTROL_WORD, od.MODE)),
             Pdo(1, True, TPDO1 + node, _EVERY_SYNC, self.position_slots),
-            Pdo(2, True, TPDO2 + node, _ON_CHANGE, self.status_slots, inhibit, period),
         ]
+        if self.status_slots:
+            found.append(Pdo(2, True, TPDO2 + node, _ON_CHANGE, self.status_slots, inhibit, period))
+        return found
 
     def identifiers(self, node: int) -> list[Write]:
         """Return the downloads of the COB-IDs of SYNC and emergencies; a drive that lacks an entry follows CiA 301."""
@@ -275,8 +279,7 @@ class BusProfile:
         """Return the PDOs that this profile does not use, with the COB-IDs that they have by default."""
         return [
             Pdo(number, sent, (TPDO1 if sent else RPDO1) + (number - 1) * 0x100 + node, _ON_RECEPTION, ())
-            for number in _UNUSED
-            for sent in (False, True)
+            for sent, number in (*(() if self.status_slots else ((True, 2),)), *_UNUSED)
         ]
 
 
@@ -296,6 +299,9 @@ def bus_profiles(driver: CanopenDriver, rate: float) -> list[BusProfile]:
 def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> BusProfile:
     drives = [k for k, drive in enumerate(driver.drives) if drive.bus == number]
     slots, target = driver.drives_a_frame, od.TARGET_POSITION if driver.streams == "position" else od.TARGET_TORQUE
+    status = (od.STATUS_WORD, od.TORQUE_ACTUAL) if driver.torque_reports == "status" else (od.STATUS_WORD,)
+    measured = (od.TORQUE_ACTUAL,) if driver.torque_reports == "cyclic" else ()
+    own = driver.status_frame == "own"
     together = [drives[first : first + slots] for first in range(0, len(drives), slots)]
     return BusProfile(
         number,
@@ -312,8 +318,8 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
         driver.torque_deadline,
         driver.status.period,
         driver.status.inhibit,
-        (od.POSITION, od.TORQUE_ACTUAL) if driver.torque_reports == "cyclic" else (od.POSITION,),
-        (od.STATUS_WORD, od.TORQUE_ACTUAL) if driver.torque_reports == "status" else (od.STATUS_WORD,),
+        (od.POSITION, *(() if own else status), *measured),
+        status if own else (),
         tuple(driver.drives[k].watchdog for k in drives),
         (driver.guarding.period, driver.guarding.factor),
         driver.heartbeats.host_timeout,
@@ -321,7 +327,9 @@ def _profile(driver: CanopenDriver, rate: float, number: int, bus: CanBus) -> Bu
 
 
 def _torque_frame(drives: Sequence[CanopenDrive], chosen: Sequence[int], target: Entry) -> TorqueFrame:
-    nodes = _nodes(drives, chosen)
+    nodes, shift = _nodes(drives, chosen), drives[chosen[0]].torque_shift
+    if shift is not None and target is od.TARGET_TORQUE:
+        return TorqueFrame(RPDO1 + nodes[0], tuple(chosen), nodes, od.TARGET_TORQUE_WIDE, shift)
     return TorqueFrame(RPDO1 + nodes[0], tuple(chosen), nodes, target)
 
 

@@ -135,9 +135,11 @@ class Buses:
         link.send(codec.nmt(command, self.drives[number].node))
 
     def control(self, number: int, word: int) -> None:
-        """Send a control word to one drive."""
+        """Send a control word to one drive; one that enables it has the bits that its mode needs."""
         codec, link = self._at[number]
-        link.send(codec.control_word(self.drives[number].node, word, self.modes[number].sent))
+        mode = self.modes[number]
+        word |= mode.enabling if word == ENABLE else 0
+        link.send(codec.control_word(self.drives[number].node, word, mode.sent))
 
     def control_stop(self, number: int, word: int) -> None:
         """Send a control word that stops; by SDO too where a drive may have left `operational`, deaf to RPDOs."""
@@ -464,7 +466,7 @@ class EnableSequence:
         if self._in_other_mode:
             return False
         ages = [now_ns - reported for reported in self._reported_ns]
-        soon = min(ages) > self._inhibit_ns and max(ages) < self._report_ns - self._inhibit_ns // 10
+        soon = min(ages) >= self._inhibit_ns and max(ages) < self._report_ns - self._inhibit_ns // 10
         return soon or now_ns - self._ready_ns > 3 * self._report_ns
 
     def _all_in_state(self) -> bool:

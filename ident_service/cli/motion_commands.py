@@ -234,7 +234,7 @@ def _files(folder: Path) -> list[str]:
 
 def add_dry_run(sub: Parser) -> None:
     """Add the option `--dry-run` to a verb that configures drives."""
-    text = "move and write nothing: list what opening the arm would write into its drives (exit code 3: one is refused)"
+    text = "move and write nothing: list what would be written into the arm's drives (exit code 3: one is refused)"
     sub.add_argument("--dry-run", action="store_true", help=text)
 
 
@@ -258,14 +258,20 @@ def described_arm(arguments: argparse.Namespace) -> ArmConfig:
         return load_arm(path)
 
 
-def dry_run(arguments: argparse.Namespace) -> Answer:
-    """Return what opening the arm of a verb would write into its drives; nothing is written and nothing moves."""
-    from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
+def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
+    """Return what opening the arm of a verb, or zeroing it, would write into its drives; nothing is written."""
+    from ident_service.operations.drive_configuration import (
+        planned_configuration,
+        planned_document,
+        planned_text,
+        planned_zero,
+    )
 
     config = described_arm(arguments)
-    planned = planned_configuration(config)
+    planned = planned_zero(config) if zero else planned_configuration(config)
     code = VERDICT_NO if any(one.refused for one in planned) else DONE
-    return code, planned_text(config, planned), planned_document(config, planned)
+    text = planned_text(config, planned, "setting home" if zero else "opening")
+    return code, text, planned_document(config, planned)
 
 
 def add_can_log(sub: Parser) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import Parser, VerbList, count, frequency, seconds, seed, share, weight, workers
+from ident_service.cli.motion_commands import add_dry_run, dry_run
 from ident_service.cli.output import (
     DONE,
     VERDICT_NO,
@@ -349,6 +350,7 @@ def _add_bus(verbs: VerbList) -> None:
     sub.add_argument(
         "--confirm", metavar="NAME", help="the arm's name: it is supported, and nobody is within its reach"
     )
+    add_dry_run(sub)
 
 
 def _bus_report(arguments: argparse.Namespace) -> Answer:
@@ -410,6 +412,8 @@ def _store(arguments: argparse.Namespace) -> Answer:
 
 
 def _driver_test(arguments: argparse.Namespace) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from dataclasses import asdict
 
     from ident_service.config.load import load_arm

@@ -69,8 +69,9 @@ def _add_recovery(verbs: VerbList) -> None:
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
+    add_dry_run(sub)
     add_lease(sub, confirm=False)
-    sub.set_defaults(zero=True, out=None, can_log=False, dry_run=False)
+    sub.set_defaults(zero=True, out=None, can_log=False)
     sub = verbs.add(
         "recover",
         _recover,
@@ -88,7 +89,7 @@ def _add_recovery(verbs: VerbList) -> None:
 
 def _home(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
-        return dry_run(arguments)
+        return dry_run(arguments, zero=arguments.zero)
     from ident_service.motion.run_plan import Destination
 
     config = described_arm(arguments)
@@ -262,10 +263,13 @@ def _add_reidentify(verbs: VerbList) -> None:
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
     sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
+    add_dry_run(sub)
     add_by(sub)
 
 
 def _reidentify(arguments: argparse.Namespace) -> Answer:
+    if arguments.dry_run:
+        return dry_run(arguments)
     from ident_service.config.load import load_arm
     from ident_service.daemon.maintenance.reidentification import enter_concluded, require_comparable
     from ident_service.operations.acceptance import ARM, PARAMETERS, accepted_set

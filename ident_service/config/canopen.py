@@ -158,8 +158,17 @@ class CanopenDrive(ExtendedSection):
     """Data sheet of this drive, where it is another type than the others; a file beside the description."""
     torque_constant: Positive | None = None
     """Torque per current of the motor [N m/A], for drives whose thousandths are of a current."""
+    current_unit: Positive | None = None
+    """Current of one count of the target [A], for drives that count it in a unit of their own (Technosoft iPOS: twice
+    the drive's peak current by 65520)."""
+    torque_shift: Annotated[int, Field(strict=True, ge=0, le=16)] | None = None
+    """Bits by which a torque is shifted in a target of 32 bits [1], where the drive has such a one (`ident bus probe`
+    says so); left out, targets have 16 bits."""
     later = frozenset(
-        {"watchdog", "watchdog_time", "watchdog_entry", "quick_stop_deceleration", "eds", "torque_constant"}
+        {
+            *("watchdog", "watchdog_time", "watchdog_entry", "quick_stop_deceleration"),
+            *("eds", "torque_constant", "current_unit", "torque_shift"),
+        }
     )
 
     @model_validator(mode="after")
@@ -209,13 +218,17 @@ class Reactions(Section):
     """Reaction to the loss of the host (6007h) [1]: 3 is quick stop."""
 
 
-class StatusReports(Section):
-    """Timing of status word and torque (TPDO2), sent on change."""
+class StatusReports(ExtendedSection):
+    """Status word and torque, sent on change (TPDO2), or with each position (TPDO1)."""
 
     period: Seconds = 0.1
     """Longest time between two reports (TPDO2) [s]."""
     inhibit: InhibitTime = 0.05
     """Shortest time between two reports [s]."""
+    frame: Literal["own", "position"] | None = None
+    """Frame of the status word: its own (TPDO2), or that of the position (TPDO1), in every cycle; left out, the latter
+    where the EDS has no TPDO2."""
+    later = frozenset({"frame"})
 
 
 class Emulation(ExtendedSection):
@@ -326,14 +339,23 @@ class CanopenDriver(ExtendedSection):
         return "status" if all(sheet.has(0x6077) for sheet in self.sheets) else "none"
 
     @property
+    def status_frame(self) -> Literal["own", "position"]:
+        """Return whether the status word has a frame of its own, or is sent with the position."""
+        if self.status.frame is not None:
+            return self.status.frame
+        lacking = any(sheet.has(0x1800, 1) and not sheet.has(0x1801, 1) for sheet in self.sheets)
+        return "position" if lacking else "own"
+
+    @property
     def drives_a_frame(self) -> int:
-        """Return how many drives a torque or position frame is for, at most; two positions fit, but no dummies do."""
-        return _SLOTS if self.torque_frames == "shared" and self.streams == "torque" else 1
+        """Return how many drives a frame of targets is for, at most; two of 32 bits fit, but no dummies do."""
+        wide = self.streams == "position" or any(drive.torque_shift is not None for drive in self.drives)
+        return 1 if wide or self.torque_frames == "single" else _SLOTS
 
     @property
     def report_delay(self) -> float:
-        """Return the largest delay with which a drive reports a change of its status [s]."""
-        return self.status.inhibit
+        """Return the largest delay with which a drive reports a change of its status [s], beside that of a cycle."""
+        return self.status.inhibit if self.status_frame == "own" else 0.0
 
     @model_validator(mode="after")
     def _require_distinct_nodes(self) -> CanopenDriver:

@@ -15,7 +15,8 @@ from ident_service.errors import DriverError
 
 EntryText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/[iu](8|16|32)$")]
 Unsigned32 = Annotated[int, Field(strict=True, ge=0, le=0xFFFF_FFFF)]
-TargetText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i16$")]  # 16 bits, as torque frames carry it
+TargetText = Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i(16|32)$")]
+_MOST_CONTROL = 0xFFFF
 _MOST_MODE = 127
 _NEEDS_NO_SOURCE = frozenset({"name", "proved", "sources", "notes"})
 
@@ -35,16 +36,30 @@ class ModeEntry(Section):
 
 
 class TorquePath(Section):
-    """Way to stream torques: a mode, its bit in 6502h where it has one, and the entry that takes the torque."""
+    """Way to stream torques: a mode, its bit in 6502h where it has one, and the entry that takes the torque.
+
+    A target of 32 bits takes counts shifted by `shift` bits. `writes` are entries that the mode needs set, with their
+    values; `enabling` are bits of the control word without which an enabled drive does not follow its target.
+    """
 
     mode: Annotated[int, Field(strict=True, ge=-128, le=0xFFFF)]
     supported: Annotated[int, Field(strict=True, ge=0, le=31)] | None = None
     target: TargetText
     by: ModeEntry | None = None
     slope: EntryText | None = None
+    shift: Annotated[int, Field(strict=True, ge=0, le=16)] = 0
+    writes: dict[EntryText, Annotated[int, Field(strict=True)]] = Field(default={})
+    enabling: Annotated[int, Field(strict=True, ge=0, le=_MOST_CONTROL)] = 0
+
+    @property
+    def wide(self) -> bool:
+        """Return whether the target has 32 bits, so that one frame carries it for one drive."""
+        return self.target.endswith("/i32")
 
     @model_validator(mode="after")
     def _fits(self) -> TorquePath:
+        if self.shift and not self.wide:
+            raise ValueError("only counts in a target of 32 bits are shifted")
         if self.by is None and self.mode > _MOST_MODE:
             raise ValueError(f"mode {self.mode} does not fit 6060h; `by` names the maker's own entry")
         return self
@@ -58,34 +73,50 @@ class PositionPath(Section):
     target: Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{1,2}/i32$")]
     by: None = None
     slope: None = None
+    writes: dict[EntryText, int] = Field(default={}, max_length=0)
+    enabling: Literal[0] = 0
 
 
 class TorqueUnit(Section):
     """Size of a count of the target: a thousandth of `rated`, or `count`, in `unit`; `mA` needs a torque constant.
 
-    `cNm` is for drives that count N m x 100 (Roboteq's 6071h: `count: 1`).
+    `cNm` is for drives that count N m x 100 (Roboteq's 6071h: `count: 1`), `own` for drives that count a current in a
+    unit of their own, which a description gives (`drives.current_unit`).
     """
 
     rated: EntryText | None = None
     count: Positive | None = None
-    unit: Literal["mNm", "uNm", "cNm", "mA"]
+    unit: Literal["mNm", "uNm", "cNm", "mA", "own"]
     writable: bool = False
 
     @model_validator(mode="after")
     def _require_rated_or_count(self) -> TorqueUnit:
         if (self.rated is None) == (self.count is None):
             raise ValueError("either `rated` names an entry, or `count` is a number")
-        if self.writable and (self.rated is None or self.unit == "mA"):
+        if self.writable and (self.rated is None or self.of_current):
             raise ValueError("only a rated torque in mNm, uNm or cNm is written")
         return self
 
+    @property
+    def of_current(self) -> bool:
+        """Return whether a count is of a current."""
+        return self.unit in ("mA", "own")
+
 
 class TorqueLimit(Section):
-    """Entry of the largest torque, in counts of the target or thousandths of `per`; `negative`: other direction."""
+    """Entry of the largest torque, in counts of the target or thousandths of `per`; `negative`: other direction.
+
+    With `below`, the entry holds how far the largest torque is below this number of counts.
+    """
 
     entry: EntryText
     per: EntryText | None = None
     negative: EntryText | None = None
+    below: Annotated[int, Field(strict=True, ge=1)] | None = None
+
+    def held(self, counts: int) -> int:
+        """Return what the entry holds for a largest torque, or the largest torque for what it holds [counts]."""
+        return counts if self.below is None else max(self.below - counts, 0)
 
 
 class MakersWatchdog(Section):

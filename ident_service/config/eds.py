@@ -1,20 +1,32 @@
-"""Read the entries of an EDS or DCF (CiA 306-1) as far as possible, in spite of oddities in makers' files."""
+"""Read the entries of an EDS or DCF (CiA 306-1) as far as possible, in spite of oddities in makers' files.
+
+Lines that are none of an ini file are passed over, and so is every value that is none: the drive has the last word.
+"""
 
 from __future__ import annotations
 
-import configparser
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Final
 
-LONGEST: Final = 2**19  # characters; an ini reader takes about a second for them
+LONGEST: Final = 2**21  # characters; the largest files of makers have about half of them
 
-_OBJECT = re.compile(r"^([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?$", re.IGNORECASE)
-_NODE = re.compile(r"\+?\$NODEID\+?", re.IGNORECASE)
-_NUMBER_OF_ENTRIES = 0x05  # type of sub-index 0
-_MOST_SUBS = 0xFE
+_SECTION = re.compile(r"\[([^\]]*)\]")
+_OBJECT = re.compile(r"([0-9a-f]{4})(?:sub([0-9a-f]{1,2}))?")
+_REMARK = re.compile(r"\s;")
+_NODE = re.compile(r"\$?NODE-?ID", re.IGNORECASE)
+_OCTAL = re.compile(r"-?0[0-7]+")
+_BARE_HEXADECIMAL = re.compile(r"([0-9a-f]*[a-f][0-9a-f]*)h?|([0-9a-f]+)h", re.IGNORECASE)  # 1F4, 1F4h
+_LARGEST = 2**64  # which no number of an object dictionary reaches
+_MOST_ENTRIES = 2**17
+_UNSIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x05, 0x06, 0x07  # data types (CiA 301, table 44)
+_CONTAINERS = (8, 9)  # object types of arrays and records, whose entries have sections of their own
+_MOST_SUBS, _MOST_PDOS, _MOST_MAPPED = 0xFE, 512, 8
+# Of `CompactPDO`: sub-index of a PDO's parameters and its type, for each bit of the mask.
+_COMPACT = {1: _UNSIGNED32, 2: _UNSIGNED8, 3: _UNSIGNED16, 5: _UNSIGNED16, 6: _UNSIGNED8}
+_YES = ("true", "yes")
 
 
 @dataclass(frozen=True)
@@ -79,32 +91,67 @@ def data_sheet(text: str) -> DataSheet:
     """Parse the text of an EDS or DCF; never raises, what cannot be read is left out."""
     if len(text) > LONGEST:
         return DataSheet(mistake=f"longer than {LONGEST} characters")
-    if why := _strange_line(text):
-        return DataSheet(mistake=why)
-    parser = configparser.RawConfigParser(strict=False, inline_comment_prefixes=(";",))
-    try:
-        parser.read_string(text)
-    except configparser.Error as error:
-        return DataSheet(mistake=str(error).splitlines()[0].removesuffix(" file: '<string>'"))
-    sections = {name.lower(): parser[name] for name in parser.sections()}
+    sections = _sections(text)
+    objects = {place: section for name, section in sections.items() if (place := _place(name)) is not None}
+    divided = {index for index, sub in objects if sub is not None}
     entries: dict[int, DataSheetEntry] = {}
-    for name, section in sections.items():
-        if match := _OBJECT.match(name):
-            index, sub = int(match[1], 16), match[2]
-            if sub is not None or "subnumber" not in section:
-                entries.update((index << 8 | at, one) for at, one in _listed(section, int(sub or "0", 16)))
-    usage: Mapping[str, str] = sections.get("dummyusage", {})
-    dummies = frozenset(k for k in range(1, 8) if _number(usage.get(f"dummy{k:04d}", "0"), 0) == 1)
-    told = {1: "vendornumber", 2: "productnumber", 3: "revisionnumber"}
+    # What an object says of all its entries comes before what the section of one of them says.
+    for (index, sub), section in sorted(objects.items(), key=lambda one: one[0][1] is not None):
+        if sub is None and _is_container(section, index in divided):
+            continue
+        values = sections.get(f"{index:04x}value", {})
+        entries.update((index << 8 | at, one) for at, one in _listed(section, sub or 0, values))
+        if len(entries) > _MOST_ENTRIES:
+            return DataSheet(mistake=f"it lists more than {_MOST_ENTRIES} entries")
     info: Mapping[str, str] = sections.get("deviceinfo", {})
-    mistake = None if "deviceinfo" in sections else "it has no section [DeviceInfo]"
+    entries = _compact_pdos(info) | entries
+    usage: Mapping[str, str] = sections.get("dummyusage", {})
+    dummies = frozenset(k for k in range(1, 8) if _is_set(usage.get(f"dummy{k:04d}", "0")))
+    told = {1: "vendornumber", 2: "productnumber", 3: "revisionnumber"}
+    mistake = None if entries or "deviceinfo" in sections else "it lists no object and has no section [DeviceInfo]"
     identity = {sub: _number(info.get(key, ""), 0) for sub, key in told.items()}
     identity |= {s: n for s in told if (one := entries.get(0x1018 << 8 | s)) and (n := one.number(0)) is not None}
     return DataSheet(entries, dummies, {sub: value for sub, value in identity.items() if value is not None}, mistake)
 
 
-def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, DataSheetEntry]]:
-    """Yield the entries of one section: one, or all elements of a compact array."""
+def _sections(text: str) -> dict[str, dict[str, str]]:
+    """Return the keys and values of each section by its name, all names in lower case; the last of two alike counts."""
+    found: dict[str, dict[str, str]] = {}
+    section: dict[str, str] = {}
+    for line in text.replace("\r", "\n").split("\n"):
+        plain = line.strip("\ufeff\0 \t")
+        if plain.startswith("["):
+            # Below a heading that is torn, keys belong to no section.
+            name = _SECTION.match(plain)
+            section = {} if name is None else found.setdefault("".join(name[1].split()).lower(), {})
+        elif plain[:1] not in (";", "#"):
+            key, equals, value = plain.partition("=")
+            if equals:
+                section[key.strip().lower()] = _REMARK.split(value, maxsplit=1)[0].strip()
+    return found
+
+
+def _place(name: str) -> tuple[int, int | None] | None:
+    """Return index and sub-index (None for an object's own) of a section; None for a section of another kind."""
+    match = _OBJECT.fullmatch(name)
+    return None if match is None else (int(match[1], 16), None if match[2] is None else int(match[2], 16))
+
+
+def _is_container(section: Mapping[str, str], divided: bool) -> bool:
+    """Return whether an object's own section only announces sections of its entries.
+
+    Files give `SubNumber=0` to plain variables too, and leave out what the standard wants.
+    """
+    kind, subs = (_number(section.get(key, ""), 0) for key in ("objecttype", "subnumber"))
+    if _number(section.get("compactsubobj", ""), 0):
+        return False
+    if kind in _CONTAINERS:
+        return divided or bool(subs) or "datatype" not in section
+    return (divided and "datatype" not in section) or (kind is None and bool(subs))
+
+
+def _listed(section: Mapping[str, str], sub: int, values: Mapping[str, str]) -> Iterator[tuple[int, DataSheetEntry]]:
+    """Yield the entries of one section: one, or all elements of a compact array, with those of its values in a DCF."""
     text = section.get("defaultvalue") or None
     own = section.get("parametervalue") or None
     if own is not None and not (text is not None and _NODE.search(text)):  # that is another node's
@@ -112,39 +159,53 @@ def _listed(section: Mapping[str, str], sub: int) -> Iterator[tuple[int, DataShe
     low, high = (_number(section.get(key, ""), 0) for key in ("lowlimit", "highlimit"))
     kind = _number(section.get("datatype", ""), 0) or 0
     access = section.get("accesstype", "ro").strip().lower()
-    mappable, configured = bool(_number(section.get("pdomapping", ""), 0)), own is not None and text is own
+    mappable, configured = _is_set(section.get("pdomapping", "")), own is not None and text is own
     found = DataSheetEntry(kind, access, mappable, low, high, text, configured)
-    if many := min(_number(section.get("compactsubobj", ""), 0) or 0, _MOST_SUBS):
-        yield 0, DataSheetEntry(_NUMBER_OF_ENTRIES, text=str(many))
-        yield from ((number, found) for number in range(1, many + 1))
+    if (many := min(_number(section.get("compactsubobj", ""), 0) or 0, _MOST_SUBS)) > 0:
+        yield 0, DataSheetEntry(_UNSIGNED8, text=str(many))
+        for number in range(1, many + 1):
+            own = values.get(str(number)) or None
+            yield number, found if own is None else replace(found, text=own, configured=True)
     else:
         yield sub, found
 
 
+def _compact_pdos(info: Mapping[str, str]) -> dict[int, DataSheetEntry]:
+    """Return the parameters of PDOs that a file does not list but sums up (`CompactPDO`)."""
+    mask = _number(info.get("compactpdo", ""), 0) or 0
+    found: dict[int, DataSheetEntry] = {}
+    for key, parameters, mapping, base in (("nrofrxpdo", 0x1400, 0x1600, 0x200), ("nroftxpdo", 0x1800, 0x1A00, 0x180)):
+        many = min(_number(info.get(key, ""), 0) or 0, _MOST_PDOS) if mask > 0 else 0
+        for number in range(many):
+            born = f"$NODEID+{base + number * 0x100:#x}" if number < 4 else "0x80000000"
+            subs = {sub: kind for sub, kind in _COMPACT.items() if mask >> sub & 1}
+            texts = {1: born, 2: "255"}
+            found[parameters + number << 8] = DataSheetEntry(_UNSIGNED8, text=str(max(subs, default=0)))
+            for sub, kind in subs.items():
+                found[parameters + number << 8 | sub] = DataSheetEntry(kind, "rw", text=texts.get(sub, "0"))
+            found[mapping + number << 8] = DataSheetEntry(_UNSIGNED8, "rw", text="0")
+            for sub in range(1, _MOST_MAPPED + 1):
+                found[mapping + number << 8 | sub] = DataSheetEntry(_UNSIGNED32, "rw", text="0")
+    return found
+
+
+def _is_set(text: str) -> bool:
+    return bool(_number(text, 0)) or text.strip().lower() in _YES
+
+
+@lru_cache(maxsize=4096)
 def _number(text: str, node: int) -> int | None:
-    plain, relative = _NODE.subn("", text.replace(" ", ""))
+    """Return a number as files write it: decimal, 0x180, octal (017), 180h, 1F4, relative to `$NODEID`; else None."""
+    plain, relative = _NODE.subn("", "".join(text.partition(";")[0].split()).strip("\"'()"))
+    plain = plain.strip("+").rstrip("uUlL")
     try:
-        return int(plain or "0" if relative else plain, 0) + (node if relative else 0)
+        if bare := _BARE_HEXADECIMAL.fullmatch(plain):
+            value = int(bare[1] or bare[2], 16)
+        elif _OCTAL.fullmatch(plain):
+            value = int(plain, 8)
+        else:
+            value = int(plain or "0" if relative else plain, 10 if plain.strip("-0").isdecimal() else 0)
     except ValueError:
         return None
-
-
-def _strange_line(eds: str) -> str | None:
-    """Return what is wrong with the first line that is not ini syntax, as configparser is quadratic in such lines."""
-    begun = False
-    level: int | None = None  # indentation of the option that deeper lines continue
-    for number, line in enumerate(eds.split("\n"), 1):
-        text = line.strip()
-        indent = len(line) - len(line.lstrip())
-        if not text or text[0] in "#;" or (level is not None and indent > level):
-            continue
-        section, at = re.match(r"\[.+\]", text), re.search("[=:]", text)
-        begun = begun or section is not None
-        if not begun:
-            return None  # configparser reports it at once
-        if section is None and at is None:
-            return f"line {number} is neither a section nor a key with a value: {text[:40]!r}"
-        if at is not None and at.start() == 0:
-            return f"line {number} has no key: {text[:40]!r}"
-        level = None if section else indent
-    return None
+    value += node if relative else 0
+    return value if abs(value) < _LARGEST else None

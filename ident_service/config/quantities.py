@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -119,14 +119,29 @@ def read_relative_file(value: Any, info: ValidationInfo) -> Any:
     Where the validation's context names that folder as `upload`, only files in it are read, and none is looked for
     elsewhere: who sends a description learns nothing about other files.
     """
-    return _read(value, info, None)
+    return _read(value, info, lambda data: data.decode("utf-8"))
 
 
 def _read_any(value: Any, info: ValidationInfo) -> Any:
-    return _read(value, info, "latin-1")
+    return _read(value, info, _decoded)
 
 
-def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
+def _decoded(data: bytes) -> str:
+    """Decode text of any encoding: UTF-16 shows by its mark or its zeros, and what is no UTF-8 is taken as Latin-1."""
+    guesses = ["utf-8-sig"]
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        guesses.insert(0, "utf-16")
+    elif b"\0" in data[:2]:
+        guesses.insert(0, "utf-16-be" if data.startswith(b"\0") else "utf-16-le")
+    for encoding in guesses:
+        try:
+            return data.decode(encoding)
+        except UnicodeDecodeError:
+            pass
+    return data.decode("latin-1")
+
+
+def _read(value: Any, info: ValidationInfo, decode: Callable[[bytes], str]) -> Any:
     if not isinstance(value, str):
         return value
     folder = value.folder if isinstance(value, LocatedStr) else Path.cwd()
@@ -144,11 +159,10 @@ def _read(value: Any, info: ValidationInfo, otherwise: str | None) -> Any:
     if path.stat().st_size > MAX_FILE_BYTES:
         raise ValueError(f"{path} is larger than {MAX_FILE_BYTES} bytes")
     try:
-        return {"name": path.name, "text": path.read_text(encoding="utf-8")}
+        text = decode(path.read_bytes())
     except UnicodeDecodeError:
-        if otherwise is not None:
-            return {"name": path.name, "text": path.read_text(encoding=otherwise)}
         raise ValueError(f"{path} is not UTF-8 text") from None
+    return {"name": path.name, "text": text.replace("\r\n", "\n").replace("\r", "\n")}
 
 
 TextBeside = Annotated[TextFile, BeforeValidator(read_relative_file, json_schema_input_type=str)]

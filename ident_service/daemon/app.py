@@ -135,7 +135,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         version=__version__,
         description="Commission a robot arm. Everything is named by id; every motion needs an operator, a lease and "
         "the typed name of its arm; stop needs none of them.",
-        openapi_url="/api/v1/openapi.json",
+        openapi_url=None,  # FastAPI makes it anew for each request, in the event loop (`openapi.py`)
         docs_url=None,  # these pages load scripts from other machines
         redoc_url=None,
         lifespan=lifespan,
@@ -153,7 +153,9 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     describe(app)
     install_error_handlers(app)
     book = Connections() if connections is None else connections
-    app.add_middleware(RequestGuardMiddleware, settings=settings, metrics=service.metrics, connections=book)
+    app.add_middleware(
+        RequestGuardMiddleware, settings=settings, metrics=service.metrics, connections=book, gate=service.gate
+    )
     return app
 
 

@@ -7,17 +7,27 @@ fewer than the places, of one address and of all, because the middleware refuses
 excepted. A client that does not read its answer is closed, too.
 
 uvicorn's own `limit_concurrency` counts idle connections and would refuse the stop; it has no deadline for a request.
+
+Reading takes the event loop's time, too: of 256 kB that are one-byte chunks a second and more. So requests are read in
+small pieces, and all connections together have a few milliseconds of each turn of the loop for it; only the head of a
+stop or of a lease's renewal is read at once (`ReadingTurns`).
 """
 
 from __future__ import annotations
 
+import asyncio
+import re
 import resource
 import socket
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, Self
+
+import h11
+from uvicorn.protocols.http.flow_control import FlowControl
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEADER_SECONDS: Final = 10.0  # for a handshake and the headers of a request
 BODY_SECONDS: Final = 60.0  # for 16 MiB over 2.2 Mbit/s
@@ -27,6 +37,11 @@ _DESCRIPTORS = 4096  # descriptors that are asked for, if the hard limit of the 
 _RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are being closed
 _LEAVING = 64
 _AT_ONCE = 16  # connections accepted before the event loop turns to other work
+_TURN: Final = 0.002  # s of the processor for reading requests in each turn of the event loop
+_SHORT, _LONG = 0.0005, 0.002  # s for a piece, below and above which the next one is larger or smaller
+_LEAST, _LARGEST = 512, 8192  # bytes of a piece
+_URGENT: Final = re.compile(rb"POST [^ ?]*/(?:stop|lease)[ ?]")
+_URGENT_BYTES: Final = 4096  # of the head of such a request
 Peer = tuple[str, int]
 
 
@@ -210,3 +225,127 @@ class Listener(socket.socket):
             if self._book.admit(connection):
                 return connection, address
             connection.close()
+
+
+class ReadingTurns:
+    """Turns of the connections that wait to have the next piece of a request read, the longest waiting first."""
+
+    def __init__(self, now: Callable[[], float] = time.thread_time) -> None:
+        """Begin without connections; `now` is the clock of the event loop's thread [s]."""
+        self._now, self._spent, self._scheduled = now, 0.0, False
+        self._waiting = deque[FairReader]()
+
+    @property
+    def free(self) -> bool:
+        """Return whether a piece may be read at once: nobody waits, and there is time left in this turn."""
+        return not self._waiting and self._spent < _TURN
+
+    def read(self, reader: FairReader) -> None:
+        """Read one piece of a request now; the connection waits for its next turn if there is more."""
+        began = self._now()
+        reader.read_piece()
+        took = self._now() - began
+        self._spent += took
+        if took < _SHORT:
+            reader.piece = min(2 * reader.piece, _LARGEST)
+        elif took > _LONG:
+            reader.piece = max(reader.piece // 2, _LEAST)
+        if reader.waits:
+            self._waiting.append(reader)
+        self._schedule()
+
+    def wait(self, reader: FairReader) -> None:
+        """Let a connection wait for its turn."""
+        self._waiting.append(reader)
+        self._schedule()
+
+    def _schedule(self) -> None:
+        if not self._scheduled:
+            self._scheduled = True
+            asyncio.get_running_loop().call_soon(self._turn)
+
+    def _turn(self) -> None:
+        self._scheduled, self._spent = False, 0.0
+        while self._waiting and self._spent < _TURN:
+            self.read(self._waiting.popleft())
+        if self._waiting:
+            self._schedule()
+
+
+class FairReader(H11Protocol):
+    """HTTP protocol of one connection that reads its requests in pieces, each in its turn."""
+
+    def __init__(self, *settings: Any, turns: ReadingTurns, **more: Any) -> None:
+        """Take uvicorn's settings, and the turns that all connections share."""
+        super().__init__(*settings, **more)
+        self.turns, self.pending, self.piece = turns, bytearray(), _LEAST
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to read; nothing more is received while something waits to be read."""
+        super().connection_made(transport)
+        self.flow = _ReaderFlow(transport, self)
+
+    def data_received(self, data: bytes) -> None:
+        """Read what has come, or the first piece of it, if it is this connection's turn or it is urgent."""
+        if self.pending:
+            self.pending += data
+            self.transport.pause_reading()
+        elif self._urgent(data):
+            super().data_received(data)
+        else:
+            self.pending += data
+            if self.turns.free:
+                self.turns.read(self)
+            else:
+                self.transport.pause_reading()
+                self.turns.wait(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget what has not been read."""
+        self.pending.clear()
+        super().connection_lost(exc)
+
+    @property
+    def waits(self) -> bool:
+        """Return whether something is to be read, and may be: the application has taken what came before."""
+        return bool(self.pending) and not self.flow.read_paused
+
+    def read_piece(self) -> None:
+        """Read the next piece, and receive more once all is read."""
+        piece = bytes(self.pending[: self.piece])
+        del self.pending[: self.piece]
+        if self.transport.is_closing():
+            self.pending.clear()
+        elif piece:
+            super().data_received(piece)
+        if self.pending:
+            self.transport.pause_reading()
+        elif not self.flow.read_paused and not self.transport.is_closing():
+            self.transport.resume_reading()
+
+    def _urgent(self, data: bytes) -> bool:
+        """Return whether this is the whole head of a stop or a lease's renewal, on a connection that waits for one."""
+        return (
+            len(data) <= _URGENT_BYTES
+            and _URGENT.match(data) is not None
+            and b"\r\n\r\n" in data
+            and b"chunked" not in data.lower()
+            and self.conn.their_state is h11.IDLE
+        )
+
+
+class _ReaderFlow(FlowControl):
+    """Flow control that does not receive more while something waits to be read."""
+
+    def __init__(self, transport: asyncio.Transport, reader: FairReader) -> None:
+        super().__init__(transport)
+        self._reader = reader
+
+    def resume_reading(self) -> None:
+        """Let the application take more: first what waits to be read, then what is received."""
+        if self._reader.pending:
+            if self.read_paused:
+                self.read_paused = False
+                self._reader.turns.wait(self._reader)
+        else:
+            super().resume_reading()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import threading
 from typing import Any, Final
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Response
 
 _CONFIRM: Final = {"name": "wam7_sim", "challenge": "bGV0IGl0IG1vdmU"}
 _YAML: Final = "extends: planar2\nname: bench\ncontrol: {rate: 500}\n"
@@ -80,15 +82,23 @@ FAILURES: Final[dict[int, tuple[str, str]]] = {
 
 
 def describe(app: FastAPI) -> None:
-    """Add summaries and examples to an application's OpenAPI description."""
-    plain = app.openapi
+    """Add summaries and examples to an application's OpenAPI description, and serve it."""
+    plain, making = app.openapi, threading.Lock()
+    made: list[bytes] = []
 
     def described() -> dict[str, Any]:
         if app.openapi_schema is None:
             _complete(plain())
         return plain()  # FastAPI keeps it from the first time
 
+    def text() -> Response:
+        with making:  # a second of computing, in a thread
+            if not made:
+                made.append(json.dumps(described()).encode())
+        return Response(made[0], media_type="application/json")
+
     app.openapi = described  # type: ignore[method-assign]
+    app.add_api_route("/api/v1/openapi.json", text, include_in_schema=False)
 
 
 def _complete(document: dict[str, Any]) -> None:

@@ -2,7 +2,9 @@
 
 Every answer gets its security headers here.
 
-Pure ASGI, so that bodies are counted as they come and streams are not held back.
+Pure ASGI, so that bodies are counted as they come and streams are not held back. FastAPI reads a body before it asks
+who sends it, and reads JSON in the event loop: so more than a little is taken of operators only, and of no body so many
+values that reading them would delay a stop.
 """
 
 from __future__ import annotations
@@ -16,9 +18,12 @@ from http import HTTPStatus
 from typing import Any, Final
 from urllib.parse import urlsplit
 
-from fastapi import HTTPException
+from fastapi import HTTPException, Request
+from fastapi.concurrency import run_in_threadpool
 
+from ident_service.daemon.authentication import Authenticator
 from ident_service.daemon.connections import Connections, Peer
+from ident_service.daemon.dependencies import COOKIE, unknown
 from ident_service.daemon.metrics import Metrics
 from ident_service.daemon.settings import Settings
 
@@ -32,6 +37,8 @@ MOST_BODY: Final = 64 * 1024
 MOST_UPLOAD: Final = 16 * 2**20
 MOST_PIECE: Final = 8 * 2**20  # of a recording
 UPLOADS: Final = ("/api/v1/arms", "/api/v1/motions", "/api/v1/descriptions/check", "/api/v1/descriptions/new")
+_MOST_VALUES: Final = 250_000  # commas and brackets of a body of JSON; 30 ms of reading
+_MOST_HELD: Final = 128 * 2**20  # bytes of all large bodies that are being received or answered
 _PIECES: Final = "/api/v1/uploads/"
 _URGENT: Final = ("/stop", "/lease")  # ends of paths that are answered however busy the service is
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -51,15 +58,16 @@ _HEADERS: Final = (
 )
 
 
-class _TooLarge(HTTPException):
-    """Error for a body that has more bytes than allowed."""
+class _Refused(HTTPException):
+    """Error for a request whose body is not taken, or not now."""
 
-    def __init__(self, most: int) -> None:
-        super().__init__(413, f"a request has {most} bytes at most")
+    kind = "TooLarge"
 
 
-class _Busy(HTTPException):
+class _Busy(_Refused):
     """Error for a request while as many are being answered as may be."""
+
+    kind = "Busy"
 
     def __init__(self) -> None:
         super().__init__(503, "too many requests at a time; try again", {"Retry-After": "1"})
@@ -68,8 +76,11 @@ class _Busy(HTTPException):
 class RequestGuardMiddleware:
     """ASGI middleware: check Host, Origin, body size and load; add security headers; count and log requests."""
 
-    def __init__(self, app: App, settings: Settings, metrics: Metrics, connections: Connections) -> None:
+    def __init__(
+        self, app: App, settings: Settings, metrics: Metrics, connections: Connections, gate: Authenticator
+    ) -> None:
         self._app, self._metrics, self._connections = app, metrics, connections
+        self._bodies = _Bodies(connections, gate)
         self._hosts, self._scheme = settings.hosts, "https" if settings.tls else "http"
         hsts = ((b"strict-transport-security", b"max-age=31536000"),) if settings.tls else ()
         self._headers = (*_HEADERS, *hsts)
@@ -86,6 +97,7 @@ class RequestGuardMiddleware:
         urgent = scope["path"].endswith(_URGENT)
         busy = not urgent and self._connections.busy(peer)
         self._connections.headers_received(peer, body=_has_body(scope))
+        body = _Body(scope, receive, self._bodies, urgent=urgent)
 
         async def answer(message: Message) -> None:
             nonlocal status, started
@@ -108,12 +120,12 @@ class RequestGuardMiddleware:
                 await _refuse(answer, 503, "Busy", _Busy().detail)
                 return
             try:
-                await self._app(scope, self._counted(scope, receive, urgent=urgent), answer)
-            except (_TooLarge, _Busy) as error:
+                await self._app(scope, body.receive, answer)
+            except _Refused as error:
                 if not started:
-                    kind = "TooLarge" if isinstance(error, _TooLarge) else "Busy"
-                    await _refuse(answer, error.status_code, kind, error.detail)
+                    await _refuse(answer, error.status_code, error.kind, error.detail)
         finally:
+            self._bodies.held -= body.held
             self._connections.answered(peer)
             stop = scope["method"] == "POST" and scope["path"].endswith("/stop")
             self._metrics.request(scope["method"], status, time.perf_counter() - began, stop=stop)
@@ -143,26 +155,68 @@ class RequestGuardMiddleware:
             return 403, "WrongOrigin", "requests from pages of other origins are refused"
         return None
 
-    def _counted(self, scope: Scope, receive: Receive, *, urgent: bool) -> Receive:
-        most, seen, peer = _body_limit(scope["method"], scope["path"]), 0, scope.get("client")
-        whole = not _has_body(scope)
 
-        async def counted() -> Message:
-            nonlocal seen, whole
-            message = await receive()
-            if message["type"] == "http.request":
-                seen += len(message.get("body", b""))
-                if seen > most:
-                    raise _TooLarge(most)
-                if not whole and not message.get("more_body", False):
-                    whole = True
-                    # While the body arrived, other requests may have used up the places.
-                    if not urgent and self._connections.busy(peer):
-                        raise _Busy
-                    self._connections.request_received(peer)
-            return message
+class _Bodies:
+    """Hold what all bodies share: the connections, who may send more than a little, and the bytes in memory."""
 
-        return counted
+    def __init__(self, connections: Connections, gate: Authenticator) -> None:
+        self.connections, self.gate, self.held = connections, gate, 0
+
+
+class _Body:
+    """Body of one request: counted as it comes."""
+
+    def __init__(self, scope: Scope, receive: Receive, bodies: _Bodies, *, urgent: bool) -> None:
+        self._scope, self._receive, self._bodies, self._urgent = scope, receive, bodies, urgent
+        self._most, self._whole = _body_limit(scope["method"], scope["path"]), not _has_body(scope)
+        self._pieces = scope["method"] == "PATCH"  # written to a file as they come, by a route that has asked who sends
+        self._seen, self._values, self.held = 0, 0, 0
+
+    async def receive(self) -> Message:
+        """Return the next message of the request.
+
+        Raises:
+            HTTPException: the body is too large or not this caller's to send, or the service is busy.
+        """
+        message = await self._receive()
+        if message["type"] == "http.request":
+            await self._count(message.get("body", b""))
+            if not self._whole and not message.get("more_body", False):
+                self._whole = True
+                peer = self._scope.get("client")
+                # While the body arrived, other requests may have used up the places.
+                if not self._urgent and self._bodies.connections.busy(peer):
+                    raise _Busy
+                self._bodies.connections.request_received(peer)
+        return message
+
+    async def _count(self, data: bytes) -> None:
+        self._seen += len(data)
+        if self._seen > self._most:
+            raise _Refused(413, f"a request has {self._most} bytes at most")
+        if self._pieces:
+            return
+        self._values += sum(data.count(mark) for mark in (b",", b"[", b"{"))
+        if self._values > _MOST_VALUES:
+            raise _Refused(413, f"a request has {_MOST_VALUES} commas and brackets at most")
+        if self._seen > MOST_BODY:
+            if not self.held:
+                await self._require_operator()
+            self._bodies.held += self._seen - self.held
+            self.held = self._seen
+            if self._bodies.held > _MOST_HELD:
+                raise _Busy
+
+    async def _require_operator(self) -> None:
+        request, gate = Request(self._scope), self._bodies.gate
+        kind, _, secret = request.headers.get("authorization", "").partition(" ")
+        caller = (secret if kind.lower() == "bearer" else None, request.cookies.get(COOKIE))
+        if (found := gate.known(*caller)) is None:
+            await run_in_threadpool(gate.refresh)  # it may have been made a moment ago
+            if (found := gate.known(*caller)) is None:
+                raise unknown()
+        if found.role != "operator":
+            raise HTTPException(403, f"the token {found.name!r} may only read; this needs the role operator")
 
 
 def _body_limit(method: str, path: str) -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import functools
 import gc
 import json
 import logging
@@ -31,7 +32,13 @@ import uvicorn
 from fastapi import FastAPI
 
 from ident_service.daemon.app import create_app
-from ident_service.daemon.connections import Connections, Listener, raise_connection_limit
+from ident_service.daemon.connections import (
+    Connections,
+    FairReader,
+    Listener,
+    ReadingTurns,
+    raise_connection_limit,
+)
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.recordings.files import write_atomically
@@ -155,7 +162,7 @@ def log_as_json(level: int = logging.INFO) -> None:
     logging.getLogger("uvicorn.access").disabled = True
 
 
-_MOST_HEADERS = 32 * 1024  # bytes
+_MOST_HEADERS = 16 * 1024  # bytes
 _SWITCH = 0.0005  # s
 _LAST_ANSWERS = 5  # s for requests that are being answered when the service ends
 _READY_AGAIN = 0.1  # s until READY=1 is sent again to a manager whose queue was full
@@ -194,7 +201,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             proxy_headers=False,
             ws="none",
             lifespan="on",
-            http="h11",
+            http=functools.partial(FairReader, turns=ReadingTurns()),  # type: ignore[arg-type] # it is called once each
             loop="asyncio",  # this loop accepts connections from `Listener`
             h11_max_incomplete_event_size=_MOST_HEADERS,
             timeout_graceful_shutdown=_LAST_ANSWERS,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from ident_service.recordings.resampling import grid
 MAX_BLOCKS = 256
 LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known
 _CHUNK = 4096  # samples whose regressor is computed at once
+_SLOWEST_SAMPLING = 0.2  # s; nobody samples an arm more slowly
 _DECAY = 28.0  # -ln(1e-12)
 _UNCOUPLED = 1e-12
 
@@ -131,6 +132,8 @@ def equations(
     model: ArmModel,
     base: BaseParameters,
     row_weights: RowWeights | None = None,
+    *,
+    judging: bool = False,
 ) -> Equations:
     """Read recordings once and return their equations in blocks.
 
@@ -140,13 +143,15 @@ def equations(
         base: grouping of the parameters.
         row_weights: what each row is multiplied by, shape (samples, joints); with it, those near standstill are
             among the blocks.
+        judging: whether only errors are computed from them, for which no joint has to move.
 
     Raises:
-        RecordingError: a recording does not fit the arm, or some joint does not move in it.
+        RecordingError: a recording does not fit the arm, or some joint moves in none of them.
     """
     whole = tuple(recordings) if isinstance(recordings, Sequence) else (recordings,)
     felt = sparsity(model.chain, model.layout, base.base)
-    return equations_of(whole, model, felt, lambda recording: equation_rows(recording, model, base), row_weights)
+    rows_of = partial(equation_rows, model=model, base=base)
+    return equations_of(whole, model, felt, rows_of, row_weights, judging=judging)
 
 
 @one_blas_thread()
@@ -156,6 +161,8 @@ def equations_of(
     felt: tuple[NDArray[np.intp], ...],
     rows_of: Callable[[Recording], Iterator[Rows]],
     row_weights: RowWeights | None = None,
+    *,
+    judging: bool = False,
 ) -> Equations:
     """Gather the rows that a function gives, which may have further columns, as `equations` gathers its own.
 
@@ -165,14 +172,49 @@ def equations_of(
         felt: per joint, which columns it feels, increasing.
         rows_of: gives a recording's rows in consecutive chunks.
         row_weights: what each row is multiplied by, as of `equations`.
+        judging: as of `equations`.
 
     Raises:
-        RecordingError: a recording does not fit the arm, or some joint does not move in it.
+        RecordingError: a recording does not fit the arm, or some joint moves in none of them.
     """
-    gathered = Equations((), 0)
+    gathered, moved = Equations((), 0), np.zeros(model.chain.joints, dtype=np.bool_)
     for recording, cut in zip(recordings, cut_into_stretches(recordings, model), strict=True):
-        gathered = _gathered(gathered, recording, rows_of(recording), model.chain.names, felt, cut, row_weights)
+        gathered, moves = _gathered(gathered, rows_of(recording), model.chain.joints, felt, cut, row_weights)
+        moved |= moves
+    if not judging:
+        require_motion(recordings, model, moved)
     return gathered
+
+
+def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDArray[np.bool_]) -> None:
+    """Raise unless every joint moves in some recording.
+
+    Args:
+        recordings: that were read.
+        model: the arm.
+        moved: whether each joint was faster than `identification.reversal.speed` somewhere, shape (joints,).
+
+    Raises:
+        RecordingError: with the joints that were not, and what to do.
+    """
+    still = [name for name, moves in zip(model.chain.names, moved, strict=True) if not moves]
+    if not still:
+        return
+    where = f"{len(recordings)} recordings" if len(recordings) > 1 else "it"
+    speed = model.config.identification.reversal.speed
+    said = f"{', '.join(still)}: never faster than identification.reversal.speed ({speed:g} rad/s or m/s) in {where}"
+    period = min(grid(recording, model.config.recording).own_period_s for recording in recordings)
+    if period > _SLOWEST_SAMPLING:
+        raise RecordingError(
+            recordings[0].path,
+            f"{said}, and samples are {period:.3g} s apart: is the time not in seconds? Name its unit: "
+            "recording.columns: {t: {column: NAME, unit: ms}}",
+        )
+    raise RecordingError(
+        recordings[0].path,
+        f"{said}, so that neither its inertia nor its friction shows; record a motion of it, or, where it is held, "
+        f"take it out of the arm: kinematics.lock: {{{still[0]}: POSITION}}",
+    )
 
 
 def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tuple[Stretches, ...]:
@@ -189,14 +231,14 @@ def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tupl
 
 def _gathered(
     before: Equations,
-    recording: Recording,
     consecutive: Iterator[Rows],
-    names: Sequence[str],
+    joints: int,
     joint_supports: tuple[NDArray[np.intp], ...],
     cut: Stretches,
     row_weights: RowWeights | None,
-) -> Equations:
-    moved = np.zeros(len(names), dtype=bool)
+) -> tuple[Equations, NDArray[np.bool_]]:
+    """Add the blocks of one recording; return them all, and which joints move in it."""
+    moved = np.zeros(joints, dtype=np.bool_)
     samples, current, origin = 0, None, cut.origin
     for rows in consecutive:
         origin = float(rows.time[0]) if origin is None else origin
@@ -225,12 +267,7 @@ def _gathered(
             current = number[begin]
         moved |= rows.moving.any(axis=0)
         before = bounded(Equations(tuple(blocks), before.samples, tuple(near), tuple(labels)))
-    if still := [name for name, moves in zip(names, moved, strict=True) if not moves]:
-        raise RecordingError(
-            recording.path,
-            f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
-        )
-    return replace(before, samples=before.samples + samples)
+    return replace(before, samples=before.samples + samples), moved
 
 
 def _block_seconds(recording: Recording, model: ArmModel) -> float:

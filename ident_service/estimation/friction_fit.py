@@ -28,9 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import FrictionShape, JointTerm
-from ident_service.errors import RecordingError
 from ident_service.estimation.choices import Choice, held_out_thirds, significant_choice
-from ident_service.estimation.equations import Equations, Rows, equation_rows
+from ident_service.estimation.equations import Equations, Rows, equation_rows, require_motion
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import Moments, ridge, weighted_least_squares
 from ident_service.estimation.robust_regression import standstill_weights
@@ -157,11 +156,7 @@ class FrictionTrials:
         self.thirds = [slice(self._rows * k // FOLDS, self._rows * (k + 1) // FOLDS) for k in range(FOLDS)]
         self._products: dict[tuple[int, int, int], Array] = {}
         self._places = [self._places_of(joint) for joint in self._joints]
-        if still := [name for joint, name in enumerate(model.chain.names) if not moved[joint]]:
-            raise RecordingError(
-                recordings[0].path,
-                f"{', '.join(still)}: never faster than identification.reversal.speed, nothing to identify from",
-            )
+        require_motion(recordings, model, moved)
 
     @property
     def joints(self) -> int:

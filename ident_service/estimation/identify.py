@@ -378,7 +378,7 @@ def _check_convex(
 
 
 def _validation_equations(recording: Recording, prepared: Prepared, base: BaseParameters) -> Equations:
-    return equations(recording, prepared.model, base).with_torques_times(prepared.torque_scales)
+    return equations(recording, prepared.model, base, judging=True).with_torques_times(prepared.torque_scales)
 
 
 def _prior(model: ArmModel, found: Fit, base: BaseParameters, conditions: FeasibleSet) -> Prior | None:

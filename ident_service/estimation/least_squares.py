@@ -58,7 +58,7 @@ def weighted_least_squares(information: Information) -> LeastSquares:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
     """
     fit = ordinary_least_squares(information)
-    floor = 1e-9 * np.sqrt(information.squared_torques() / np.maximum(information.rows, 1))
+    floor = least_deviations(information)
     for _ in range(_MOST_ROUNDS):
         degrees = np.maximum(information.rows - information.base / information.joints, 1)
         deviations = np.maximum(np.sqrt(information.squared_residuals(fit.beta) / degrees), floor)
@@ -69,6 +69,15 @@ def weighted_least_squares(information: Information) -> LeastSquares:
         if settled:
             return fit
     raise ModelError(f"the weights of the joints do not converge in {_MOST_ROUNDS} rounds: {fit.weights}")
+
+
+def least_deviations(information: Information) -> Array:
+    """Return what residuals' deviations count as at least [N m or N], far below each joint's torque, shape (joints,).
+
+    A joint whose torque is always zero has those of the others.
+    """
+    torques = np.sqrt(information.squared_torques() / np.maximum(information.rows, 1))
+    return np.asarray(1e-9 * np.where(torques > 0.0, torques, torques.max(initial=0.0) or 1.0))
 
 
 def ordinary_least_squares(information: Information, weights: Array | None = None) -> LeastSquares:

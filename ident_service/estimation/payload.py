@@ -13,8 +13,10 @@ on this motion looks like a payload: x depends on beta by -G = -(K_x^T W^T W K_x
 A body that was added has a pseudo-inertia >= 0, one that was taken off has the negative of one. Of both sets the point
 nearest to x in the metric of its covariance is sought, and told by its distance (`drift.probability`) and by the torque
 that lies between: too far from both means that no single body explains the recording, as when one tool was exchanged
-for another. So does a recording without a payload whose residual is far above that of the identification: a small body
-is easily lost in it, and the arm does not move as it was identified.
+for another. Of the bodies that move like that point (to a hundredth of its deviations) the one most like a ball is
+told: what no motion shows has the size that a load of this mass has. No single body explains a recording without a
+payload whose residual is far above that of the identification, either: a small body is easily lost in it, and the arm
+does not move as it was identified.
 
 A parameter's verdict compares its deviation with the larger of its size and what is as good as zero: what makes 1 % of
 a joint's torque on this motion, or what a body of this mass, at least 100 g, has 5 cm from the frame, if that is less.
@@ -22,7 +24,9 @@ a joint's torque on this motion, or what a body of this mass, at least 100 g, ha
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -40,10 +44,12 @@ from ident_service.estimation.change_detection import (
     torque_shares,
 )
 from ident_service.estimation.equations import Equations
+from ident_service.estimation.feasible.central import ChangeEllipsoid, centre
 from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap, constrain
 from ident_service.estimation.feasible.nearest import nearest
+from ident_service.estimation.fit import allowed_change
 from ident_service.estimation.least_squares import LeastSquares, TorqueError, torque_error, weighted_least_squares
 from ident_service.estimation.uncertainty import Verdict, uncertainty, verdicts
 from ident_service.model.arm_model import ArmModel
@@ -51,10 +57,12 @@ from ident_service.model.base_parameters import BaseParameters, grouping
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, triangle
+from ident_service.model.likely_bodies import LikelyBodies, likely_load
 from ident_service.model.parameter_layout import INERTIAL
 
 Word = Literal["none", "added", "removed", "infeasible"]
 
+_WORST_LAST: tuple[Verdict, ...] = ("identified", "weak", "unidentified")
 _ARM = 0.05  # m
 _LEAST_MASS = 0.1  # kg
 FAR = 4.0  # times the residual of the identification, as in `plausibility.py`
@@ -96,7 +104,8 @@ class Body:
     """Body nearest to an estimate among those that were added, or among those that were taken off.
 
     Attributes:
-        delta: its ten parameters in the last link's frame (eq. 13), positive mass, and the offsets, shape (names,).
+        delta: its ten parameters in the last link's frame (eq. 13), positive mass, and the offsets, shape (names,);
+            those that no motion shows are as a ball of this mass has them.
         b: what it adds to the arm in base parameters of the payload: minus itself if taken off, shape (payload,).
         p: how often an estimate lies farther away by chance.
         torque_share: per joint, of its torque, by which it predicts otherwise than the estimate, shape (joints,).
@@ -203,8 +212,9 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
         conditions = feasible_set("pseudo_inertia", base.names)
         whole = difference_test(arm_side, new_side, range(base.size))
         signs: dict[Word, float] = {"added": 1.0, "removed": -1.0}
+        near = partial(allowed_change, fit, base, deviations)
         for kind, sign in signs.items():
-            found[kind] = _body(fit.beta, covariance, base, conditions, sign, whole, (arm_side, new_side))
+            found[kind] = _body(fit.beta, covariance, base, conditions, sign, whole, (arm_side, new_side), near)
         best = max(found, key=lambda kind: (found[kind].explains, found[kind].p))
         word = best if found[best].explains else "infeasible"
     body = found.get(word)
@@ -314,33 +324,44 @@ def _body(
     sign: float,
     whole: Test,
     sides: tuple[ComparedEstimate, ComparedEstimate],
+    near: Callable[[Array], ChangeEllipsoid | None],
 ) -> Body:
     metric = _metric(covariance)
     # The sign applies to the offsets too, and is undone below.
     found = nearest(metric, sign * metric @ b, sign * b, base, conditions, "payload")
     p = probability(found.objective**2, max(whole.directions, 1), whole.degrees)
-    moved = sign * found.beta
+    delta = _compact(found.delta, base, conditions, near(found.beta))
+    moved = sign * base.K @ delta
     rest = np.where(np.isfinite(np.diag(covariance)), b - moved, 0.0)
     shares = torque_shares(*sides, rest)
     explains = p >= ALPHA or not relevant(shares)
-    delta = _smallest(found.delta, base, conditions)
     share = np.zeros(0) if shares is None else shares[0]
     return Body(delta, moved, p, share, explains, conditions.margin(delta)[0])
 
 
-def _smallest(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Array:
-    """Return the body of the same base parameters with the least tr(P) = m + tr(L) / 2.
+def _compact(delta: Array, base: BaseParameters, conditions: FeasibleSet, near: ChangeEllipsoid | None) -> Array:
+    """Return, of the bodies that move alike, the nearest to a ball of the mass and centre of mass that motion shows.
 
-    What no motion shows stays small.
+    Where it does not show the mass, the ball has that of the smallest of these bodies.
     """
+    begin = _smallest(delta, base, conditions)
+    mass, first = begin[len(INERTIAL) - 1], begin[len(INERTIAL) - 4 : len(INERTIAL) - 1]
+    likely = np.zeros(len(delta))
+    likely[: len(INERTIAL)] = likely_load(mass, first / mass)
+    return centre(begin, base, conditions, LikelyBodies(likely, np.zeros(len(delta)), "geometry"), near)
+
+
+def _smallest(delta: Array, base: BaseParameters, conditions: FeasibleSet) -> Array:
+    """Return the body of the same base parameters with the least tr(P) = m + tr(L) / 2."""
     if not len(base.dependent):
         return delta
     lift = LinkParameterMap(base)
     fixed = lift.of_beta @ (base.K @ delta)
     problem = ConicProblem(len(base.dependent))
+    # Half the room that this body has: a load that is nearly a point has less than the usual inset.
+    inset = 0.5 * min(EPSILON, conditions.margin(delta)[0])
     for block in conditions.blocks:
-        # Half the inset that the nearest body has, so that there is room.
-        inside = block.f + block.F @ fixed - 0.5 * EPSILON * block.identity()
+        inside = block.f + block.F @ fixed - inset * block.identity()
         constrain(problem, block, block.times(lift.of_dependent), inside)
     trace = np.array([0.5 if name[:3] in ("Lxx", "Lyy", "Lzz") else float(name[0] == "m") for name in base.names])
     try:
@@ -361,6 +382,22 @@ def _metric(covariance: Array) -> Array:
     metric = np.zeros((int(kept.sum()), len(covariance)))
     metric[:, seen] = (vectors[:, kept] / np.sqrt(values[kept])).T / scale
     return metric
+
+
+def body_words(payload: Payload) -> tuple[str, ...]:
+    """Return a word for each of the ten values of a body: its verdict, or `chosen` where no motion shows it.
+
+    A value that several base parameters make up has the worst of their verdicts.
+    """
+    lift = LinkParameterMap(payload.base)
+    found = list[str]()
+    for row, free in zip(lift.of_beta[: len(INERTIAL)], lift.of_dependent[: len(INERTIAL)], strict=True):
+        parts = np.flatnonzero(row)
+        if free.any() or not np.isfinite(payload.standard_deviations[parts]).all():
+            found.append("chosen")
+        else:
+            found.append(max((payload.verdicts[k] for k in parts), key=_WORST_LAST.index))
+    return tuple(found)
 
 
 def center_of_mass(payload: Payload) -> tuple[Array, Array] | None:

@@ -19,7 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.estimation.equations import Equations, Rows, equation_rows, equations
-from ident_service.estimation.least_squares import LeastSquares, Moments, ordinary_least_squares, weighted_least_squares
+from ident_service.estimation.least_squares import (
+    LeastSquares,
+    Moments,
+    least_deviations,
+    ordinary_least_squares,
+    weighted_least_squares,
+)
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
@@ -234,7 +240,7 @@ def standstill_weights(gathered: Equations) -> Array:
     if near is None or not near.rows.any():
         return shares
     beta = weighted_least_squares(gathered.everything).beta
-    floor = 1e-9 * np.sqrt(gathered.everything.squared_torques() / np.maximum(gathered.everything.rows, 1))
+    floor = least_deviations(gathered.everything)
     for _ in range(_MOST_WEIGHINGS):
         fast, slow = (np.maximum(_deviations(part, beta), floor) for part in (moving, near))
         # A joint whose rows are all of one kind has nothing to compare.

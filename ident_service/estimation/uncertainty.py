@@ -75,7 +75,8 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
         fit: what solves them.
     """
     clusters = equations.clusters
-    covariance, degrees, blind = jackknife(clusters, fit)
+    seen = [_Whitened.of(cluster, fit) for cluster in clusters]
+    covariance, degrees, blind = _left_out(seen, fit, np.eye(len(fit.beta)))
     deviations = np.sqrt(np.diag(covariance))
     known = ~blind & (deviations > 0.0)
     floor = np.where(known, np.maximum(deviations, np.where(known, fit.standard_deviations, 0.0)), deviations)
@@ -87,8 +88,8 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
     for count in _LONGER:
         if len(clusters) < _LEAST_CLUSTERS * count:
             break
-        longer = [sum(clusters[start : start + count], ()) for start in range(0, len(clusters), count)]
-        other, fewer, _ = jackknife(longer, fit)
+        longer = [_Whitened.sum(seen[start : start + count]) for start in range(0, len(seen), count)]
+        other, fewer, _ = _left_out(longer, fit, np.eye(len(fit.beta)))
         found = np.sqrt(np.diag(other)) * widening(fewer)
         degrees = np.where(found > largest, fewer, degrees)
         largest = np.maximum(largest, found)
@@ -111,32 +112,79 @@ def jackknife(
         The covariance of the combinations, shape (combinations, combinations); degrees of freedom of its variances,
         shape (combinations,); and of which of them the data, or all clusters but one, say nothing.
     """
-    size = len(fit.beta)
-    asked = np.eye(size) if along is None else along
-    meat = np.zeros((size, size))
-    bread = fit.inverse @ fit.inverse.T
-    wanted = bread @ asked
-    variances = np.maximum(np.sum(asked * wanted, axis=0), np.finfo(float).tiny)
-    alone = np.zeros(len(variances))  # largest share of a white variance along a direction of one cluster alone
-    lengths, images = np.zeros((len(clusters), len(alone))), np.zeros((len(clusters), size, len(alone)))
-    for number, cluster in enumerate(clusters):
-        block = Information.sum(cluster)
-        score = block.scores(fit.beta, fit.weights)
-        W = block.stacked(fit.weights)[:-1, :-1]
-        # Leave-one-out: the score times (1 - leverage)^-1, solved in the cluster's own small space.
-        shares, U = np.linalg.eigh(W @ bread @ W.T)
+    asked = np.eye(len(fit.beta)) if along is None else along
+    return _left_out([_Whitened.of(cluster, fit) for cluster in clusters], fit, asked)
+
+
+@dataclass(frozen=True)
+class _Whitened:
+    """Hold what a cluster says, in coordinates in which all clusters together have the identity as information.
+
+    Attributes:
+        score: shape (base,).
+        share: of the information, symmetric with eigenvalues from 0 to 1, the cluster's leverages; shape (base, base).
+    """
+
+    score: Array
+    share: Array
+
+    @classmethod
+    def of(cls, cluster: Sequence[Information], fit: LeastSquares) -> _Whitened:
+        """Return what a cluster says about the parameters of a fit."""
+        A = fit.inverse
+        rows = [
+            (1.0 if fit.weights is None else fit.weights[joint]) * (factor[:, :-1] @ A[support])
+            for block in cluster
+            for joint, (support, factor) in enumerate(zip(block.supports, block.factors, strict=True))
+        ]
+        Z = np.vstack(rows)
+        scores = np.sum([block.scores(fit.beta, fit.weights) for block in cluster], axis=0)
+        return cls(A.T @ scores, Z.T @ Z)
+
+    @classmethod
+    def sum(cls, parts: Sequence[_Whitened]) -> _Whitened:
+        """Return what clusters say that count as one."""
+        return cls(np.sum([one.score for one in parts], axis=0), np.sum([one.share for one in parts], axis=0))
+
+    def of_others(self) -> tuple[Array, Array]:
+        """Return (I - share)^-1, shape (base, base), without directions that no other cluster sees, and those.
+
+        The latter are columns times the square roots of their shares, shape (base, directions).
+        """
+        size = len(self.score)
+        try:
+            X = np.linalg.inv(np.linalg.cholesky(np.eye(size) - self.share))
+        except np.linalg.LinAlgError:
+            pass
+        else:
+            # No eigenvalue of the inverse is above their sum.
+            if np.sum(X**2) < 1.0 / (1.0 - _ALONE):
+                return X.T @ X, np.zeros((size, 0))
+        shares, V = np.linalg.eigh(self.share)
         others = shares < _ALONE
-        inverse = (U[:, others] / (1.0 - shares[others])) @ U[:, others].T
-        inverse = inverse @ W
-        full = score + W.T @ (inverse @ (bread @ score))
-        meat += np.outer(full, full)
-        alone = np.maximum(alone, np.sum((U[:, ~others].T @ (W @ wanted)) ** 2, axis=0) / variances)
-        left_out = inverse @ wanted
-        lengths[number] = np.sum(left_out**2, axis=0)
-        images[number] = fit.inverse.T @ (W.T @ left_out)
+        return (V[:, others] / (1.0 - shares[others])) @ V[:, others].T, V[:, ~others] * np.sqrt(shares[~others])
+
+
+def _left_out(clusters: Sequence[_Whitened], fit: LeastSquares, asked: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return what `jackknife` does, of combinations `asked`, shape (base, combinations)."""
+    along = fit.inverse.T @ asked
+    variances = np.maximum(np.sum(along**2, axis=0), np.finfo(float).tiny)
+    alone = np.zeros(len(variances))  # largest share of a white variance along a direction of one cluster alone
+    lengths, images = np.zeros((len(clusters), len(alone))), np.zeros((len(clusters), len(along), len(alone)))
+    scores = np.zeros((len(clusters), len(along)))
+    for number, one in enumerate(clusters):
+        # Leave-one-out: the score times (1 - leverage)^-1.
+        inverse, directions = one.of_others()
+        scores[number] = one.score + one.share @ (inverse @ one.score)
+        if directions.shape[1]:
+            alone = np.maximum(alone, np.sum((directions.T @ along) ** 2, axis=0) / variances)
+        without = inverse @ along
+        images[number] = one.share @ without
+        lengths[number] = np.sum(without * images[number], axis=0)
     unseen = ~np.isfinite(fit.standard_deviations)
     blind = np.any(asked[unseen] != 0.0, axis=0) | (alone > _SEEN_ALONE)
-    return wanted.T @ meat @ wanted, _degrees(lengths, images), blind
+    projected = scores @ along
+    return projected.T @ projected, _degrees(lengths, images), blind
 
 
 def _noise(clusters: Sequence[Sequence[Information]], fit: LeastSquares) -> Array | None:

@@ -6,7 +6,6 @@ then proven for all time, made smaller where the proof needs it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -213,8 +212,11 @@ def design_motion(
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
     _require_holdable_home(model, task.limits)
-    prover = Prover(model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto)
-    found, best = _searched(task, prover, safe, seed, budget or Budget(), tell, cancelled, earlier)
+    budget = budget or Budget()
+    prover = Prover(
+        model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto, budget.clock
+    )
+    found, best = _searched(task, prover, safe, seed, budget, tell, cancelled, earlier)
     limits = motion_limits(model.config)
     if best.result is None and best.candidate.start >= 0:
         gains = _gains(best, (), limits, stable)
@@ -256,10 +258,10 @@ def _searched(
     earlier: SearchResult | None,
 ) -> tuple[SearchResult, Attempt]:
     """Search, prove, and spend what time is left on what the proof objects to, or else on searching on."""
-    begun, per = time.monotonic(), per_period(task.basis)
+    begun, per = budget.clock(), per_period(task.basis)
 
     def left() -> float:
-        return np.inf if budget.seconds is None else budget.seconds - (time.monotonic() - begun)
+        return np.inf if budget.seconds is None else budget.seconds - (budget.clock() - begun)
 
     def part(share: float) -> Budget:
         return budget if budget.seconds is None else replace(budget, seconds=share * budget.seconds)

@@ -62,6 +62,7 @@ class Prover:
         torque_margin: float,
         value: Callable[[Array], float],
         veto: Callable[[FourierPath | PosturePath], str | None],
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take an arm.
 
@@ -72,9 +73,10 @@ class Prover:
             torque_margin: share of the torque that motions keep free.
             value: the criterion of a motion's coefficients, to be made small.
             veto: what else speaks against a motion of which everything is proven, in words.
+            clock: of the search's budget [s].
         """
         self._model, self._task, self._safe, self._margin = model, task, safe, torque_margin
-        self._value, self._veto = value, veto
+        self._value, self._veto, self._clock = value, veto, clock
         self._limits, self._collision = motion_limits(model.config), CollisionModel(model)
 
     def proof(self, coefficients: Array) -> tuple[Proof, str]:
@@ -149,10 +151,10 @@ class Prover:
             harder, whole = self._harder(latest), latest.candidate.coefficients
             if harder is None or not self.proof(self._scaled(whole, _NEARLY))[1]:
                 break  # there is nothing to search for, or hardly anything to gain by it
-            until = None if seconds is None else time.monotonic() + seconds
+            until = None if seconds is None else self._clock() + seconds
 
             def over(until: float | None = until) -> bool:
-                return cancelled() or (until is not None and time.monotonic() >= until)
+                return cancelled() or (until is not None and self._clock() >= until)
 
             found = polished(harder, whole, self.safe(harder), candidate.start, per_period, over)
             tried.append(self._at_full_size(harder, found))

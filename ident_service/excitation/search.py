@@ -249,14 +249,16 @@ class Budget:
     """Limits of time and of random starts that end a search; at least one of both.
 
     Attributes:
-        seconds: of wall time.
+        seconds: by the clock.
         starts: random starts.
         workers: processes; with one, the search runs in the calling process.
+        clock: time that passes [s]: `time.process_time` counts the work of one worker, however busy the machine is.
     """
 
     seconds: float | None = 60.0
     starts: int | None = None
     workers: int = 2
+    clock: Callable[[], float] = time.monotonic
 
     def __post_init__(self) -> None:
         if self.seconds is None and self.starts is None:
@@ -265,6 +267,8 @@ class Budget:
             raise UsageError(
                 f"{self.workers=} and {self.starts=}: a search needs one worker or more, and no fewer than 0 starts"
             )
+        if self.workers > 1 and self.clock is not time.monotonic:
+            raise UsageError("several workers share the machine's monotonic clock only; give one worker")
 
 
 @dataclass(frozen=True)
@@ -331,7 +335,7 @@ def search(
     Raises:
         SolverError: a worker process died before anything was found.
     """
-    begun = time.monotonic()
+    begun = budget.clock()
     run = _Run(task, safe, seed, budget, begun, tell, cancelled, earlier)
     with _crew(task, safe, seed, budget, per_period, cancelled) as crew:
         run.starts(crew)
@@ -400,7 +404,7 @@ class _Run:
         self._polished: set[int] = set()
 
     def found(self) -> SearchResult:
-        elapsed = self._before + time.monotonic() - self._begun
+        elapsed = self._before + self._budget.clock() - self._begun
         return SearchResult(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
     def has_time_for_starts(self) -> bool:
@@ -410,7 +414,7 @@ class _Run:
 
     def starts(self, crew: _WorkerPool) -> None:
         """Run starts in a share of the time that is left, or as many as are asked for."""
-        seconds, now = self._budget.seconds, time.monotonic()
+        seconds, now = self._budget.seconds, self._budget.clock()
         until = None if seconds is None else now + _STARTS_SHARE * (self._begun + seconds - now)
         last = None if self._budget.starts is None else self._first + self._budget.starts
         running: set[Future[Candidate]] = set()
@@ -440,14 +444,14 @@ class _Run:
                 self._take(candidate)
 
     def _over(self, until: float | None) -> bool:
-        return self._broken or self._cancelled() or (until is not None and time.monotonic() >= until)
+        return self._broken or self._cancelled() or (until is not None and self._budget.clock() >= until)
 
     def _finished_of(self, crew: _WorkerPool, running: set[Future[Candidate]], phase: str) -> list[Candidate]:
         if self._cancelled():
             crew.interrupt()
         done, _ = wait(running, timeout=_TICK, return_when=FIRST_COMPLETED)
         running -= done
-        elapsed = time.monotonic() - self._begun
+        elapsed = self._budget.clock() - self._begun
         best = self._best[0].value if self._best else None
         self._tell(Progress(phase, self._finished, best, elapsed, self._remaining(elapsed)))
         try:
@@ -480,7 +484,7 @@ def _crew(
     task: Task, safe: Array, seed: int, budget: Budget, per_period: int, cancelled: Callable[[], bool]
 ) -> Iterator[_WorkerPool]:
     if budget.workers == 1:
-        worker = _Worker(task, safe, seed, per_period, cancelled)
+        worker = _Worker(task, safe, seed, per_period, cancelled, budget.clock)
 
         def here(number: int, candidate: Candidate | None, until: float | None) -> Future[Candidate]:
             future: Future[Candidate] = Future()
@@ -504,16 +508,24 @@ def _crew(
 class _Worker:
     """Problems and seed of one worker process, made once."""
 
-    def __init__(self, task: Task, safe: Array, seed: int, per_period: int, stopped: Callable[[], bool]) -> None:
+    def __init__(
+        self,
+        task: Task,
+        safe: Array,
+        seed: int,
+        per_period: int,
+        stopped: Callable[[], bool],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._coarse, self._fine = Problem(task, per_period), Problem(task, _FINER * per_period)
         self._safe = task.basis.standing(safe)
-        self._seed, self._stopped = seed, stopped
+        self._seed, self._stopped, self._clock = seed, stopped, clock
 
     def work(self, number: int, candidate: Candidate | None, until: float | None) -> Candidate:
-        """Run one start, or the polish of a candidate, cut short at the time `until` of the monotonic clock."""
+        """Run one start, or the polish of a candidate, cut short at the time `until` of the clock."""
 
         def check() -> None:
-            if self._stopped() or (until is not None and time.monotonic() >= until):
+            if self._stopped() or (until is not None and self._clock() >= until):
                 raise Interrupted
 
         problem = self._coarse if candidate is None else self._fine

@@ -84,6 +84,18 @@ def likely_bodies(model: ArmModel) -> LikelyBodies:
     return LikelyBodies(delta, _drives(model, delta), "geometry" if guessed else "prior", names)
 
 
+def likely_load(mass: float, center: Array) -> Array:
+    """Return the inertial parameters of a compact load, a ball about its centre of mass, shape (10,), see `INERTIAL`.
+
+    Args:
+        mass: of the load [kg].
+        center: of its mass, in the link's frame [m], shape (3,).
+    """
+    r = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
+    L = mass * ((0.4 * r**2 + center @ center) * np.eye(3) - np.outer(center, center))
+    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(mass * center), mass])
+
+
 def with_file_bodies(model: ArmModel) -> ArmModel:
     """Return the model with every body of its URDF or MJCF as its prior, also those that no real link could have."""
     kinematics = model.config.kinematics

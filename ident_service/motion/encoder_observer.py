@@ -15,13 +15,20 @@ fed forward and `M_jj (a - a_0)_j` with M the control law's inertia and a the fe
 what other joints' corrections do to it. A joint whose estimated displacement d is more than its encoder's steps can
 hide is not where its encoder says. A jammed joint looks the same, and so does one whose dry friction is far larger than
 configuration says.
+
+Where drives move several joints, encoders count the drives' motion d = C q. One that is frozen leaves its joints the
+motion of the other drives, so that none of them stands still. Such drives are observed as joints are, with their own
+torque C^-T tau and inertia (C^-T M C^-1)_kk.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from drivers.arm import Counts, Flags, Vector
+from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.expected_friction import expected_friction
@@ -32,6 +39,79 @@ from ident_service.model.pinocchio_models import InverseDynamics
 STANDING, SLIDING = 3.0, 1.0
 SLID = 20  # cycles within which a second step in the same direction shows that a joint slides
 HIDDEN_SHARE, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
+_SAME = 1e-9  # rad or m, by which a drive's position that did not change may seem to: positions are computed back
+
+
+@dataclass(frozen=True)
+class EncoderCoordinates:
+    """Coordinates in which encoders may stand still: every joint, then every drive that moves several joints.
+
+    Attributes:
+        motions: turns velocities of joints into those of the drives, shape (drives, joints).
+        torques: turns torques of joints into those of the drives, shape (drives, joints).
+    """
+
+    motions: Vector
+    torques: Vector
+
+    @staticmethod
+    def of(coupling: Vector | None, joints: int) -> EncoderCoordinates:
+        """Return the coordinates of an arm.
+
+        Args:
+            coupling: drive coordinates per joint coordinates, shape (joints, joints); each joint's own drive when None.
+            joints: number of joints.
+        """
+        if coupling is None:
+            return EncoderCoordinates(np.zeros((0, joints)), np.zeros((0, joints)))
+        shared = np.sum(coupling != 0.0, axis=1) > 1
+        return EncoderCoordinates(coupling[shared], np.linalg.inv(coupling).T[shared])
+
+    def steps(self, position: Vector, before: Vector) -> Vector:
+        """Return by how much each has changed [rad or m], shape (joints + drives,)."""
+        change = position - before
+        if not len(self.motions):
+            return np.asarray(change)
+        with np.errstate(invalid="ignore"):  # positions that are not finite are not valid either
+            drives = self.motions @ change
+        return np.concatenate([change, np.where(np.abs(drives) > _SAME, drives, 0.0)])
+
+    def valid(self, valid: Flags) -> Flags:
+        """Return which are known, from the joints whose positions are valid."""
+        if not len(self.motions):
+            return valid
+        return np.append(valid, (valid | (self.motions == 0.0)).all(axis=1))
+
+    def velocities(self, of_joints: Vector) -> Vector:
+        """Return velocities or accelerations of joints in these coordinates, shape (joints + drives,)."""
+        return np.append(of_joints, self.motions @ of_joints) if len(self.motions) else of_joints
+
+    def forces(self, of_joints: Vector) -> Vector:
+        """Return torques of joints in these coordinates [N m or N], shape (joints + drives,)."""
+        return np.append(of_joints, self.torques @ of_joints) if len(self.torques) else of_joints
+
+    def largest_motions(self, of_joints: Vector) -> Vector:
+        """Return what motions of at most so much each can come to, shape (joints + drives,)."""
+        return np.append(of_joints, np.abs(self.motions) @ of_joints)
+
+    def largest_forces(self, of_joints: Vector) -> Vector:
+        """Return the torque that a drive gives when one joint alone needs so much, the most of its joints."""
+        drives = np.abs(self.torques) * of_joints
+        return np.append(of_joints, drives.max(axis=1, initial=0.0))
+
+    def inertias(self, mass_matrix: Vector) -> Vector:
+        """Return the inertia that each has while the others stand [kg m^2 or kg], shape (joints + drives,)."""
+        own = np.diag(mass_matrix)
+        if not len(self.torques):
+            return own
+        return np.append(own, np.einsum("dj,jk,dk->d", self.torques, mass_matrix, self.torques))
+
+    def at_joints(self, flags: Flags) -> Flags:
+        """Return the joints that flags concern, those of a drive all, shape (joints,)."""
+        joints = self.motions.shape[1]
+        if not len(self.motions):
+            return flags
+        return np.asarray(flags[:joints] | (flags[joints:, None] & (self.motions != 0.0)).any(axis=0))
 
 
 class FrozenEncoderObserver:
@@ -45,6 +125,7 @@ class FrozenEncoderObserver:
         friction: Vector,
         resolution: Vector,
         least: InverseDynamics | None = None,
+        coupling: Vector | None = None,
     ) -> None:
         """Start with an estimated displacement of zero.
 
@@ -52,13 +133,17 @@ class FrozenEncoderObserver:
             dynamics: the control law's model.
             limits: of the arm.
             period: of the loop [s].
-            friction: dry friction expected of each joint [N m or N], shape (joints,).
+            friction: dry friction expected of each joint, and of each drive that moves several [N m or N], shape
+                (joints + drives,).
             resolution: smallest step of the positions [rad or m], shape (joints,).
             least: the prior model; the control law's when None.
+            coupling: of the arm, as for `EncoderCoordinates.of`.
         """
         self._dynamics, self._least, self._period = dynamics, least or dynamics, period
+        self._encoders = EncoderCoordinates.of(coupling, len(resolution))
         self._standing, self._sliding = STANDING * friction, SLIDING * friction
-        self._hidden = HIDDEN_SHARE * limits.following_error + STEPS * resolution
+        hidden = HIDDEN_SHARE * limits.following_error + STEPS * resolution
+        self._hidden = self._encoders.largest_motions(hidden)
         self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
         self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
         self._base_fed = np.zeros_like(friction)
@@ -80,7 +165,7 @@ class FrozenEncoderObserver:
 
         Args:
             direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape
-                (joints,).
+                (joints + drives,).
             correction: feedback torque [N m or N], shape (joints,); all zero where no position is asked for, which
                 allows no conclusion.
             answer: feedback acceleration [rad/s^2 or m/s^2], shape (joints,).
@@ -88,10 +173,13 @@ class FrozenEncoderObserver:
             feedforward: friction in the torque [N m or N], shape (joints,).
 
         Returns:
-            Which joints should have moved farther than their encoders can hide, shape (joints,).
+            Which joints and drives should have moved farther than their encoders can hide, shape (joints + drives,).
         """
         self._cycle += 1
-        pushed = correction + feedforward
+        encoders, given = self._encoders, correction
+        fed = encoders.forces(np.broadcast_to(feedforward, correction.shape))
+        correction, answer = encoders.forces(correction), encoders.velocities(answer)
+        pushed = correction + fed
         changed = direction != 0.0
         if changed.any():
             slides = (direction == self._direction) & (self._cycle - self._stepped <= SLID)
@@ -100,21 +188,21 @@ class FrozenEncoderObserver:
             np.copyto(self._stepped, self._cycle, where=changed)
             np.copyto(self._base, pushed, where=changed)
             np.copyto(self._base_answer, answer, where=changed)
-            np.copyto(self._base_fed, feedforward, where=changed)
+            np.copyto(self._base_fed, fed, where=changed)
         change = pushed - self._base
         allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
         if not (np.abs(change) > allowed).any():
             self._reset_estimate()
             return self._none
-        if not correction.any():
+        if not given.any():
             self._base, self._base_answer = correction.copy(), answer.copy()
             self._base_fed = np.zeros_like(correction)
             self._reset_estimate()
             return self._none
-        inertia = np.diag(self._dynamics.mass_matrix(position))
-        own = np.sign(change) * (inertia * (answer - self._base_answer) + feedforward - self._base_fed)
+        inertia = encoders.inertias(self._dynamics.mass_matrix(position))
+        own = np.sign(change) * (inertia * (answer - self._base_answer) + fed - self._base_fed)
         push = np.minimum(np.abs(change), own) - allowed
-        acting, gained = push > 0.0, push / np.diag(self._least.mass_matrix(position)) * self._period
+        acting, gained = push > 0.0, push / encoders.inertias(self._least.mass_matrix(position)) * self._period
         self._speed = np.where(acting, self._speed + gained, 0.0)
         self._way = np.where(acting, self._way + self._speed * self._period, 0.0)
         self._owing = True
@@ -129,9 +217,20 @@ def frozen_encoder_observer(
     dynamics: InverseDynamics, model: ArmModel, limits: MotionLimits, period: float, resolution: Vector
 ) -> FrozenEncoderObserver:
     """Create the frozen-encoder observer of an arm; dry friction is the prior's, at least the configuration's guess."""
-    guess = model.config.design.friction_guess
-    expected = expected_friction(model, limits, guess).at_joints(model.chain).coulomb
-    least = None if model.prior is None else InverseDynamics(model.chain, model.layout, model.prior)
-    return FrozenEncoderObserver(
-        dynamics, limits, period, np.maximum(expected, guess[0] * limits.torque), resolution, least
-    )
+    guess, chain = model.config.design.friction_guess, model.chain
+    joints = np.maximum(expected_friction(model, limits, guess).at_joints(chain).coulomb, guess[0] * limits.torque)
+    coupling = encoder_coupling(model.config)
+    # The friction of joints that slide while a drive of theirs stands balances there: the sum would be too much.
+    friction = EncoderCoordinates.of(coupling, chain.joints).largest_forces(joints)
+    least = None if model.prior is None else InverseDynamics(chain, model.layout, model.prior)
+    return FrozenEncoderObserver(dynamics, limits, period, friction, resolution, least, coupling)
+
+
+def encoder_coupling(config: ArmConfig) -> Vector | None:
+    """Return the motion of the encoders per motion of the joints, shape (joints, joints), where encoders are at drives.
+
+    None where each joint has its own drive. Whether friction and inertia are the drives' (`drive_terms`) is another
+    question: encoders at shared drives count the drives' motion in any case.
+    """
+    gears = config.transmission
+    return None if gears is None or gears.coupling is None else np.array(gears.coupling, dtype=float)

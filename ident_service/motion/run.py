@@ -35,7 +35,7 @@ from ident_service.motion.control_loop import REST_CYCLES, REST_SPEED, Loop, Pea
 from ident_service.motion.control_loop import Sink as Sink
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines, longest_stall
-from ident_service.motion.encoder_observer import frozen_encoder_observer
+from ident_service.motion.encoder_observer import encoder_coupling, frozen_encoder_observer
 from ident_service.motion.faults import FAULTS, HOLD, ActiveFaults
 from ident_service.motion.lowering import lowest_point
 from ident_service.motion.run_plan import ExcitationPlan, Plan
@@ -363,6 +363,7 @@ class _Run:
             owed=owed,
             max_age=described.lost_cycles,
             most_torque=(1.0 + NOT_APPLIED) * limits.torque if described.streams_position else None,
+            coupling=encoder_coupling(model.config),
         )
         friction = friction_feedforward(model, limits)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home, friction)

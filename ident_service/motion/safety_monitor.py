@@ -1,7 +1,5 @@
 """Judge every sample before the next torque leaves, and every torque before it leaves.
 
-Called only when `safety_monitor.py` has found that some threshold is violated.
-
 Nearly all cycles are healthy, so all thresholds are compared at once, in one array. Only when one of them is violated
 is each compared by itself and put into words. NaN violates every threshold.
 """
@@ -17,7 +15,7 @@ from drivers.arm import Counts, Flags, Sample, Vector
 from drivers.axis_status import TRIPPED, AxisEvent, AxisStatus
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.collision import Contact
-from ident_service.motion.encoder_observer import FrozenEncoderObserver
+from ident_service.motion.encoder_observer import EncoderCoordinates, FrozenEncoderObserver
 from ident_service.motion.faults import Fault, FaultCounter
 from ident_service.motion.faults import Reaction as Reaction
 from ident_service.motion.trajectory import Setpoint
@@ -264,6 +262,7 @@ class SafetyMonitor:
         owed: FrozenEncoderObserver | None = None,
         max_age: int = MAX_AGE,
         most_torque: Vector | None = None,
+        coupling: Vector | None = None,
     ) -> None:
         """Start with the arm standing at a position.
 
@@ -279,6 +278,8 @@ class SafetyMonitor:
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
             most_torque: for drives that are given positions: the torque above which what they measure is a warning
                 [N m or N], shape (joints,); None for drives that are given torques.
+            coupling: drive coordinates per joint coordinates, shape (joints, joints): a drive that moves several joints
+                can stand still, too; each joint's own drive when None.
         """
         joints = len(position)
         self.findings = FaultCounter()
@@ -292,10 +293,13 @@ class SafetyMonitor:
         self._position = self._shown = position.copy()
         self._age: Counts = np.zeros(joints, dtype=np.int64)
         self._jumps: Counts = np.zeros(joints, dtype=np.int64)
-        self._still: Counts = np.zeros(joints, dtype=np.int64)
-        self._unchanged: Counts = np.zeros(joints, dtype=np.int64)
-        self._sudden = np.zeros(joints, dtype=bool)
-        self._owes: Flags = np.zeros(joints, dtype=bool)
+        encoders = self._encoders = EncoderCoordinates.of(coupling, joints)
+        self._fast = SUDDEN_SPEED * encoders.largest_motions(limits.velocity)
+        self._push = FROZEN_EFFORT * encoders.largest_forces(limits.torque)
+        self._still: Counts = np.zeros(len(self._push), dtype=np.int64)
+        self._unchanged: Counts = np.zeros(len(self._push), dtype=np.int64)
+        self._sudden = np.zeros(len(self._push), dtype=bool)
+        self._owes: Flags = np.zeros(len(self._push), dtype=bool)
         self._all_fresh = self._none_still = self._all_change = True
         self._depths = np.zeros(len(self._pairs))
         self._sent: Vector | None = None
@@ -310,7 +314,6 @@ class SafetyMonitor:
         self._healthy: tuple[int, ...] = ()
         self._was_powered = np.zeros(joints, dtype=bool)
         self._jump = JUMP * limits.velocity * period
-        self._push = FROZEN_EFFORT * limits.torque
         self._not_applied = NOT_APPLIED * limits.torque
         together = np.eye(joints, dtype=bool) if limits.motors is None else limits.motors.together
         self._joined = together @ together.T  # which joints share motors
@@ -360,11 +363,14 @@ class SafetyMonitor:
         self.findings.cycle += 1
         self._elapsed, self._known = self._period if elapsed is None else elapsed, known
         answered = bool(sample.valid.all())
-        self._count_stationary_cycles(sample, np.maximum(np.abs(correction + feedforward), np.abs(unexplained)))
-        self._count_unchanged(sample, velocity)
+        encoders = self._encoders
+        steps, valid = encoders.steps(sample.position, self._shown), encoders.valid(sample.valid)
+        own = np.abs(encoders.forces(np.broadcast_to(unexplained, correction.shape)))
+        pushed = np.maximum(np.abs(encoders.forces(correction + feedforward)), own)
+        self._count_stationary_cycles((steps != 0.0) & valid, pushed)
+        self._count_unchanged((steps == 0.0) & valid, velocity)
         if self._owed is not None and answer is not None:
-            up, down = sample.position > self._shown, sample.position < self._shown
-            direction = np.where(sample.valid, up * 1.0 - down, 0.0)
+            direction = np.where(valid, (steps > 0.0) * 1.0 - (steps < 0.0), 0.0)
             self._owes = self._owed.update(direction, correction, answer, self._position, feedforward)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
@@ -575,23 +581,20 @@ class SafetyMonitor:
             Check("torque_unexplained", long, "the drive measures {} {f} beside the model's, of {}", numbers)
         )
 
-    def _count_stationary_cycles(self, sample: Sample, pushes: Vector) -> None:
+    def _count_stationary_cycles(self, changed: Flags, pushes: Vector) -> None:
         """Count for how many cycles each position has stood still while the controller, or the drive, pushed."""
         pushed = pushes > self._push
         if pushed.any():
-            changed = sample.valid & (sample.position != self._shown)
             self._still = np.where(pushed & ~changed, self._still + 1, 0)
             self._none_still = False
         elif not self._none_still:
             self._still = np.zeros_like(self._still)
             self._none_still = True
 
-    def _count_unchanged(self, sample: Sample, velocity: Vector) -> None:
+    def _count_unchanged(self, same: Flags, velocity: Vector) -> None:
         """Count for how many cycles each position has stood still, and note whether that began in full motion."""
-        same = sample.position == self._shown
         if same.any():
-            same &= sample.valid
-            fast = np.abs(velocity) > SUDDEN_SPEED * self._limits.velocity
+            fast = np.abs(self._encoders.velocities(velocity)) > self._fast
             self._sudden = np.where(self._unchanged == 0, same & fast, self._sudden)
             self._unchanged = np.where(same, self._unchanged + 1, 0)
             self._all_change = False
@@ -600,9 +603,10 @@ class SafetyMonitor:
             self._all_change = True
 
     def _frozen(self) -> Flags:
-        """Return which encoders stand still although the joint cannot."""
+        """Return the joints of encoders that stand still although their joint, or drive, cannot."""
         frozen, sudden = self._frozen_after
-        return (self._still >= frozen) | (self._sudden & (self._unchanged >= sudden)) | self._owes
+        flags = (self._still >= frozen) | (self._sudden & (self._unchanged >= sudden)) | self._owes
+        return self._encoders.at_joints(flags)
 
     def _found(self, check: Check) -> Fault:
         return self.findings.found(check.code, describe_check(check, self._names, self._units))

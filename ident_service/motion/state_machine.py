@@ -72,8 +72,8 @@ class StateMachine:
     def enter(self, wanted: State) -> None:
         """Enter another state.
 
-        ArmError: no transition leads there, a mistake of the program; or an unacknowledged fault forbids it.
-            ArmError: no lawful way leads there, a mistake of the program; or a latched fault stands in it.
+        Raises:
+            ArmError: no transition leads there, a mistake of the program; or an unacknowledged fault forbids it.
         """
         if wanted not in TRANSITIONS[self.state]:
             raise ArmError(f"no transition from {self.state.value} to {wanted.value}")

@@ -230,12 +230,16 @@ class Ticket:
 
     @property
     def verdict(self) -> Verdict:
-        """Return FAILED where one check failed, else NEEDS_PERSON where one does, else PASSED."""
+        """Return FAILED where one check failed, else NEEDS_PERSON where one does, else PASSED.
+
+        Without an indispensable check it is FAILED, too: `valid_for` would allow nothing.
+        """
         found = {check.verdict for check in self.checks}
         for worse in (Verdict.FAILED, Verdict.NEEDS_PERSON):
             if worse in found:
                 return worse
-        return Verdict.PASSED
+        made = all(Verdict.PASSED in self._verdicts(code) for code in INDISPENSABLE)
+        return Verdict.PASSED if made else Verdict.FAILED
 
     def _verdicts(self, code: str) -> set[Verdict]:
         return {check.verdict for check in self.checks if check.code == code}

@@ -93,6 +93,38 @@ def planned_configuration(
     return tuple(planned)
 
 
+def planned_zero(
+    config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_links
+) -> tuple[PlannedDrive, ...]:
+    """Return what setting the present posture as home would write into an arm's drives, by SDO uploads alone.
+
+    Args:
+        config: of the arm.
+        open_bus: gives the links, in the order of the buses.
+
+    Raises:
+        UsageError: the arm has no CANopen drives.
+        DriverError: their encoders know their position, or as `planned_configuration`.
+    """
+    driver = require_drives(config)
+    if (zeros := zeros_of(config)) is None:
+        raise DriverError(f"{config.name}: its encoders know their position (driver.zero: absolute); no home is set")
+    planned = []
+    with asking(config, open_bus) as (_, links, heard):
+        for number, drive in enumerate(driver.drives):
+            objects, refused = DryRunObjects(links[drive.bus], drive.node, hearing(heard, drive.bus)), ""
+            try:
+                _require_off(objects)
+                zeros.require_volatile_storage(objects)
+                zeros.keep(objects, number, objects.read(od.POSITION))
+            except BusError:
+                raise
+            except DriverError as error:
+                refused = str(error)
+            planned.append(PlannedDrive(number + 1, drive.node, tuple(objects.changes), refused))
+    return tuple(planned)
+
+
 def _fixed(sheet: DataSheet) -> frozenset[int]:
     return frozenset(key for key, entry in sheet.entries.items() if not entry.writable)
 
@@ -314,9 +346,9 @@ def imported_document(config: ArmConfig, found: Sequence[ImportedDrive], *, dry:
     }
 
 
-def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive]) -> str:
-    """Format a dry run as text, with a last line break."""
-    lines = [f"{config.name}: what opening would write; nothing was written, and nothing moved"]
+def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive], what: str = "opening") -> str:
+    """Format a dry run of something, in words, as text, with a last line break."""
+    lines = [f"{config.name}: what {what} would write; nothing was written, and nothing moved"]
     for one in planned:
         lines += ["", f"drive {one.number}, node {one.node}: {_count(one)}", *_change_lines(one.changes)]
         lines += [f"  {'REFUSED':<16}{one.refused}"] if one.refused else []

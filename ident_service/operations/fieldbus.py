@@ -461,7 +461,8 @@ def _of_drive(driver: CanopenDriver, number: int, objects: Objects) -> Probed:
 
 
 def _of_file(driver: CanopenDriver, number: int, file: TextFile) -> Probed:
-    mistake = data_sheet(file.text).mistake
+    sheet = data_sheet(file.text)
+    mistake = sheet.mistake or ("" if sheet.entries else "it lists no object")
     why = f"is no EDS: {mistake}" if mistake else ""
     return Probed(file.name, driver.drives[number].node, why, _capabilities_from_sheet(driver, number, file))
 
@@ -532,7 +533,8 @@ def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"
     facts["torque_frames"] = f"{shares}, as far as its file and family know"
-    facts["status_reports"] = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    by_itself = "on change and by timer" if can.event else f"every {found.status_syncs} SYNCs"
+    facts["status_reports"] = "with each position" if can.beside else by_itself
     if (brake := can.family.brake) is not None:
         held = can.found.get(parse_entry(brake, ""))
         facts["brake"] = f"{named(brake)}, set up by the maker's tool: {'not known' if held is None else held}"
@@ -574,6 +576,7 @@ def _document(one: Probed, found: Probe) -> dict[str, Any]:
             "shares": can.shares,
             "dummies": list(can.dummies),
             "status_timer": can.event,
+            "status_with_position": can.beside,
             "problems": [{"where": problem.where, "why": problem.why} for problem in can.problems],
             "changes": [{"where": change.where, "why": change.why} for change in can.changes],
             "missing": list(can.notes),
@@ -615,20 +618,6 @@ def keep_outcome(path: Path, document: dict[str, Any]) -> list[str]:
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, json.dumps({"format": _KEPT_FORMAT, "version": 1, "drives": known}, indent=1) + "\n")
     return words
-
-
-# The rest of a probe is what the description makes of it.
-_OF_THE_DRIVE = (
-    "family",
-    "firmware",
-    "mode",
-    "target",
-    "count",
-    "torque_limit",
-    "speed_limit",
-    "watchdogs",
-    "status_timer",
-)
 
 
 # The rest of a probe is what the description makes of it.

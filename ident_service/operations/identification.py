@@ -155,7 +155,10 @@ def identify_files(
     found = list[tuple[Recording, Quality]]()
     for count, recording in enumerate(opened.recordings):
         step(f"looking at {recording.path.name}", 0.1 + 0.1 * count / len(opened.recordings))
-        found.append((recording, recording_quality(recording, model)))
+        found.append((recording, seen := recording_quality(recording, model)))
+        if all(joint.torque[0] == joint.torque[1] for joint in seen.joints):
+            reason = "the torque of every joint is always the same; were other columns meant, or was it not recorded?"
+            raise RecordingError(recording.path, reason)
     warnings = opened.remarks
     warnings += tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     # Replicates take 0.05 s each, reduction a third of the rest; neither is known better before.

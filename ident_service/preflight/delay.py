@@ -15,6 +15,7 @@ import numpy as np
 from drivers.arm import Vector
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.zero_phase import local_polynomial
+from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.ticket import Measure, measure
 from ident_service.preflight.session import Session, Trace
 
@@ -22,6 +23,7 @@ FREQUENCY = 15.0  # Hz: high enough for a phase, low enough for an amplitude of 
 _LEAST_SAMPLES = 10.0  # a period of the sine; a slower loop would take it for motion of its own
 _SPEED = 0.03  # rad/s or m/s, of the motion's 0.2, so that the joint goes on sliding
 _TORQUE = 0.05  # of the limit, at most
+CALM = 0.3  # of the fastest change of torque that the guard lets pass: friction learned and control need theirs
 _SLIDING = 0.3  # of the largest speed asked for, above which the joint is taken to slide
 _WINDOW = 0.02  # s, of the filter that differentiates: the sine must pass
 _STEPS, _FARTHEST = 4, 0.005  # s a step
@@ -45,7 +47,9 @@ def dither(session: Session, limits_torque: Vector, joint: int) -> Vector:
     """Return the amplitude of a sinusoidal torque on one joint [N m or N], (joints,); zero in too slow a loop."""
     if FREQUENCY * session.period > 1.0 / _LEAST_SAMPLES:
         return np.zeros(len(limits_torque))
-    size = min(_TORQUE * limits_torque[joint], _SPEED * session.inertia[joint, joint] * 2.0 * np.pi * FREQUENCY)
+    pace = 2.0 * np.pi * FREQUENCY
+    calm = CALM * min(TORQUE_RATE, TORQUE_RATE_SHARE * limits_torque[joint]) / pace
+    size = min(_TORQUE * limits_torque[joint], _SPEED * session.inertia[joint, joint] * pace, calm)
     return np.where(np.arange(len(limits_torque)) == joint, size, 0.0)
 
 

@@ -31,6 +31,7 @@ from ident_service.model.expected_friction import ExpectedFriction
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Elapsed
+from ident_service.motion.encoder_observer import encoder_coupling
 from ident_service.motion.run import MOVED
 from ident_service.motion.safety_monitor import Reaction, SafetyMonitor
 from ident_service.motion.trajectory import Reference, Setpoint
@@ -211,6 +212,7 @@ class Session:
             revolute=model.chain.revolute,
             max_age=described.lost_cycles,
             most_torque=np.minimum(np.abs(self.gravity) + self._band, limits.torque) if self.gives_positions else None,
+            coupling=encoder_coupling(model.config),
         )
         self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         self._since = Elapsed(period)

@@ -16,7 +16,7 @@ from drivers.arm import Arm, Flags, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisStatus
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure, skipped
+from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure
 from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.session import Session
 from ident_service.preflight.static_checks import LONGEST_SILENCE
@@ -67,7 +67,8 @@ def confirm_watchdog_test(model: ArmModel, sample: Sample, confirm: Confirm) -> 
     """
     if not sample.status:
         why = "the driver does not report drive states, so the watchdogs cannot be tested"
-        return Consent(False, skipped(CODE, why, "Test it by hand: pull the bus cable while the arm is supported."))
+        remedy = "Nothing moves without this proof: have the driver report the state of each drive in `Sample.status`."
+        return Consent(False, failed(CODE, why, remedy))
     name = model.config.name
     typed = confirm(
         f"The drives' own watchdog is tried at the end, at rest and in a small motion: they hear no more of what "

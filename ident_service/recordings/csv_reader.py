@@ -82,6 +82,8 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
         raise RecordingError(path, "is empty; expected a header t,q1..qN,tau1..tauN")
     if len(names) > _MOST_COLUMNS:
         raise RecordingError(path, f"line 1: {len(names)} columns; a recording has {_MOST_COLUMNS} at most")
+    if wrong := _no_header(header, names):
+        raise RecordingError(path, f"line 1: {wrong}")
     problems = [f"column {name!r} appears twice" for name, count in sorted(Counter(names).items()) if count > 1]
     if columns is None:
         place = {name: index for index, name in enumerate(names)}
@@ -92,8 +94,8 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     for name in place:
         if match := _NAME.fullmatch(name):
             numbers[match[1]].add(int(match[2]))
-        elif name != "t":
-            problems.append(f"unknown column {name!r}")
+    if unknown := [name for name in place if name != "t" and not _NAME.fullmatch(name)]:
+        problems.append(f"unknown {_listed('column', [repr(name) for name in unknown])}")
     if "t" not in place:
         problems.append("no column 't' (time in seconds)")
     joints = max((number for found in numbers.values() for number in found), default=0)
@@ -102,10 +104,9 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     for kind, found in numbers.items():
         missing = [f"{kind}{number}" for number in range(1, joints + 1) if number not in found]
         if missing and (found or kind != "dq"):
-            more = f" and {len(missing) - 8} more" if len(missing) > 8 else ""
-            problems.append(f"missing {', '.join(missing[:8])}{more}")
+            problems.append(f"missing {_listed('', missing)}")
     if problems:
-        raise RecordingError(path, f"line 1: {'; '.join(problems)}; expected a header t,q1..qN,tau1..tauN")
+        raise RecordingError(path, f"line 1: {'; '.join(problems)}; {_what_then(names, columns)}")
 
     def indices(kind: str) -> NDArray[np.intp]:
         return np.array([place[f"{kind}{number}"] for number in range(1, joints + 1)], np.intp)
@@ -127,6 +128,35 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
         nanoseconds=nanoseconds,
         scale=None if (scale == 1.0).all() else scale,
         used=tuple(sorted(place.values())),
+    )
+
+
+def _no_header(header: str, names: Sequence[str]) -> str:
+    """Return what is wrong with a first line that is no header at all; empty where it may be one."""
+    if names and all(_is_number(name) for name in names):
+        return "is numbers; put a line with the names of the columns above it: t,q1..qN,tau1..tauN"
+    if header.lstrip().startswith(("#", "%")) and "," in header:
+        return "is a comment; remove what stands before the names of the columns"
+    separators = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+    if len(names) == 1:
+        for separator, words in separators.items():
+            if separator in header.strip():
+                return f"columns are separated by {words}; separate them by commas, and write decimals with points"
+    return ""
+
+
+def _listed(what: str, names: Sequence[str], most: int = 8) -> str:
+    plural = f"{what}{'s' if len(names) > 1 else ''} " if what else ""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"{plural}{', '.join(names[:most])}{more}"
+
+
+def _what_then(names: Sequence[str], columns: Mapping[str, Column] | None) -> str:
+    if columns is not None:
+        return f"the file has the {_listed('column', names, 40)}"
+    return (
+        "expected a header t,q1..qN,tau1..tauN, or the names of these columns in recording.columns of the description"
+        " (or --columns): columns: {t: NAME, q1: NAME, tau1: NAME, ...}"
     )
 
 

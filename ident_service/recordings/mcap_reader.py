@@ -145,11 +145,11 @@ class JointStateDecoder:
         self._others = others
         self._velocity = velocity
 
-    def decode(self, payloads: Sequence[bytes], log_times: Sequence[int]) -> Block:
+    def decode(self, payloads: Sequence[bytes] | NDArray[np.uint8], log_times: Sequence[int] | Stamps) -> Block:
         """Decode payloads in order.
 
         Args:
-            payloads: JointState messages.
+            payloads: JointState messages; of those of one length also as rows, shape (messages, bytes).
             log_times: [ns], for those whose header has no stamp.
 
         Raises:
@@ -161,13 +161,10 @@ class JointStateDecoder:
         velocity: Matrix = np.empty((n, joints))
         effort: Matrix = np.empty((n, joints))
         used = np.zeros(n, np.bool_)
-        lengths = np.fromiter(map(len, payloads), np.int64, n)
-        for length in np.unique(lengths):
-            left = np.flatnonzero(lengths == length)
-            rows = np.frombuffer(b"".join([payloads[int(i)] for i in left]), np.uint8).reshape(len(left), length)
+        for left, rows in _by_length(payloads):
             for _ in range(_MAX_LAYOUTS):
                 try:
-                    layout = Layout.parse(payloads[left[0]])
+                    layout = Layout.parse(rows[0].tobytes())
                     order = self._order(layout)
                 except PayloadError as error:
                     raise PayloadError(str(error), int(left[0])) from error
@@ -207,6 +204,32 @@ class JointStateDecoder:
         if self._velocity and layout.velocity is None:
             raise PayloadError("has no velocity where the first has one")
         return np.array([layout.names.index(name) for name in self._names], np.intp)
+
+
+def _joined(payloads: Sequence[bytes | NDArray[np.uint8]]) -> list[bytes] | NDArray[np.uint8]:
+    """Return payloads as rows, shape (payloads, bytes), where they are of one length, else one by one."""
+    lengths = {len(one) if isinstance(one, bytes) else one.shape[1] for one in payloads}
+    parts = [one if isinstance(one, bytes) else one.tobytes() for one in payloads]
+    if len(lengths) == 1 and (length := lengths.pop()):
+        return np.frombuffer(b"".join(parts), np.uint8).reshape(-1, length)
+    whole: list[bytes] = []
+    for one, data in zip(payloads, parts, strict=True):
+        whole += [data] if isinstance(one, bytes) else [row.tobytes() for row in one]
+    return whole
+
+
+def _by_length(
+    payloads: Sequence[bytes] | NDArray[np.uint8],
+) -> Iterator[tuple[NDArray[np.intp], NDArray[np.uint8]]]:
+    """Yield of payloads of each length their places and their bytes, shape (payloads, bytes)."""
+    if isinstance(payloads, np.ndarray):
+        yield np.arange(len(payloads)), payloads
+        return
+    lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    for length in np.unique(lengths):
+        places = np.flatnonzero(lengths == length)
+        joined = b"".join([payloads[int(i)] for i in places])
+        yield places, np.frombuffer(joined, np.uint8).reshape(len(places), length)
 
 
 _EVENTS: Final = "/events"
@@ -554,20 +577,24 @@ class McapRecording:
         return stamps, layout.columns(rows, layout.effort, order)
 
     def _pieces(self, samples: int) -> Iterator[Block]:
-        payloads: list[bytes] = []
+        waiting: list[bytes | NDArray[np.uint8]] = []
         log_times: list[int] = []
         read = 0
-        for log_time, payload in self._payloads():
-            payloads.append(payload)
-            log_times.append(min(log_time, _MAX_STAMP))
-            if len(payloads) == max(samples, 1):
-                yield self._decode(payloads, log_times, read)
-                read += len(payloads)
-                payloads, log_times = [], []
-        if payloads:
-            yield self._decode(payloads, log_times, read)
+        for found in self._series():
+            if isinstance(found, mcap.Series):
+                waiting.append(found.payloads)
+                log_times.extend(np.minimum(found.log_times, _MAX_STAMP).tolist())
+            else:
+                waiting.append(found[2])
+                log_times.append(min(found[1], _MAX_STAMP))
+            if len(log_times) >= max(samples, 1):
+                yield self._decode(_joined(waiting), log_times, read)
+                read += len(log_times)
+                waiting, log_times = [], []
+        if waiting:
+            yield self._decode(_joined(waiting), log_times, read)
 
-    def _decode(self, payloads: Sequence[bytes], log_times: Sequence[int], before: int) -> Block:
+    def _decode(self, payloads: Sequence[bytes] | NDArray[np.uint8], log_times: Sequence[int], before: int) -> Block:
         try:
             block = self._decoder.decode(payloads, log_times)
         except PayloadError as error:
@@ -581,6 +608,16 @@ class McapRecording:
         self, directory: mcap.Directory | None = None, topic: str | None = None
     ) -> Iterator[tuple[int, bytes]]:
         """Yield log time [ns] and payload of each message on a topic (None: that of the states), up to the damage."""
+        for found in self._series(directory, topic):
+            if isinstance(found, mcap.Series):
+                yield from zip(found.log_times.tolist(), map(np.ndarray.tobytes, found.payloads), strict=True)
+            else:
+                yield found[1], found[2]
+
+    def _series(
+        self, directory: mcap.Directory | None = None, topic: str | None = None
+    ) -> Iterator[mcap.Message | mcap.Series]:
+        """Yield what `_payloads` does, with many at once where they repeat."""
         directory, topic = directory or mcap.Directory(), topic or self._topic
 
         def choose(channel_id: int) -> bool:
@@ -588,8 +625,7 @@ class McapRecording:
 
         try:
             for run in self._contents():
-                for _, log_time, payload in mcap.messages(run, directory, choose):
-                    yield log_time, payload
+                yield from mcap.series(run, directory, choose)
         except mcap.TornError as error:
             self._tear(error)
         except (mcap.TooLargeError, OSError) as error:

@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from io import BytesIO
-from typing import IO, Any, Final
+from typing import IO, Any, Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from numpy.typing import NDArray
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD: Final = 64 << 20
@@ -27,9 +29,26 @@ _MESSAGE: Final = struct.Struct("<BQHIQQ")
 _MESSAGE_HEAD: Final = struct.Struct("<BQH")
 _A_MESSAGE: Final = int(Opcode.MESSAGE)
 _MESSAGE_FIELDS: Final = _MESSAGE.size - _HEAD.size
+_LOG_TIME: Final = _MESSAGE_HEAD.size + 4  # where it stands in a message record
+_LONGEST: Final = 64  # records that a period may have
+_FEW: Final = 8  # repetitions, below which looking for them costs more than it saves
 CONTENTS: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE, Opcode.CHANNEL, Opcode.SCHEMA})
 
 Message = tuple[int, int, bytes]
+
+
+class Series(NamedTuple):
+    """Hold messages of one channel that have one length.
+
+    Attributes:
+        channel: its id.
+        log_times: [ns], shape (messages,).
+        payloads: shape (messages, bytes).
+    """
+
+    channel: int
+    log_times: NDArray[np.uint64]
+    payloads: NDArray[np.uint8]
 
 
 class TornError(Exception):
@@ -136,7 +155,25 @@ def expand(content: bytes) -> bytes:
 
 
 def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True) -> Iterator[Message]:
-    """The messages in a run of records; channels and schemas go into `directory`.
+    """Yield the messages in a run of records one by one, as `series` finds them.
+
+    Yields:
+        Channel id, log time [ns], payload.
+    """
+    for found in series(run, directory, choose):
+        if isinstance(found, Series):
+            for stamp, row in zip(found.log_times.tolist(), found.payloads, strict=True):
+                yield found.channel, stamp, row.tobytes()
+        else:
+            yield found
+
+
+def series(
+    run: bytes, directory: Directory, choose: Callable[[int], bool] = lambda _: True
+) -> Iterator[Message | Series]:
+    """Yield the messages in a run of records; channels and schemas go into `directory`.
+
+    Where records repeat in kind, length and channel, as those of a loop do, all of them are found at once.
 
     Args:
         run: of records.
@@ -144,16 +181,30 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
         choose: which channels to read, asked at each one's first message.
 
     Yields:
-        Channel id, log time [ns], payload.
+        Channel id, log time [ns] and payload; or several of one channel at once.
 
     Raises:
         TornError: the bytes cannot be records.
     """
     position, end, chosen = 0, len(run), directory.chosen
     head, unpack = _HEAD.size, _MESSAGE_HEAD.unpack_from  # three messages a cycle: what is looked up here counts
+    # The head of the message that a period may begin with, and where its messages begin.
+    regular, first = True, b""
+    begins: list[int] = []
     try:
         while position < end:
             if run[position] == _A_MESSAGE:
+                if regular and run[position : position + _MESSAGE_HEAD.size] == first:
+                    last, begins = begins, []
+                    slots = [at for at in last if chosen[unpack(run, at)[2]]]
+                    count = _repeats(run, last, position) if len(slots) < 2 else 0
+                    regular = count >= _FEW
+                    first = b""
+                    if slots and count:
+                        yield _gathered(run, slots[0] - last[0], position, position - last[0], count)
+                    position += count * (position - last[0])
+                    if count:
+                        continue
                 _, length, channel = unpack(run, position)
                 begin = position
                 position += head + length
@@ -161,6 +212,10 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
                     raise TornError("a chunk ends within a message")
                 if (wanted := chosen.get(channel)) is None:
                     wanted = chosen[channel] = choose(channel)
+                if regular:
+                    if not first or len(begins) == _LONGEST:
+                        first, begins = run[begin : begin + _MESSAGE_HEAD.size], []
+                    begins.append(begin)
                 if wanted:
                     log_time = _MESSAGE.unpack_from(run, begin)[4]
                     yield channel, log_time, run[begin + _MESSAGE.size : position]
@@ -170,6 +225,7 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
             position = start + length
             if position > end:
                 raise TornError("a chunk ends within a record")
+            first, begins = b"", []
             if opcode == Opcode.CHANNEL:
                 found: Channel = _parse(Channel, run[start:position])
                 directory.channels[found.id] = found
@@ -178,6 +234,25 @@ def messages(run: bytes, directory: Directory, choose: Callable[[int], bool] = l
                 directory.schemas[schema.id] = schema.name
     except struct.error as error:
         raise TornError("a chunk ends within a record") from error
+
+
+def _repeats(run: bytes, begins: Sequence[int], position: int) -> int:
+    """Return how often the messages at `begins` follow anew from `position` on, in kind, length and channel."""
+    period = position - begins[0]
+    rows = np.frombuffer(run, np.uint8, (len(run) - position) // period * period, position).reshape(-1, period)
+    where = np.add.outer(np.array(begins) - begins[0], np.arange(_MESSAGE_HEAD.size)).ravel()
+    expected = np.frombuffer(run, np.uint8, period, begins[0])[where]
+    other = np.flatnonzero((rows[:, where] != expected).any(axis=1))
+    return int(other[0]) if len(other) else len(rows)
+
+
+def _gathered(run: bytes, offset: int, position: int, period: int, count: int) -> Series:
+    """Return the messages `offset` bytes from the begin of each of `count` periods from `position` on."""
+    rows = np.frombuffer(run, np.uint8, count * period, position).reshape(count, period)
+    _, length, channel = _MESSAGE_HEAD.unpack_from(run, position + offset)
+    start = offset + _MESSAGE.size
+    times = np.ascontiguousarray(rows[:, offset + _LOG_TIME : offset + _LOG_TIME + 8]).view("<u8")[:, 0]
+    return Series(channel, times, rows[:, start : offset + _HEAD.size + length])
 
 
 def metadata(content: bytes) -> Metadata:

@@ -19,7 +19,7 @@ from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.feasible.problems import feasibility_test
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares
-from ident_service.estimation.payload import KnownArm, Payload, Word, center_of_mass, loaded_covariance
+from ident_service.estimation.payload import KnownArm, Payload, Word, body_words, center_of_mass, loaded_covariance
 from ident_service.estimation.uncertainty import negligible, verdicts
 from ident_service.model.chain import Array
 from ident_service.model.parameter_layout import INERTIAL
@@ -81,6 +81,7 @@ def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recording
         else {
             "names": list(base.names[: len(INERTIAL)]),
             "values": body.delta[: len(INERTIAL)].tolist(),
+            "verdicts": list(body_words(payload)),
             "margin": body.margin,
             "p": body.p,
             "torque_share": body.torque_share.tolist(),
@@ -153,8 +154,8 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
     lines += [
         f"  {name:30s} {value:11.4g} +- {sigma:8.2g}  {verdict} [{unit}]" for name, value, sigma, verdict, unit in rows
     ]
-    shown = {name for row in payload.base.K for name, value in zip(payload.base.names, row, strict=True) if value}
-    if hidden := [name for name in payload.base.names if name not in shown]:
+    excited = {name for row in payload.base.K for name, value in zip(payload.base.names, row, strict=True) if value}
+    if hidden := [name for name in payload.base.names if name not in excited]:
         lines.append(f"  not excited by any motion of this arm: {' '.join(hidden)}")
     if (center := center_of_mass(payload)) is not None and payload.verdict in ("added", "removed"):
         point = ", ".join(f"{value:.4g} +- {sigma:.2g}" for value, sigma in zip(*center, strict=True))
@@ -163,11 +164,16 @@ def payload_text(payload: Payload, arm: KnownArm) -> str:
         worst = int(np.argmax(payload.body.torque_share))
         lines += [
             "",
-            f"the nearest physical body (values that no motion determines: the smallest), p = {payload.body.p:.2g}, at "
-            f"most {payload.body.torque_share[worst]:.2%} of the torque of joint {names[worst]} away",
+            f"the nearest physical body, p = {payload.body.p:.2g}, at most {payload.body.torque_share[worst]:.2%} of "
+            f"the torque of joint {names[worst]} away",
         ]
-        body = zip(payload.base.names, rounded(payload.body.delta[: len(INERTIAL)]), strict=False)
-        lines.append("  " + "  ".join(f"{name} {value:.4g}" for name, value in body))
+        values, words = rounded(payload.body.delta[: len(INERTIAL)]), body_words(payload)
+        body = [f"{name} {value:.4g}" for name, value in zip(payload.base.names, values, strict=False)]
+        shown = [text for text, word in zip(body, words, strict=True) if word != "chosen"]
+        lines.append("  " + "  ".join(shown))
+        if len(shown) < len(body):
+            chosen = "  ".join(text for text, word in zip(body, words, strict=True) if word == "chosen")
+            lines.append(f"  not identified, chosen as a compact load of this mass has them: {chosen}")
     lines += ["", *wrapped(rows_and_filter(arm.model.config.identification))]
     return "\n".join(lines) + "\n"
 

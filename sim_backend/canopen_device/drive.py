@@ -40,7 +40,7 @@ from sim_backend.canopen_device.emergency import Emergency
 from sim_backend.canopen_device.nmt import Nmt, State
 from sim_backend.canopen_device.node import Node
 from sim_backend.canopen_device.objects import WRONG_STATE, WRONG_VALUE, Objects, SdoAbort, SdoServer
-from sim_backend.canopen_device.pdo import COMMUNICATION, MAPPING, RPDO_TIMEOUT, Pdos, check_write
+from sim_backend.canopen_device.pdo import COMMUNICATION, MAPPING, MOST_MAPPED, RPDO_TIMEOUT, Pdos, check_write
 from sim_backend.canopen_device.personality import LIKE_NEW, DriveProperties, Firmware
 from sim_backend.emulator.face import Traffic
 from sim_backend.emulator.motor import Motor
@@ -136,7 +136,7 @@ class PositionLoop:
         assert self._line is not None  # noqa: S101 - set by the caller
         first, last, since_ns = self._line
         number, power = self._objects.number(0x60C2, 1), self._objects.number(0x60C2, 2)
-        period = number * 10.0**power or 1e-3
+        period = number * 10.0 ** min(max(power, -9), 9) or 1e-3
         share = (now_ns - since_ns) * 1e-9 / period
         return (last, 0.0) if share >= 1.0 else (first + share * (last - first), (last - first) / period)
 
@@ -168,8 +168,7 @@ class TorqueLoop:
         number = self._objects.number
         values = self._objects.values
         cyclic = number(0x6061) in self._personality.modes
-        target = self._personality.target
-        asked = number(target >> 8, target & 0xFF) + number(0x60B2) if cyclic else 0
+        asked = self._personality.asked(self._objects) + number(0x60B2) if cyclic else 0
         if follows := number(0x6061) == _CSP and 0x607A00 in self._objects.entries:
             count = self._personality.torque(1.0, self._objects)
             most, self._motor.holds = self._personality.reach(self._objects) * count, True
@@ -205,9 +204,8 @@ class TorqueLoop:
         self._sum, self._told_ns = 0.0, now_ns
 
     def _exceeds_max_speed(self, demand: int, now_ns: int) -> bool:
-        speed = self._motor.speed(now_ns)
-        limited = 0x608000 in self._objects.entries
-        return limited and speed * demand > 0.0 and abs(speed) * _RPM > self._objects.number(0x6080)
+        speed, most = self._motor.speed(now_ns), self._personality.fastest(self._objects)
+        return most is not None and speed * demand > 0.0 and abs(speed) * _RPM > most
 
 
 _RAMP = "ramp"
@@ -577,7 +575,7 @@ class CanopenDrive:
             return Traffic.HEARTBEAT
         for number, index in enumerate(COMMUNICATION[1]):
             if self.objects.number(index, 1) & 0x7FF == frame.identifier:
-                entries = range(1, self.objects.number(MAPPING[1][number]) + 1)
+                entries = range(1, min(self.objects.number(MAPPING[1][number]), MOST_MAPPED) + 1)
                 keys = [self.objects.number(MAPPING[1][number], k) >> 8 for k in entries]
                 return Traffic.FEEDBACK if _POSITION in keys else Traffic.OTHER
         return Traffic.OTHER

@@ -21,8 +21,11 @@ Value = int | bytes
 
 # Data types of CiA 301, table 44, that are numbers here.
 _FORMATS = {0x01: "?", 0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I"}
-_BYTES = {0x08: 4, 0x11: 8, 0x15: 8, 0x1B: 8}  # of numbers that are none here
+# Bytes of those that are none.
+_BYTES = {0x08: 4, 0x0C: 6, 0x0D: 6, 0x10: 3, 0x11: 8, 0x12: 5, 0x13: 6, 0x14: 7, 0x15: 8, 0x16: 3}
+_BYTES |= {0x18: 5, 0x19: 6, 0x1A: 7, 0x1B: 8}
 _VISIBLE_STRING = 0x09
+_OF_NO_NUMBER = 4  # bytes of what the firmware keeps in an entry whose type is none of a number
 # Store and restore themselves, the mark of a configuration, and commands.
 _NOT_STORED = (0x1010, 0x1011, 0x1020, 0x2030, 0x6040, 0x6060, 0x6071, 0x607A, 0x60B2)
 _FIRST, _HEARTBEAT_CONSUMERS = 0x1000, 0x1016
@@ -149,8 +152,15 @@ class Objects:
         if not entry.readable:
             raise SdoAbort(WRITE_ONLY)
         self.before_read(key)
+        return self.packed(key)
+
+    def packed(self, key: int) -> bytes:
+        """Return the bytes of an entry; of what its type does not hold, the lower ones, as drives have them."""
         value = self.values[key]
-        return value if isinstance(value, bytes) else struct.pack(f"<{entry.form}", value)
+        if isinstance(value, bytes):
+            return value
+        size = self.entries[key].size or _OF_NO_NUMBER
+        return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """Set a value by a host's download; raises SdoAbort, and then nothing has changed."""

@@ -31,6 +31,7 @@ INVALID = 1 << 31
 EXTENDED = 1 << 29
 COMMUNICATION = (range(0x1400, 0x1404), range(0x1800, 0x1804))
 MAPPING = (range(0x1600, 0x1604), range(0x1A00, 0x1A04))
+MOST_MAPPED = 64  # entries of a PDO (CiA 301, 1600h): of one bit each
 # Identifiers that are no PDO's (CiA 301, table 24).
 _RESTRICTED = (
     range(0x080),
@@ -69,7 +70,7 @@ def layout(objects: Objects, index: int, count: int | None = None) -> Layout:
     """
     receives = index in MAPPING[0]
     form, keys = "<", []
-    for subindex in range(1, (objects.number(index) if count is None else count) + 1):
+    for subindex in range(1, min(objects.number(index) if count is None else count, MOST_MAPPED) + 1):
         entry = objects.number(index, subindex)
         key, bits = entry >> 8, entry & 0xFF
         if receives and key & 0xFF == 0 and bits and objects.dummies.get(key >> 8, 0) * 8 == bits:
@@ -316,8 +317,11 @@ class Pdos:
         self._received(rpdo.layout.keys)
 
     def _packed(self, tpdo: _Sent) -> bytes:
-        values = self._node.objects.values
-        return tpdo.layout.packing.pack(*[values[key] for key in tpdo.layout.keys])
+        objects, keys = self._node.objects, tpdo.layout.keys
+        try:
+            return tpdo.layout.packing.pack(*[objects.values[key] for key in keys])
+        except struct.error:  # the file gives an entry a type that does not hold what the firmware keeps there
+            return b"".join(map(objects.packed, keys))
 
     def _layout(self, index: int) -> Layout | None:
         """Return the layout of a PDO, None for one that maps nothing and so does not exist."""

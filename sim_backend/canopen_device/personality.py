@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from drivers.canopen.capabilities import TORQUE_UNITS, family_of, parse_entry
+from drivers.canopen import object_dictionary as od
+from drivers.canopen.capabilities import family_of, parse_entry, speed_size, torque_unit
 from ident_service.config.canopen import CanopenDrive
-from ident_service.config.drive_family import Family, TorqueUnit
+from ident_service.config.drive_family import Family, TorquePath, TorqueUnit
 from ident_service.config.eds import DataSheet, data_sheet
 from sim_backend.canopen_device.node import Node
 from sim_backend.canopen_device.objects import Objects
@@ -38,7 +39,12 @@ class DriveProperties:
     Attributes:
         modes: of operation in which it follows a torque, as 6061h tells them.
         target: key of the entry that takes the torque.
-        limits: keys of what limits it, in counts, or in thousandths of the second key's value.
+        shift: bits by which counts are shifted in it.
+        needs: values of entries, by key, without which no torque follows the target.
+        enabling: bits of the control word without which none does either.
+        limits: keys of what limits it, in counts, or in thousandths of the second key's value, and the number that the
+            entry's value is taken from.
+        speed: key of what limits its speed, and how many of its unit a turn per minute is; None for nothing.
         rated: key of what a thousandth is of; None where a count is `scale`.
         scale: N m per unit of `rated`, or per count.
         shipped: whether it is the shipped data sheet's drive: it does at once what frames ask for, and has the
@@ -49,7 +55,11 @@ class DriveProperties:
 
     modes: tuple[int, ...] = (10,)
     target: int = 0x607100
-    limits: tuple[tuple[int, int | None], ...] = ((0x607200, None), (0x607300, None))
+    shift: int = 0
+    needs: tuple[tuple[int, int], ...] = ()
+    enabling: int = 0
+    limits: tuple[tuple[int, int | None, int | None], ...] = ((0x607200, None, None), (0x607300, None, None))
+    speed: tuple[int, float] | None = (0x608000, 1.0)
     rated: int | None = 0x607600
     scale: float = 1e-3
     shipped: bool = True
@@ -59,12 +69,27 @@ class DriveProperties:
     def reach(self, objects: Objects) -> int:
         """Return the largest torque that the drive's limits let through [counts]."""
         found = [0x7FFF]
-        for key, per in self.limits:
+        for key, per, below in self.limits:
             if key in objects.entries:
                 value = objects.number(key >> 8, key & 0xFF)
+                value = value if below is None else max(below - value, 0)
                 whole = 1000 if per is None else objects.number(per >> 8, per & 0xFF)
                 found.append(1000 * value // whole if whole else 0)
         return min(found)
+
+    def asked(self, objects: Objects) -> int:
+        """Return the torque that the target asks for [counts]; none while the drive does not follow it."""
+        follows = objects.number(0x6040) & self.enabling == self.enabling
+        if not follows or any(objects.number(key >> 8, key & 0xFF) != value for key, value in self.needs):
+            return 0
+        return objects.number(self.target >> 8, self.target & 0xFF) >> self.shift
+
+    def fastest(self, objects: Objects) -> float | None:
+        """Return the speed above which no torque acts that leads faster [turns per minute]; None for none."""
+        if self.speed is None or self.speed[0] not in objects.entries:
+            return None
+        key, size = self.speed
+        return objects.number(key >> 8, key & 0xFF) / size
 
     def torque(self, counts: float, objects: Objects) -> float:
         """Convert counts of torque to [N m]."""
@@ -90,28 +115,44 @@ def personality_of(text: str, drive: CanopenDrive, families: Sequence[Family] = 
     paths = [path for path in family.torque if sheet.has(_key(path.target) >> 8)]
     unit = family.unit or TorqueUnit(rated="6076:0/u32", unit="mNm")
     constant = drive.torque_constant or _SOME_CONSTANT
-    scale = TORQUE_UNITS[unit.unit] * (constant if unit.unit == "mA" else 1.0) * (unit.count or 1.0)
-    limits = {(_key(one.entry), None if one.per is None else _key(one.per)) for one in family.torque_limit}
+    scale = torque_unit(unit, drive.model_copy(update={"torque_constant": constant})) * (unit.count or 1.0)
+    limits = {(_key(one.entry), None if one.per is None else _key(one.per), one.below) for one in family.torque_limit}
+    path = paths[0] if paths else TorquePath(mode=10, target="6071:0/i16")
     amperes = drive.rated_torque / constant
     motor = {0x607500: round(1e3 * amperes), 0x607600: round(1e3 * drive.rated_torque)}
     if unit.rated is not None:
         motor[_key(unit.rated)] = round(drive.rated_torque / scale)
     return DriveProperties(
         modes=tuple(path.mode for path in paths),
-        target=_key(paths[0].target) if paths else 0x607100,
+        target=_key(path.target),
+        shift=path.shift,
+        needs=tuple((_key(text), value) for text, value in path.writes.items()),
+        enabling=path.enabling,
+        speed=_speed(family, sheet, drive),
         limits=tuple(sorted(limits, key=str)),
         rated=None if unit.rated is None else _key(unit.rated),
         scale=scale,
         shipped=False,
-        motor=(*_unspecified(sheet, [key for key, _ in limits]), *motor.items()),
+        motor=(*_unspecified(sheet, [key for key, _, below in limits if below is None]), *motor.items()),
         mode_when_on=family.mode_shown == "switched_on",
     )
+
+
+def _speed(family: Family, sheet: DataSheet, drive: CanopenDrive) -> tuple[int, float] | None:
+    """Return the entry that limits the speed, and its unit; of those of its family the first that the file lists."""
+    unit = sheet.entries.get(od.VELOCITY_UNIT.key)
+    told = None if unit is None else unit.number(drive.node)
+    for text in family.speed_limit:
+        if _key(text) in sheet.entries and (size := speed_size(parse_entry(text, ""), told, drive)) is not None:
+            return _key(text), size
+    return None
 
 
 def _unspecified(sheet: DataSheet, limits: list[int]) -> list[tuple[int, int]]:
     """Return values that every drive has, for entries that the file lists without a value."""
     modes = sum(1 << mode - 1 for mode, needs in _MODES.items() if all(sheet.has(index) for index in needs))
     values = [(0x100000, _SERVO), (0x650200, modes), (0x608F02, 1), (0x608000, 0xFFFF), (0x608500, 0xFFFF)]
+    values += [(0x607F00, 0x7FFF_FFFF)]
     values += [(0x101800 | sub, number) for sub, number in sheet.identity.items()]
     values += [(key, 0xFFFF) for key in limits]
     return [(key, value) for key, value in values if key in sheet.entries and not sheet.entries[key].number(0)]

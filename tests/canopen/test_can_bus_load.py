@@ -208,10 +208,10 @@ def test_drives_share_frames_only_where_their_eds_says_so(arms: Path, eds: str) 
 @pytest.mark.parametrize(
     ("eds", "why"),
     [
-        ("", "it has no section"),
-        ("no EDS at all", "File contains no section headers"),
-        ("\x00\x01", "File contains no section headers"),
-        ("[FileInfo]\nA=1\n", "it has no section"),
+        ("", "it lists no object"),
+        ("no EDS at all", "it lists no object"),
+        ("\x00\x01", "it lists no object"),
+        ("[FileInfo]\nA=1\n", "it lists no object"),
     ],
 )
 def test_what_is_no_eds_is_refused_however_torques_are_sent(arms: Path, eds: str, why: str, frames: str) -> None:

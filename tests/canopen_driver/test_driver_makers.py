@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of
+from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of, sheet
 from test_driver_watchdogs import Bench as HeldBench
 
 from drivers.arm import StopKind
@@ -14,6 +15,7 @@ from drivers.axis_status import AxisStatus
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from ident_service.motion.ticket import Verdict
+from ident_service.operations.fieldbus import bus_probe, probe_text
 
 ZERO = np.zeros(2)
 # Without 1029h:01; they leave `operational` when they miss their host.
@@ -294,3 +296,114 @@ def test_a_drive_that_takes_no_type_of_torque_frames_is_refused() -> None:
     objects.values[key] = 5
     with pytest.raises(DriverError, match=r"node 2: setting 1400h:02"):
         bench.arm.open()
+
+
+def entry(key: int, kind: int, value: int) -> str:
+    """A plain variable of a data sheet, writable and mappable."""
+    head = f"\n[{key >> 8:04X}]\nObjectType=7\nDataType={kind:#x}\nAccessType=rww\n"
+    return f"{head}PDOMapping=1\nDefaultValue={value}\n"
+
+
+def without(text: str, *indices: str) -> str:
+    return re.sub(rf"(?ims)^\[({'|'.join(indices)})(sub\w+)?\].*?(?=^\[|\Z)", "", text)
+
+
+CONSTANT, UNIT = 0.05, 2.0 * 10.0 / 65520.0  # N m/A; A a count, of a drive with a peak current of 10 A
+IPOS = {
+    "torque_constant": CONSTANT,
+    "current_unit": UNIT,
+    "torque_shift": 16,
+    "rated_torque": round(1e9 * CONSTANT * UNIT) * 1e-6,
+    "max_torque": 0.1,
+}
+
+
+def ipos(**drive: Any) -> ArmConfig:
+    """An anonymous drive's file as an iPOS would have it: 201Ch of 32 bits, 201Dh and 207Fh, and no 6071h nor 6080h."""
+    text = sheet("e35.eds")["text"].replace("VendorNumber=101", "VendorNumber=0x1A3")
+    head, tail = text.split("[1018sub1]")
+    text = head + "[1018sub1]" + tail.replace("DefaultValue=0xFF", "DefaultValue=0x1A3", 1)
+    text = without(text, "6060", "6071", "6072", "6073", "6080", "6075", "6076")
+    text += entry(0x606000, 2, 0) + entry(0x201C00, 4, 0) + entry(0x201D00, 6, 0) + entry(0x207F00, 6, 0)
+    return arm_of("e35.eds", text=text, drive=IPOS | drive)
+
+
+def test_torques_of_32_bits_act_once_the_mode_has_what_it_needs() -> None:
+    """As Technosoft's iPOS takes them: 201Ch = counts << 16, 201Dh = 1, mode -5, bit 4 of the control word."""
+    bench = Bench(ipos())
+    with bench.arm as arm:
+        objects = [face.objects for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]
+        assert [one.number(0x201D) for one in objects] == [1, 1]
+        # 207Fh holds how far the limit is below 32767 counts.
+        assert [one.number(0x207F) for one in objects] == [32767 - int(100.0 / IPOS["rated_torque"])] * 2
+        arm.enable()
+        enabled = [frame for frame in bench.taps[0].sent if 0x300 < frame.identifier < 0x380 and frame.data[0] & 8]
+        assert {frame.data[:2] for frame in enabled} == {b"\x1f\x00"}
+        asked = np.array([0.02, -0.03])
+        for _ in range(20):
+            sample = arm.exchange(asked)
+        np.testing.assert_allclose(sample.torque, asked, atol=CONSTANT * UNIT)
+        torques = bench.behind.emulator.body.truth(bench.behind.clock.now_ns()).torque
+        np.testing.assert_allclose(torques, sample.torque, rtol=1e-3)
+        frames = [frame for frame in bench.taps[0].sent if 0x200 < frame.identifier < 0x280]
+        assert {len(frame.data) for frame in frames} == {4}
+        most = arm.exchange(np.array([9.0, -9.0])).torque
+        np.testing.assert_allclose(most, [0.1, -0.1], rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"torque_shift": None}, r"drives.torque_shift: 201Ch takes 32 bits: set it to 16"),
+        ({"torque_shift": 0}, r"drives.torque_shift: 201Ch takes 32 bits: set it to 16"),
+        ({"current_unit": None}, r"drives.current_unit: a count is in the drive's own unit of current: give it"),
+        ({"rated_torque": 0.15, "max_torque": 0.2}, r"wrong by 9.8"),
+    ],
+)
+def test_what_a_description_lacks_for_them_is_told_before_anything_is_written(
+    changes: dict[str, Any], words: str
+) -> None:
+    bench = Bench(ipos(**changes), ipos())
+    with pytest.raises(DriverError, match=rf"node 1: cannot be driven \(Technosoft iPOS\): .*{words}"):
+        bench.arm.open()
+    assert bench.downloads() == []
+
+
+def test_a_target_of_16_bits_is_not_sent_in_32() -> None:
+    bench = Bench(arm_of("e35.eds", drive={"torque_shift": 0}), arm_of("e35.eds"))
+    with pytest.raises(DriverError, match=r"drives.torque_shift: 6071h takes 16 bits: leave it out"):
+        bench.arm.open()
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_turn"),
+    [
+        (None, 65536 / 60),  # counts per second, by the standard
+        (0x00B44700, 1.0),  # turns per minute
+        (0xFDB44700, 1000.0),  # thousandths of them
+        (0x00B40300, 1 / 60),  # turns per second
+        (0x00B50300, 65536 / 60),
+        (0x00123400, None),  # nobody knows
+    ],
+)
+def test_a_drive_without_6080h_limits_its_speed_by_607fh_in_its_own_unit(
+    unit: int | None, per_turn: float | None
+) -> None:
+    text = without(sheet("e35.eds")["text"], "6080", "60A9")
+    text += "" if unit is None else entry(0x60A900, 7, unit)
+    config = arm_of("e35.eds", text=text, drive={"max_speed": 12.0})
+    bench = Bench(config)
+    text = probe_text(config, bus_probe(config, (), Bench(config).links))  # type: ignore[arg-type]
+    assert ("speed limit     607Fh" if per_turn else "speed limit     set by the host") in text
+    with bench.arm as arm:
+        faces = bench.behind.emulator.faces
+        held = [face.objects.number(0x607F) for face in faces]  # type: ignore[attr-defined]
+        assert held == [100_000 if per_turn is None else max(1, round(12.0 * per_turn))] * 2
+        arm.enable()
+        torque = np.array([2.0, 0.0])
+        speeds = []
+        for _ in range(900) if per_turn and held[0] > 1 else ():
+            arm.exchange(torque)
+            speeds.append(abs(bench.behind.emulator.body.truth(bench.behind.clock.now_ns()).velocity[0]))
+        if speeds:  # 12 turns per minute are 1.257 rad/s, which the 1 N m that 6073h leaves reach in 1.3 s
+            assert max(speeds) == pytest.approx(1.257, rel=0.02)

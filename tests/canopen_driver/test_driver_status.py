@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
-from helpers.emulated_arms import Tapped, tapped, weightless_config
+from helpers.emulated_arms import EDS, Tapped, tapped, weightless_config
 from pydantic import ValidationError
 
-from drivers.axis_status import AxisEvent, AxisEventCode
+from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.can.can_frame import Frame
+from drivers.canopen.bus_load import budget
 from drivers.canopen.driver import CanopenArm
+from ident_service.config.arm import ArmConfig
+from ident_service.errors import DriverError
 from sim_backend.emulator.lock_step import LockStepArm
 
 ZERO = np.zeros(2)
@@ -122,3 +127,73 @@ def test_a_drive_without_position_limits_is_none_the_worse() -> None:
     with CanopenArm(config, lambda _: tapped(behind, config)) as arm:
         arm.enable()
         arm.exchange(ZERO)
+
+
+def without(text: str, *indices: str) -> str:
+    """A data sheet without some objects."""
+    return re.sub(rf"(?ims)^\[({'|'.join(indices)})(sub\w+)?\].*?(?=^\[|\Z)", "", text)
+
+
+ONE_TPDO = without(EDS, "1801", "1A01")
+
+
+def of_one_tpdo(**driver: Any) -> ArmConfig:
+    """Drives whose files have one TPDO."""
+    file = {"name": "one_tpdo.eds", "text": ONE_TPDO}
+    emulation = {"truth": {"m1": 0.5, "Lxx1": 0.1, "Lyy1": 0.1, "Lzz1": 1.0, "m2": 1.0}}
+    return weightless_config(**{"eds": file, "emulation": emulation} | driver)
+
+
+@pytest.mark.parametrize("measured", ["status", "cyclic", "none"])
+def test_a_drive_with_one_tpdo_tells_its_status_beside_its_position(measured: str) -> None:
+    config = of_one_tpdo(measured_torque=measured)
+    taps = tapped(behind := LockStepArm(config), config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        lengths = {len(frame.data) for frame in behind_frames(arm, taps)}
+        assert lengths == {6 if measured == "none" else 8}
+        arm.enable()
+        assert [event for _, event in told(arm, 0.5)] == []
+        behind.emulator.faces[1].fail(0x4310, behind.clock.now_ns())
+        arm.exchange(ZERO)  # no inhibit time holds it back
+        assert arm.drive_status()[1] & AxisStatus.FAULT
+        assert not arm.drive_status()[0] & AxisStatus.FAULT
+        measures = arm.exchange(ZERO).measured_torque
+        assert (measures is None) is (measured == "none")
+    with CanopenArm(config, lambda _: tapped(behind, config)) as arm:
+        assert arm.describe().report_delay == 0.0
+
+
+def behind_frames(arm: CanopenArm, taps: list[Tapped]) -> list[Frame]:
+    """What the drives send as their position in some cycles."""
+    found: list[Frame] = []
+    for tap in taps:
+        tap.misses = lambda frame: 0x180 < frame.identifier < 0x200 and bool(found.append(frame))
+    for _ in range(3):
+        arm.exchange(None)
+    for tap in taps:
+        tap.misses = lambda frame: False
+    return found
+
+
+def test_drives_of_which_one_turns_out_to_have_no_second_tpdo_say_what_to_write() -> None:
+    """The file promises it; the drive has the last word, and nothing has been written."""
+    config, real = weightless_config(), of_one_tpdo()
+    taps = tapped(LockStepArm(real), config)
+    with pytest.raises(DriverError, match=r"driver.status.frame: 1801h:01 is missing, .*: set it to position"):
+        CanopenArm(config, lambda _: taps).open()
+    assert not [frame for frame in taps[0].sent if 0x600 < frame.identifier < 0x680 and frame.data[0] >> 5 == 1]
+    told_so = weightless_config(status={"frame": "position"})
+    with CanopenArm(told_so, lambda _: tapped(LockStepArm(of_one_tpdo()), told_so)) as arm:
+        arm.enable()
+        assert arm.exchange(ZERO).valid.all()
+
+
+def test_the_bus_budget_is_of_the_map_with_the_status_beside_the_position() -> None:
+    """FIELDBUS.md 2.2: 989 typical bits and 1130 at worst of seven drives with 6 bytes; three TPDOs less here."""
+    (own,), (beside,) = (budget(config.driver, 500.0).buses for config in (weightless_config(), of_one_tpdo()))  # type: ignore[arg-type]
+    assert "status reports" in [line.name for line in own.lines]
+    assert "status reports" not in [line.name for line in beside.lines]
+    (line,) = [line for line in beside.lines if line.name == "positions with status"]
+    assert line.length == 8
+    plain = next(line for line in own.lines if line.name == "positions")
+    assert line.load.worst > 1.3 * plain.load.worst

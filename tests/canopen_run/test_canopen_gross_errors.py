@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
+from canopen_run_bench import canopen, described, write
 
 from drivers.canopen.driver import CanopenArm
 from ident_service.config.arm import ArmConfig
@@ -26,6 +29,12 @@ def wam(ratio: float = 1.0, **drives: dict[str, Any]) -> ArmConfig:
     for name, changes in drives.items():
         tree["driver"]["drives"][int(name[1:]) - 1] |= changes
     return ArmConfig.model_validate(tree)
+
+
+def small(folder: Path) -> ArmConfig:
+    """Two joints behind a differential and two drives."""
+    tree = canopen(described("small", 250.0, 225.0, 30.0), {"interface": "lock_step"}, 2)
+    return load_arm(write(folder, tree))
 
 
 def checked(told: ArmConfig, real: ArmConfig, *faults: str) -> dict[str, Check]:
@@ -57,6 +66,7 @@ def test_twice_the_torque_of_motor_1_is_refused() -> None:
     assert check.reason.startswith("j1: response to torque")
 
 
+@pytest.mark.campaign
 def test_a_gear_ratio_twice_too_large_is_told_and_leads_to_the_scale() -> None:
     check = checked(wam(ratio=2.0), wam())["direction"]
     assert check.reason.startswith("j1, ")
@@ -65,8 +75,10 @@ def test_a_gear_ratio_twice_too_large_is_told_and_leads_to_the_scale() -> None:
     assert "do `ident preflight ARM --scale` before the motion: with a gear ratio configured" in check.reason
 
 
-def test_a_hidden_delay_of_a_cycle_is_refused() -> None:
-    check = checked(wam(), wam(), "hidden_delay size=0.002")["direction"]
+@pytest.mark.parametrize("make", [small, pytest.param(lambda _: wam(), marks=pytest.mark.campaign, id="wam")])
+def test_a_hidden_delay_of_a_cycle_is_refused(make: Callable[[Path], ArmConfig], tmp_path: Path) -> None:
+    arm = make(tmp_path)
+    check = checked(arm, arm, f"hidden_delay size={1.0 / arm.control.rate!r}")["direction"]
     assert check.verdict is Verdict.FAILED
     assert "hidden delay from torque to position" in check.reason
 

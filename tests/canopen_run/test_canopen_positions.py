@@ -48,7 +48,7 @@ def of_makers(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [positions, of_makers])
+@pytest.mark.parametrize("make", [pytest.param(positions, marks=pytest.mark.campaign), of_makers])
 def test_an_arm_is_checked_moved_and_identified_from_the_torque_that_its_drives_measure(
     make: Any, tmp_path: Path
 ) -> None:

@@ -12,6 +12,7 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,6 +43,8 @@ from ident_service.motion.run import keep_host_alive
 from ident_service.recordings.open import open_recording
 from ident_service.registry.state_folder import arm_folder, fault_file
 
+BEGIN_ANEW = True
+
 NAME, RATE, KP, KD = "far", 50.0, 100.0, 16.0
 DEADLINE, BRAKING = 0.2, [4.0, 2.0]
 STOPPED = "(quick stop active|switch on disabled|fault reaction active|fault)"
@@ -53,17 +56,17 @@ pytestmark = [pytest.mark.slow, pytest.mark.realtime, pytest.mark.timeout(600)]
 class Bench:
     """An arm's file and state, checked once; its drives are new for each run."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.state = folder, folder / "state"
+    def __init__(self, folder: Path, name: str = NAME, rate: float = RATE, **driver: Any) -> None:
+        self.folder, self.state, self.name, self.rate = folder, folder / "state", name, rate
         bus = {"interface": "ident_wire", "channel": channel()}
-        tree = canopen(described(NAME, RATE, KP, KD), bus, 1, torque_deadline=DEADLINE)
+        tree = canopen(described(name, rate, KP, KD), bus, 1, torque_deadline=DEADLINE, **driver)
         tree["driver"]["emulation"]["braking"] = BRAKING  # it sinks to rest in a few seconds
         self.arm = write(folder, tree)
-        self.faults = fault_file(self.state, NAME)
+        self.faults = fault_file(self.state, name)
         self._runs = 0
         for _ in range(TRIES):
             with emulated(self.arm):
-                if checked(self.arm, NAME, self.state):
+                if checked(self.arm, name, self.state):
                     return
         raise AssertionError("preflight never passed")
 
@@ -112,7 +115,8 @@ def samples(folder: Path) -> int:
     return sum(len(block.position) for block in open_recording(path, NAMES).blocks())
 
 
-def test_a_run_against_drives_in_another_process_finds_the_arms_parameters(bench: Bench, tmp_path: Path) -> None:
+def completed(bench: Bench) -> Path:
+    """The folder of a run that reached its end."""
     for _ in range(TRIES):
         with emulated(bench.arm) as drives:
             run, folder = bench.started()
@@ -127,24 +131,53 @@ def test_a_run_against_drives_in_another_process_finds_the_arms_parameters(bench
         raise AssertionError("the machine stalls all the time")
     ended = json.loads((folder / "ended.json").read_text())
     assert ended["state"] == "done"
-    assert ended["lateness"]["count"] > 9.0 * RATE  # the motion lasts 10 s
+    assert ended["lateness"]["count"] > 9.0 * bench.rate  # the motion lasts 10 s
     stood_where_it_ended(bench, folder)
-    out = tmp_path / "out"
+    return folder
+
+
+def deviations(bench: Bench, folder: Path, out: Path, torque: str) -> np.ndarray:
+    """How many of their deviations the parameters that a run finds are off."""
     assert main(["identify", str(folder / "run.mcap"), "--arm", str(bench.arm), "--out", str(out)]) == 0
-    document = json.loads((out / "parameters.json").read_text())["base_parameters"]
+    found = json.loads((out / "parameters.json").read_text())
+    assert found["torque"] == torque
+    document = found["base_parameters"]
     model = arm_model(load_arm(bench.arm))
     base = base_parameters(model.chain, model.layout)
     true = base.K @ np.array([truth().get(name, 0.0) for name in model.layout.names])
-    z = (np.array(document["values"]) - true) / np.array(document["standard_deviations"])
+    return (np.array(document["values"]) - true) / np.array(document["standard_deviations"])
+
+
+def test_a_run_against_drives_in_another_process_finds_the_arms_parameters(bench: Bench, tmp_path: Path) -> None:
+    z = deviations(bench, completed(bench), tmp_path / "out", "commanded")
     # Coulomb and viscous friction of the shoulder explain each other; each alone is up to 5.4 deviations off.
     assert np.abs(z).max() < 7.0, z
 
 
 def stood_where_it_ended(bench: Bench, folder: Path) -> None:
     """The position that the motion process kept when it had closed the arm is the last one of its recording."""
-    kept = np.array(json.loads((arm_folder(bench.state, NAME) / FILE).read_text())["position"])
+    kept = np.array(json.loads((arm_folder(bench.state, bench.name) / FILE).read_text())["position"])
     last = list(open_recording(folder / "run.mcap", NAMES).blocks())[-1].position[-1]
     assert np.abs(kept - last).max() < 0.05
+
+
+def test_drives_in_another_process_that_are_given_positions_are_moved_and_stop_without_their_host(
+    tmp_path: Path,
+) -> None:
+    """Checked first, as every arm; what it measures identifies it; a motion process that is killed ends it."""
+    bench = Bench(tmp_path, "given_positions", 100.0, streams="position")
+    z = deviations(bench, completed(bench), tmp_path / "out", "measured")
+    assert np.abs(z).max() < 7.0, z
+    with emulated(bench.arm) as drives:
+        run, _ = moving(bench, drives)
+        with run:
+            before, pid = len(drives.lines), child(run.process.pid, "motion.process")
+            assert pid is not None
+            os.kill(pid, signal.SIGKILL)
+            for node in (1, 2):
+                drives.says(rf"node {node}: operational, {STOPPED}, error 0x8250", before)
+            assert run.code() == 4
+    assert "motion_process" in bench.faults.latched()
 
 
 def test_a_run_is_refused_on_an_arm_whose_motor_stands_a_whole_turn_elsewhere(bench: Bench) -> None:

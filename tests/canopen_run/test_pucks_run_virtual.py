@@ -28,7 +28,7 @@ def arm(folder: Path, name: str, **driver: Any) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("firmware", [40, 200])
+@pytest.mark.parametrize("firmware", [pytest.param(40, marks=pytest.mark.campaign), 200])
 def test_an_arm_of_pucks_is_checked_run_and_identified(tmp_path: Path, firmware: int, capsys: Any) -> None:
     name = f"pucks{firmware}"
     path, run, out = arm(tmp_path, name, emulation={"firmware": firmware}), tmp_path / "run", tmp_path / "out"

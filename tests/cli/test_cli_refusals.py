@@ -148,7 +148,21 @@ def test_a_joint_that_never_moves(place: Path, quick: Commissioned, samples: Sam
     position = samples.position.copy()
     position[:, 1] = 0.5
     path = replace(samples, position=position).write(place / "still.csv")
-    refused(place, ident, identify(place, quick, path), 2, "elbow: never faster than")
+    words = "elbow: never faster than identification.reversal.speed (0.05 rad/s or m/s) in it, so that neither"
+    refused(place, ident, identify(place, quick, path), 2, words)
+
+
+def test_a_time_in_milliseconds(place: Path, quick: Commissioned, samples: Samples, ident: Ident) -> None:
+    path = replace(samples, time=1e3 * samples.time).write(place / "milliseconds.csv")
+    refused(place, ident, identify(place, quick, path), 2, "samples are 1 s apart: is the time not in seconds?")
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0])
+def test_torque_columns_that_never_change(
+    place: Path, quick: Commissioned, samples: Samples, ident: Ident, value: float
+) -> None:
+    path = replace(samples, torque=np.full_like(samples.torque, value)).write(place / f"torque{value:g}.csv")
+    refused(place, ident, identify(place, quick, path), 2, "the torque of every joint is always the same")
 
 
 @pytest.mark.parametrize("content", [b"", b"hello\n", b"\x00\x01\x02", b"t,q1,tau1\n"])

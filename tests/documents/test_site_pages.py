@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from documents.walk import PORT, ROOT, Block, blocks, script, walk
 
-from ident_service.motion.faults import FAULTS, Reaction
+from ident_service.motion.faults import FAULTS, HOLD, LOWER, LOWER_AFTER, Reaction
 from ident_service.motion.state_machine import TRANSITIONS
 from ident_service.motion.ticket import CODES
 from ident_service.operations.arm_checks import TITLES
@@ -107,6 +107,33 @@ def test_every_fault_has_an_entry_with_three_checks() -> None:
         assert begins is not None, code
         assert REACTIONS[begins[1]] is FAULTS[code].reaction, code
         assert re.findall(r"(?m)^(\d)\. \S", entry) == ["1", "2", "3"], code
+
+
+@pytest.mark.parametrize(
+    ("page", "heading"),
+    [
+        ("fieldbus.md", "## What the arm does at each end, and what a person must do"),
+        ("commissioning.md", "## What a person must do at each end of a motion"),
+    ],
+)
+def test_what_a_person_must_do_at_each_end_is_said_of_what_the_code_does(page: str, heading: str) -> None:
+    told = text(page).partition(heading)[2].partition("\n## ")[0]
+    rows = re.findall(r"(?m)^\| (.*) \|$", told)
+    named = {code: row for row in rows for code in re.findall(r"`(\w+)`", row.split("|")[0]) if code in FAULTS}
+    let_go = (Reaction.DAMPED_LOWERING, Reaction.TORQUE_OFF)
+    assert sorted(named) == sorted(code for code, rule in FAULTS.items() if rule.reaction in let_go)
+    for code, row in named.items():
+        if FAULTS[code].reaction is Reaction.TORQUE_OFF:
+            assert "**it falls**" in row, code
+            assert "keep out of its reach" in row or row.endswith("the same"), code
+        else:
+            assert f"lowered for {LOWER_AFTER + LOWER:g} s" in row, code
+    (stopped,) = (row for row in rows if row.startswith(("a stop, ", "`ident home` is done; a stop")))
+    assert stopped.count(f"held for {HOLD:g} s") == 2
+    assert "`ident supported ARM`" in stopped
+    (quick,) = (row for row in rows if row.startswith("quick stop"))
+    assert "**fall" in quick or "**it falls**" in quick
+    assert "upport it" in quick
 
 
 def test_every_row_of_the_preflight_is_explained() -> None:

@@ -5,16 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.emulated_arms import Tapped, tapped, weightless_config
 from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of
 
+from drivers.canopen.driver import CanopenArm
 from drivers.canopen.sdo import Change
 from ident_service.config.arm import ArmConfig
+from ident_service.errors import DriverError
 from ident_service.operations.drive_configuration import (
     PlannedDrive,
     planned_configuration,
     planned_document,
     planned_text,
+    planned_zero,
 )
+from sim_backend.canopen_device.drive import PowerState
 
 # What is tried and refused: limits and fixed entries that no upload shows.
 REFUSES = {
@@ -76,10 +81,39 @@ def test_a_drive_that_would_be_refused_is_told_so(name: str) -> None:
 
 
 def test_no_verb_that_configures_drives_lacks_it() -> None:
+    """Every verb that opens an arm, zeroes it, or writes what a person asks for."""
     from ident_service.cli import parser
 
-    for verb in ("check", "run", "rehearse", "home", "recover"):
-        assert parser().parse_args([verb, "wam7_canopen", "--dry-run"]).dry_run
+    opening = ["check A", "preflight A", "run A", "rehearse A", "home A", "recover A", "reidentify A", "driver test A"]
+    for words in (*opening, "set-home A", "bus import A one.dcf", "bus store A", "bus restore A"):
+        assert parser().parse_args([*words.split(), "--dry-run"]).dry_run, words
+
+
+def test_a_dry_run_of_zeroing_tells_the_counts_that_would_be_kept() -> None:
+    tree = weightless_config(zero="at_home").model_dump(mode="json", by_alias=True)
+    tree["joints"]["slide"]["home"] = 0.5
+    config = ArmConfig.model_validate(tree)
+    bench = Bench(config)
+    found = planned_zero(config, bench.links)  # type: ignore[arg-type]
+    assert all(frame.data[0] >> 5 in (2, 3) for frame in bench.taps[0].sent)  # uploads alone
+    assert [(change.entry.index, change.entry.sub) for change in found[0].changes] == [(0x1020, 1), (0x1020, 2)]
+    assert planned_text(config, found, "setting home").startswith("weightless: what setting home would write; nothing")
+    taps: list[Tapped] = []
+
+    def links(one: ArmConfig) -> list[Tapped]:
+        taps[:] = tapped(bench.behind, one)
+        return taps
+
+    CanopenArm(config, links).zero()
+    held = [face.objects.number(0x1020, sub) for face in bench.behind.emulator.faces for sub in (1, 2)]  # type: ignore[attr-defined]
+    assert held == [change.after & 0xFFFF_FFFF for one in found for change in one.changes]
+    face = bench.behind.emulator.faces[1]
+    face.power.state = PowerState.OPERATION_ENABLED  # type: ignore[attr-defined]
+    face.warn(False, bench.behind.clock.now_ns())  # which tells its state anew
+    (_, second) = planned_zero(config, bench.links)  # type: ignore[arg-type]
+    assert "only changed while it is off" in second.refused
+    with pytest.raises(DriverError, match="no home is set"):
+        planned_zero(weightless_config(), bench.links)  # type: ignore[arg-type]
 
 
 def test_the_command_refuses_arms_without_drives(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

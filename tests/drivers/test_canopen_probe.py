@@ -244,13 +244,6 @@ def test_makers_without_a_file_at_hand_are_emulated_by_what_their_family_says(na
         np.testing.assert_allclose(torques, sample.torque, rtol=1e-6, atol=1e-9)
 
 
-def test_an_ipos_is_refused_in_one_sentence_that_says_what_to_do() -> None:
-    family = family_of({"vendor": 0x1A3, "product": 1})
-    assert family.name == "Technosoft iPOS"
-    assert ". " not in family.refuse
-    assert "driver.streams to position" in family.refuse
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -261,7 +254,11 @@ def test_an_ipos_is_refused_in_one_sentence_that_says_what_to_do() -> None:
             "{name: x, proved: no, torque: [{mode: 200, target: '6071:0/i16'}], sources: {torque: y}}",
             "does not fit 6060h",
         ),
-        ("{name: x, proved: no, torque: [{mode: 4, target: '201C:0/i32'}], sources: {torque: y}}", "should match"),
+        ("{name: x, proved: no, torque: [{mode: 4, target: '201C:0/u32'}], sources: {torque: y}}", "should match"),
+        (
+            "{name: x, proved: no, torque: [{mode: 4, target: '201C:0/i16', shift: 2}], sources: {torque: y}}",
+            "only counts in a target of 32 bits are shifted",
+        ),
         ("{name: x, proved: no, unit: {count: 1, unit: mA, writable: yes}, sources: {unit: y}}", "only a rated torque"),
         ("{name: x, proved: no, unit: null, sources: {unit: y}}", "leave out what is not known"),
         ("{name: x, proved: no, surprise: 1, sources: {}}", "surprise"),

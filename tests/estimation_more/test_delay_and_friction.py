@@ -313,7 +313,7 @@ def test_the_rate_and_other_options_come_back_untouched() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [NOISE, 0.3])
+@pytest.mark.parametrize("noise", [pytest.param(NOISE, marks=pytest.mark.campaign), 0.3])
 def test_deviations_of_friction_hold_where_its_shape_was_fitted(noise: float) -> None:
     model, base, delta = rubbing(FIT)
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
@@ -348,7 +348,9 @@ def test_degrees_of_freedom_of_both_parts_are_joined() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("slower", "noise", "seconds"), [(1.0, 0.3, 12.0), (0.5, 0.05, 24.0)])
+@pytest.mark.parametrize(
+    ("slower", "noise", "seconds"), [(1.0, 0.3, 12.0), pytest.param(0.5, 0.05, 24.0, marks=pytest.mark.campaign)]
+)
 def test_two_deviations_are_95_percent_where_few_reversals_tell_the_shape(
     slower: float, noise: float, seconds: float
 ) -> None:

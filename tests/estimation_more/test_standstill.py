@@ -89,8 +89,25 @@ def test_a_joint_that_never_moves_is_named() -> None:
     recording = measured(model, delta, 1.0)
     still = recording.position.copy()
     still[:, 1] = 0.3
-    with pytest.raises(RecordingError, match="never faster than"):
-        equations(replace(recording, position=still), model, base_parameters(model.chain, model.layout))
+    held, base = replace(recording, position=still, sha256="1" * 64), base_parameters(model.chain, model.layout)
+    name = model.chain.names[1]
+    with pytest.raises(
+        RecordingError, match=rf"{name}: never faster than .* in it, .* kinematics\.lock: {{{name}: POSITI"
+    ):
+        equations(held, model, base)
+    # Another recording may move it, and whoever only judges needs no motion of it.
+    assert equations([held, recording], model, base).samples > equations(recording, model, base).samples
+    assert equations(held, model, base, judging=True).samples > 0
+
+
+def test_a_joint_whose_torque_is_always_zero_is_weighed() -> None:
+    model, delta = arm()
+    recording = measured(model, delta, 1.0)
+    torque = recording.torque * [1.0, 0.0]
+    found = equations(replace(recording, torque=torque), model, base_parameters(model.chain, model.layout))
+    assert np.isfinite(weighted_least_squares(found.everything).weights).all()
+    nothing = equations(replace(recording, torque=0.0 * torque), model, base_parameters(model.chain, model.layout))
+    assert np.isfinite(weighted_least_squares(nothing.everything).weights).all()
 
 
 @pytest.mark.parametrize(("outliers", "method"), [(0.0, "wls"), (0.03, "huber")])

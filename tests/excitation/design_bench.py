@@ -37,8 +37,11 @@ def quick(**changes: Any) -> Design:
 
 
 def small(name: str = "planar2", joints: dict[str, dict[str, Any]] | None = None, **changes: Any) -> ArmModel:
-    """A shipped arm with other values: `joints` by joint, `changes` by section."""
-    config = load_arm(name).model_dump(by_alias=True) | changes
+    """A shipped arm with other values: `joints` by joint, `changes` by section.
+
+    Its loop has a quarter of the rate, as every cycle of a motion is simulated each time that it is proven.
+    """
+    config = load_arm(name).model_dump(by_alias=True) | {"control": {"rate": 250.0}} | changes
     for joint, values in (joints or {}).items():
         config["joints"][joint] |= values
     return arm_model(ArmConfig.model_validate(config))

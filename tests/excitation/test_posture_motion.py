@@ -37,7 +37,7 @@ def test_static_parameters_are_what_standing_and_creeping_can_show() -> None:
 
 @pytest.mark.slow
 def test_a_few_postures_in_a_tiny_workspace_teach_all_static_parameters_and_everything_is_proven() -> None:
-    basis = PostureBasis(5, (1.0,) * 4 + (2.0,) * 4, 0.2)
+    basis = PostureBasis(4, (1.0,) * 3 + (1.5,) * 3, 0.2)
     designed = design_motion(TINY, quick(), budget=ONE_START, basis=basis, base=STATIC)
     limits = motion_limits(TINY.config)
     assert unproven(designed, TINY, usable_limits(TINY.chain.names, limits, quick())) == []

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from design_bench import quick, small
 
-from ident_service.excitation import search as searching
-from ident_service.excitation.design import complete_task, family
+from ident_service.errors import UsageError
+from ident_service.excitation.design import complete_task, design_motion, family
 from ident_service.excitation.optimal_design import Problem
 from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import Budget, Progress, SearchResult, search, within_limits
@@ -31,7 +32,8 @@ COARSE, FINE = Problem(TASK, GRID), Problem(TASK, 2 * GRID)
 
 
 def starts(number: int | None, workers: int = 1, seconds: float | None = None, **options: Any) -> SearchResult:
-    return search(TASK, SAFE, options.pop("seed", 5), Budget(seconds, number, workers), GRID, **options)
+    budget = Budget(seconds, number, workers, options.pop("clock", time.monotonic))
+    return search(TASK, SAFE, options.pop("seed", 5), budget, GRID, **options)
 
 
 @lru_cache
@@ -41,11 +43,10 @@ def searched(number: int) -> tuple[SearchResult, tuple[Progress, ...]]:
     return starts(number, tell=told.append), tuple(told)
 
 
-@pytest.fixture
-def ticking(monkeypatch: pytest.MonkeyPatch) -> None:
+def ticking() -> Callable[[], float]:
     """A clock that goes on by two milliseconds whenever the search looks at it."""
     ticks = count()
-    monkeypatch.setattr(searching, "time", SimpleNamespace(monotonic=lambda: 2e-3 * next(ticks)))
+    return lambda: 2e-3 * next(ticks)
 
 
 def assert_same(one: SearchResult, other: SearchResult) -> None:
@@ -147,22 +148,37 @@ def test_cancelling_ends_the_work_of_other_processes_too() -> None:
 
 
 @pytest.mark.slow
-def test_a_budget_of_time_is_kept(ticking: None) -> None:
-    found = starts(None, seconds=1.0)
+def test_a_budget_of_time_is_kept() -> None:
+    found = starts(None, seconds=1.0, clock=ticking())
     assert 0.6 < found.seconds < 1.05
     assert found.finished > 0
     assert within_limits(COARSE, found.candidates[0].coefficients)
 
 
-def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate(ticking: None) -> None:
-    found = starts(None, seconds=0.01)
+def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate() -> None:
+    found = starts(None, seconds=0.01, clock=ticking())
     assert within_limits(COARSE, found.candidates[0].coefficients)
 
 
-def test_time_spent_is_added_up(ticking: None) -> None:
-    found = starts(0, earlier=SearchResult(5, 3, 100.0, ()))
+def test_time_spent_is_added_up() -> None:
+    found = starts(0, earlier=SearchResult(5, 3, 100.0, ()), clock=ticking())
     assert found.finished == 3
     assert 100.0 < found.seconds < 100.1
+
+
+@pytest.mark.slow
+def test_a_budget_of_work_finds_the_same_however_busy_the_machine_is() -> None:
+    """The clock of the budget is the only one that a whole design looks at."""
+    model, design = small(), quick()
+    budgets = (Budget(0.4, None, 1, ticking()) for _ in range(2))
+    one, other = (design_motion(model, design, seed=3, budget=budget) for budget in budgets)
+    assert one.excitation.to_json() == other.excitation.to_json()
+    assert one.found.seconds == other.found.seconds > 0.1
+
+
+def test_work_is_counted_in_one_process_only() -> None:
+    with pytest.raises(UsageError, match="give one worker"):
+        Budget(1.0, None, 2, time.process_time)
 
 
 @pytest.mark.slow

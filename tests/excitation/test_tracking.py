@@ -38,8 +38,6 @@ from ident_service.motion.run import run
 from ident_service.motion.state_machine import State
 from ident_service.preflight.stability import stability
 
-SLOW = {"control": {"rate": 250.0}}
-
 
 class Unrecorded:
     """A sink that keeps nothing."""
@@ -69,8 +67,8 @@ def as_in(case: int, model: ArmModel) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", [0, 1])
 def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
-    model = small(**SLOW)
-    model = small(**SLOW, driver=as_in(case, model))
+    model = small()
+    model = small(driver=as_in(case, model))
     path = excitation(model, "identification").path
     assert isinstance(path, FourierPath)
     ramped = FourierPath(path.series, 1, 1.0)
@@ -88,7 +86,7 @@ def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
 def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -> None:
     """Soft gains: friction moves the arm farther off than it may be, wherever it moves at all."""
     soft = {name: {"kp": 2.0, "kd": 1.0, "following_error": 0.02} for name in ("shoulder", "elbow")}
-    model = small(joints=soft, **SLOW)
+    model = small(joints=soft)
     path = excitation(model, "identification").path
     limits = motion_limits(model.config)
     found = violations(proof_of(path, model, limits, CollisionModel(model)), model, limits)
@@ -98,7 +96,7 @@ def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -
 
 
 def test_clearance_is_the_arm_s_and_not_the_reference_s() -> None:
-    model = small(**SLOW)
+    model = small()
     path = excitation(model, "identification").path
     collision, tracking = CollisionModel(model), track(path, model, 0.2)
     reference = certified_clearance(collision, path, 0.02)
@@ -110,7 +108,7 @@ def test_clearance_is_the_arm_s_and_not_the_reference_s() -> None:
 
 
 def test_the_last_ramp_of_a_motion_of_many_periods_has_the_tube_of_the_simulated_one() -> None:
-    model = small(**SLOW)
+    model = small()
     series = excitation(model, "identification").path
     assert isinstance(series, FourierPath)
     once, often = (FourierPath(series.series, periods, 1.0) for periods in (1, 4))
@@ -141,7 +139,7 @@ def polished(model: ArmModel, design: Design) -> tuple[Task, Candidate, Callable
 @pytest.mark.slow
 def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
     """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
-    model = small(joints={"elbow": {"velocity": 0.6}}, **SLOW)
+    model = small(joints={"elbow": {"velocity": 0.6}})
     task, best, from_there = polished(model, quick())
     found = binding(task, best.coefficients, per_period(task.basis))
     expected = {(one.limit, one.joint): one.exponent for one in found}["velocity", 1]
@@ -156,7 +154,7 @@ def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
 @pytest.fixture(scope="module")
 def soft() -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
     """An elbow so soft that the friction which nobody knows of would push it far off its reference."""
-    model = small(joints={"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.05}}, **SLOW)
+    model = small(joints={"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.05}})
     return polished(model, quick())
 
 
@@ -204,7 +202,7 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
 def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     """An elbow too soft to move: with the gains, which are stable at this rate, it moves freely."""
     weak = {"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.15}}
-    soft = small(joints=weak, **SLOW)
+    soft = small(joints=weak)
     limits = motion_limits(soft.config)
 
     def stable(kp: np.ndarray, kd: np.ndarray) -> bool:
@@ -214,7 +212,7 @@ def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     told = [line for line in before.binding if line.startswith("elbow")]
     (proposed,) = re.findall(r"with kp ([0-9.]+) and kd ([0-9.]+) it would follow at its velocity", "; ".join(told))
     weak["elbow"] |= {"kp": float(proposed[0]), "kd": float(proposed[1])}
-    after = design_motion(small(joints=weak, **SLOW), quick(), budget=ONE_START)
+    after = design_motion(small(joints=weak), quick(), budget=ONE_START)
     slow, fast = (one.proof.demands.velocity[1] for one in (before, after))
     assert fast > max(2.0 * slow, 0.3 * limits.velocity[1])
 
@@ -255,7 +253,7 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
     """A soft arm above a floor: its heavier links, which no forecast knows, and the tube around its motion."""
     gains = {"kp": kp, "kd": 2.0 * kp**0.5}
     floor = {"clearance": 0.02, "obstacles": {"floor": {"half_space": {"normal": [0, 1, 0], "offset": -0.6}}}}
-    model = small(joints={"shoulder": gains, "elbow": gains}, workspace=floor, **SLOW)
+    model = small(joints={"shoulder": gains, "elbow": gains}, workspace=floor)
     design = quick()
     task, best, _ = polished(model, design)
     base, safe = family(design, model)[1], safe_posture(model, task.limits)
@@ -275,7 +273,7 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
 
 
 def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
-    model = small(joints={"elbow": {"velocity": 0.1}}, **SLOW)
+    model = small(joints={"elbow": {"velocity": 0.1}})
     path = PosturePath(np.array([[0.0, 0.0], [0.6, 0.5], [0.0, 0.0]]), np.array([9.0, 11.0]), 0.0)
     whole = track(path, model, 0.2).error
     (parts,) = segment_tube_width(path, model, 0.2)(np.array([10.0]), np.array([0.1]))

@@ -34,21 +34,22 @@ def sheet(name: str) -> dict[str, str]:
     return {"name": name, "text": (SHEETS / name).read_text(encoding="latin-1")}
 
 
-def arm_of(*names: str, **changes: Any) -> ArmConfig:
-    """Two drives made from these files, described as they are."""
+def arm_of(*names: str, text: str | None = None, drive: dict[str, Any] | None = None, **changes: Any) -> ArmConfig:
+    """Two drives made from these files, described as they are; `text` and keys of `drive` are in place of theirs."""
     drives = []
-    for node, name in zip((1, 2), names * 2, strict=False):
-        watchdog, _, own = CAPABLE.get(name, ("heartbeat", 0, {}))
+    files = [sheet(name) if text is None else {"name": "strange.eds", "text": text} for name in names]
+    for node, name, file in zip((1, 2), names * 2, files * 2, strict=False):
+        guard, _, own = CAPABLE.get(name, ("heartbeat", 0, {}))
         one = {"node": node, "counts": 65536, "rated_torque": 1.0, "max_torque": 2.0, "max_speed": 6000.0}
-        drives.append(one | {"watchdog": watchdog, "eds": sheet(name)} | own)
+        drives.append(one | {"watchdog": guard, "eds": file} | own | (drive or {}))
     section = {
         "drives": drives,
-        "eds": sheet(names[0]),
+        "eds": files[0],
         "torque_frames": "single",
         "heartbeats": {"period": 0.02, "timeout": 0.11, "host_timeout": 0.06, "drives": 0.1},
         "emulation": {
             "truth": {"m1": 0.5, "Lxx1": 0.1, "Lyy1": 0.1, "Lzz1": 1.0, "m2": 1.0},
-            "eds": [sheet(name) for name in names],
+            "eds": files,
         },
     }
     return weightless_config(**section | changes)

@@ -46,14 +46,20 @@ class _Branches:
         self.faults: list[Fault | Strike] = []
         self.number: int | None = None
         self._arm, self._found, self._answer = arm, dict[int, Any](), -1
-        exchange = arm.exchange
+        exchange, exchange_position = arm.exchange, arm.exchange_position
 
         def branching(torque: Array | None) -> Any:
             if self.number is None:
                 self._branch(arm.cycle)
             return exchange(torque)
 
+        def branching_position(position: Array) -> Any:
+            if self.number is None:
+                self._branch(arm.cycle)
+            return exchange_position(position)
+
         arm.exchange = branching  # type: ignore[method-assign]
+        arm.exchange_position = branching_position  # type: ignore[method-assign]
 
     def results(self, body: Callable[[], Any]) -> list[Any]:
         """Return, for each fault, the result that `body`, which drives the arm, has in its branch."""

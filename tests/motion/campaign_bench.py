@@ -37,7 +37,6 @@ from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray
 HOLD = 0.3  # s
-PERIOD = 1e-3
 # States that somebody at the controls brings about; the same hands lead through all of a line.
 PAUSED = (State.PAUSING, State.PAUSED, State.RESUMING)
 STOPPED = (State.STOPPING, State.STOPPED)
@@ -146,11 +145,16 @@ class Subject:
     of_joint: Callable[[str], bool] = lambda kind: kind not in STALLS and FAULT_RULES[FaultKind(kind)].of_joint
     torque_step: Array | float = 0.0
 
+    @property
+    def period(self) -> float:
+        """Of its cycles [s]."""
+        return 1.0 / self.config.control.rate
+
 
 @cache
 def subject(name: str) -> Subject:
-    """`bench` or `wam`; of emulated drives `bench canopen`, `wam canopen`, and with two buses `wam two buses`."""
-    if "canopen" in name or "buses" in name:
+    """`bench` or `wam`; of emulated drives `bench canopen`, `wam canopen`, `wam two buses`, `bench positions`."""
+    if "canopen" in name or "buses" in name or "positions" in name:
         from campaign_canopen import canopen_subject
 
         return canopen_subject(name)
@@ -198,7 +202,7 @@ class Script(LocalCommands):
         self, arm: WatchedArm, which: Subject, state: State, speed: float = 1.0, *, finish: bool = False
     ) -> None:
         super().__init__()
-        self._arm = arm
+        self._arm, self._hold = arm, HOLD / which.period
         self._finish = round(which.pause / speed) if finish else 10**9
         self._pause = round(which.pause / speed) if state in PAUSED and not finish else 10**9
         self._stop = round(which.stop / speed) if state in STOPPED else 10**9
@@ -208,7 +212,7 @@ class Script(LocalCommands):
         cycle = self._arm.cycle - 1
         self.pause = self._pause <= cycle < self._pause + PAUSED_FOR + 200
         self.stop, self.finish = cycle >= self._stop, cycle >= self._finish
-        self.supported = cycle >= self._held_since + HOLD / PERIOD  # counts where the arm waits for it
+        self.supported = cycle >= self._held_since + self._hold  # counts where the arm waits for it
         return True
 
     def wait_for_support(self) -> None:
@@ -301,7 +305,8 @@ def _windows(name: str, state: State, speed: float, finish: bool) -> dict[str, t
     assert healthy.fault is None
     first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]
     # Enabling may take time that has no cycles.
-    since = [max(-1, round((stamp - first["stamp_ns"]) * 1e-9 / PERIOD)) for stamp, _, _ in told]
+    period = subject(name).period
+    since = [max(-1, round((stamp - first["stamp_ns"]) * 1e-9 / period)) for stamp, _, _ in told]
     begins = [(message, first["cycle"] + cycles) for (_, _, message), cycles in zip(told, since, strict=True)]
     ends = [begin for _, begin in begins[1:]] + [healthy.story.samples[-1]["cycle"]]
     return {message: (begin + 1, end) for (message, begin), end in zip(begins, ends, strict=True)}

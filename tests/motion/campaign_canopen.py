@@ -8,7 +8,9 @@ own deadlines.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
+from typing import Any
 
 from campaign_bench import READ_WRONGLY, UNTRUE, Promise, Strike, Subject, wam_config
 from helpers.emulated_arms import EDS, Tapped, tapped
@@ -26,7 +28,6 @@ from sim_backend.emulator.faults import DRIVE_FAULTS, DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.machine import Truth
 
-PERIOD = 1e-3
 # Sent by somebody else; a torque frame, a control word and an NMT command are those that would do harm.
 FOREIGN: dict[str, Frame] = {
     "foreign_sync": Frame(0x080),
@@ -35,7 +36,7 @@ FOREIGN: dict[str, Frame] = {
     "foreign_nmt": Frame(0x000, bytes([0x01, 0x01])),
     "foreign_heartbeat": Frame(0x77F, b"\x05"),
 }
-QUICK_STOP = bytes([0x02, 0x00, 10])  # control word and mode
+QUICK_STOP = bytes([0x02, 0x00])  # control word, before the mode
 NOTICE = Frame(0x081, bytes.fromhex("01 ff 00 00 00 00 00 00"))  # without a bit of the error register
 WIRE = ("lost_torques", "lost_status", "notice", *FOREIGN, "full_queue")
 # Two cycles: a fault may come after the answers of the cycle before which it was handed over.
@@ -80,6 +81,25 @@ CANOPEN_PROMISES: dict[str, Promise] = {
 }
 
 
+# Drives that close the loop hold the joints' torque themselves; what they measure beside the model's ends the motion.
+POSITION_RATE = 500.0
+_SHARE = POSITION_RATE / 1000.0  # of the cycles that a time has
+_MEASURED = {"torque_unexplained", "torque_exceeded"}
+POSITION_PROMISES: dict[str, Promise] = {
+    kind: replace(
+        promise,
+        codes=promise.codes | (_MEASURED if promise.codes & UNTRUE else set()),
+        size=promise.size / _SHARE if kind == "delayed_feedback" else promise.size,  # more cycles than a joint may miss
+        within=round(_SHARE * promise.within) if promise.within is not None and promise.within > 50 else promise.within,
+    )
+    for kind, promise in CANOPEN_PROMISES.items()
+}
+
+
+def is_quick_stop(frame: Frame) -> bool:
+    return 0x300 < frame.identifier < 0x380 and frame.data[:2] == QUICK_STOP
+
+
 class EmulatedArm(WatchedArm):
     """The driver's arm over emulated drives, that breaks before one of its exchanges.
 
@@ -98,7 +118,7 @@ class EmulatedArm(WatchedArm):
         self.taps: list[Tapped] = []
         self.states: tuple[str, ...] = ()
         self.told_to_brake = 0
-        self._config, self._strike = config, strike
+        self._config, self._strike, self._period = config, strike, 1.0 / config.control.rate
         super().__init__(CanopenArm(config, self._links))
         self.before_exchange = self._break
 
@@ -107,6 +127,14 @@ class EmulatedArm(WatchedArm):
         return self.taps
 
     def exchange(self, torque: object) -> Sample:
+        self._lose()
+        return super().exchange(torque)  # type: ignore[arg-type]
+
+    def exchange_position(self, position: Any) -> Sample:
+        self._lose()
+        return super().exchange_position(position)
+
+    def _lose(self) -> None:
         if self._strike is not None and self._strike.kind in ("lost_torques", "lost_status"):
             first, last = self._strike.at_cycle, self._strike.at_cycle + (self._strike.duration or 1)
             lost = first <= self.cycle < last
@@ -115,7 +143,6 @@ class EmulatedArm(WatchedArm):
             else:
                 for tap in self.taps:
                     tap.misses = lambda frame: lost and 0x280 <= frame.identifier < 0x300
-        return super().exchange(torque)  # type: ignore[arg-type]
 
     def _break(self, cycle: int) -> None:
         strike = self._strike
@@ -123,7 +150,7 @@ class EmulatedArm(WatchedArm):
             return
         if strike.kind == "full_queue":
             for tap in self.taps:
-                tap.full_until_ns = self.clock.now_ns() + round((strike.duration or 1) * PERIOD * 1e9)
+                tap.full_until_ns = self.clock.now_ns() + round((strike.duration or 1) * self._period * 1e9)
             return
         if strike.kind == "notice":
             self.taps[0].disturb([NOTICE], drives_hear=False)
@@ -131,15 +158,15 @@ class EmulatedArm(WatchedArm):
         if strike.kind in FOREIGN:
             self.taps[-1].disturb([FOREIGN[strike.kind]])
             return
-        duration = None if strike.duration is None else strike.duration * PERIOD
-        self.behind.inject(DriveFault(strike.kind, strike.joint, strike.later * PERIOD, duration, strike.size))
+        duration = None if strike.duration is None else strike.duration * self._period
+        self.behind.inject(DriveFault(strike.kind, strike.joint, strike.later * self._period, duration, strike.size))
 
     def strike(self, fault: Strike) -> None:
         self._strike = fault
 
     def left_alone(self) -> None:
         """Longer than the drives wait for torque frames, and for a ramp."""
-        told = [{frame.identifier for frame in tap.sent if frame.data == QUICK_STOP} for tap in self.taps]
+        told = [{frame.identifier for frame in tap.sent if is_quick_stop(frame)} for tap in self.taps]
         self.told_to_brake = sum(len(nodes) for nodes in told)
         self.behind.settle(self.clock.now_ns() + 50_000_000)
         self.states = self.behind.emulator.states
@@ -166,6 +193,14 @@ def bench_canopen_config(*, brakes: bool = True) -> ArmConfig:
     )
 
 
+def bench_positions_config() -> ArmConfig:
+    """The bench's arm behind two drives that close the position loop."""
+    document = bench_canopen_config().model_dump(mode="json", by_alias=True)
+    document["control"] |= {"rate": POSITION_RATE}
+    document["driver"]["streams"] = "position"
+    return ArmConfig.model_validate(document)
+
+
 def wam_canopen_config(buses: int = 1) -> ArmConfig:
     """The shipped WAM of drives, with its differentials; on two buses the wrist has its own."""
     shipped = wam_config("wam7_canopen")
@@ -183,9 +218,11 @@ def of_joint(kind: str) -> bool:
 
 @cache
 def canopen_subject(name: str) -> Subject:
-    """`bench canopen`, `loose canopen`, which has no brakes, `wam canopen`, or `wam two buses`."""
+    """`bench canopen`, `loose canopen`, which has no brakes, `wam canopen`, `wam two buses`, or `bench positions`."""
     if name in ("bench canopen", "loose canopen"):
         config, pause = bench_canopen_config(brakes=name == "bench canopen"), 900
+    elif name == "bench positions":
+        config, pause = bench_positions_config(), 450
     else:
         config, pause = wam_canopen_config(2 if name == "wam two buses" else 1), 2600
     model = arm_model(config)
@@ -199,7 +236,7 @@ def canopen_subject(name: str) -> Subject:
         pause,
         pause,
         lambda strike, observer: EmulatedArm(config, strike, observer),
-        CANOPEN_PROMISES,
+        POSITION_PROMISES if name == "bench positions" else CANOPEN_PROMISES,
         of_joint,
         step,
     )

@@ -17,7 +17,6 @@ import pytest
 from branches import outcomes
 from campaign_bench import (
     HOLD,
-    PERIOD,
     Case,
     Outcome,
     Promise,
@@ -96,8 +95,8 @@ def is_kept(case: Case, fault: Fault | Strike, outcome: Outcome, path: Path) -> 
     ends_as_the_table_says(which, outcome)
     ends_in_time(which, outcome)
     if promise.within is not None:
-        assert found_in(outcome) < fault.at_cycle + promise.within
-        assert found_in(outcome) >= fault.at_cycle
+        assert found_in(which, outcome) < fault.at_cycle + promise.within
+        assert found_in(which, outcome) >= fault.at_cycle
 
 
 def went_on(case: Case, promise: Promise, at_cycle: int, outcome: Outcome) -> None:
@@ -124,7 +123,7 @@ def plant_stays_within_limits(which: Subject, outcome: Outcome, case: Case) -> N
         most = np.maximum(most, np.abs(jacobian).T @ limits.motors.torque)
     assert (torque <= most * (1 + 1e-9) + which.torque_step).all()
     speed, acceleration = (np.abs([getattr(moment, name) for moment in truth]) for name in ("velocity", "acceleration"))
-    unseen = 1.0 / (2.0 * np.pi * np.asarray(which.config.control.velocity_cutoff)) + 2.0 * PERIOD
+    unseen = 1.0 / (2.0 * np.pi * np.asarray(which.config.control.velocity_cutoff)) + 2.0 * which.period
     gained = acceleration[-20:].max(axis=0) * unseen
     assert (speed <= VELOCITY_OFF * limits.velocity + gained).all()
 
@@ -175,18 +174,19 @@ def ends_in_time(which: Subject, outcome: Outcome) -> None:
     limits = which.limits
     stop = (limits.velocity + 0.5 * limits.acceleration**2 / limits.jerk) / limits.acceleration
     stop = stop + 2.0 * limits.acceleration / limits.jerk
-    controlled = float(stop.max()) + SETTLE + REST_CYCLES * PERIOD + HOLD
+    controlled = float(stop.max()) + SETTLE + REST_CYCLES * which.period + HOLD
     if which.config.control.after_stop is not None:
-        # From one end of a joint's range to the other, and as long again for what the compensation takes to go.
-        controlled += 2.0 * float(((limits.upper - limits.lower) / (SPEED * limits.velocity)).max()) + RESTING
+        # From one end of each joint's range to the other, one after the other, because gravity compensation goes only
+        # while the fastest joint is slow; and as long again for what it takes to go.
+        controlled += 2.0 * float(((limits.upper - limits.lower) / (SPEED * limits.velocity)).sum()) + RESTING
     promised = {Reaction.CONTROLLED_STOP: controlled, Reaction.DAMPED_LOWERING: controlled + LOWER_AFTER + LOWER}
     # Every reaction on the way there may have taken its time.
     reactions = [FAULTS[message.split(":")[0]].reaction for message in outcome.story.errors]
     worst = max(promised.get(reaction, 0.0) for reaction in reactions)
-    assert (outcome.arm.cycle - 1 - found_in(outcome)) * PERIOD <= worst + 2.0 * PERIOD
+    assert (outcome.arm.cycle - 1 - found_in(which, outcome)) * which.period <= worst + 2.0 * which.period
 
 
-def found_in(outcome: Outcome) -> int:
+def found_in(which: Subject, outcome: Outcome) -> int:
     """The cycle in which the first fault that is more than a warning was found."""
     first = outcome.story.errors[0]
     if FAULTS[first.split(":")[0]].reaction >= Reaction.QUICK_STOP:
@@ -194,5 +194,5 @@ def found_in(outcome: Outcome) -> int:
     stamp = next(stamp for stamp, _, message in outcome.story.events if message == first)
     last = outcome.story.samples[-1]
     if stamp > last["stamp_ns"]:  # an arm that is held or lowered for long is no longer recorded
-        return int(last["cycle"]) + round((stamp - last["stamp_ns"]) * 1e-9 / PERIOD)
+        return int(last["cycle"]) + round((stamp - last["stamp_ns"]) * 1e-9 / which.period)
     return int(next(sample["cycle"] for sample in outcome.story.samples if sample["stamp_ns"] == stamp))

@@ -60,7 +60,7 @@ def bench_excitation() -> Excitation:
 
 
 class WatchedArm(Arm):
-    """An arm that remembers what was asked of it, and fails where a test says so."""
+    """An arm that remembers what was asked of it, torques or positions, and fails where a test says so."""
 
     def __init__(self, inner: Arm) -> None:
         self.inner = inner
@@ -98,6 +98,12 @@ class WatchedArm(Arm):
         self.before_exchange(self.cycle)
         self.cycle += 1
         return self.shown(self.inner.exchange(torque))
+
+    def exchange_position(self, position: Array) -> Sample:
+        self.torques.append(position.copy())
+        self.before_exchange(self.cycle)
+        self.cycle += 1
+        return self.shown(self.inner.exchange_position(position))
 
     def stop(self, kind: StopKind) -> None:
         self.stops.append(kind)

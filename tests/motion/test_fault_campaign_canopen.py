@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign_bench import Case, Outcome, Strike, play, subject, windows
-from campaign_canopen import CANOPEN_PROMISES, WIRE, EmulatedArm, of_joint
+from campaign_canopen import CANOPEN_PROMISES, FOREIGN, WIRE, EmulatedArm, of_joint
 from campaign_checks import keep_their_promises, keeps_its_promise, together
 from test_fault_campaign import STATES
 
@@ -26,7 +26,7 @@ from sim_backend.emulator.faults import DRIVE_FAULTS
 from sim_backend.emulator.motor import Power
 
 SEED = 11
-DRIVES = {"bench canopen": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
+DRIVES = {"bench canopen": 2, "bench positions": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
 # At the end of this stop j7 stands still against more than the friction guess, which is taken for a frozen encoder
 # (decision 0008). A stop that a person asks for in the same cycle ends so too.
 REMAINING = {"wam canopen-lost_status-exciting-0.64-None"}
@@ -44,14 +44,17 @@ def cases(arm: str, times: int, drives: int) -> Iterator[Case]:
 
 
 def sample() -> list[Case]:
-    """One of each kind on the small arm, one of a differential on the large one, some of all and of its two buses."""
+    """One of each kind on the small arm, one of a differential on the large one, one of all and of its two buses."""
     rng = random.Random(SEED)  # noqa: S311 - not for secrets
     small, large, divided = list(cases("bench canopen", 1, 1)), list(cases("wam canopen", 1, 1)), list(two_buses())
     chosen = [rng.choice([case for case in small if case.kind == kind]) for kind in CANOPEN_PROMISES]
+    # While it moves, drives that are given positions react in their own way.
+    moving = [case for case in cases("bench positions", 1, 1) if case.state is State.EXCITING]
+    chosen += rng.sample([case for case in moving if case.kind not in FOREIGN], 12)
     # Early in its motion: simulating the WAM up to the fault is what takes time.
     chosen += [Case("wam canopen", "stuck_torque", State.EXCITING, 0.2 * rng.random(), 1)]
     chosen += rng.sample([case for case in large if case.state is State.EXCITING and case.share < 0.2], 1)
-    return chosen + rng.sample([case for case in divided if case.state is State.EXCITING], 2)
+    return chosen + rng.sample([case for case in divided if case.state is State.EXCITING and case.share < 0.4], 1)
 
 
 def two_buses() -> Iterator[Case]:
@@ -71,6 +74,12 @@ def loose() -> Iterator[Case]:
     kinds = (*DRIVES_HOLD, *NOBODY_HOLDS, *LOWERED)
     states = (State.EXCITING, State.STOPPING, State.STOPPED)
     return (case for case in cases("loose canopen", 1, 1) if case.kind in kinds and case.state in states)
+
+
+def some_loose() -> list[Case]:
+    """One of each sort, two of what nobody holds: while it moves, and while it is held."""
+    wanted = {("bus_gone", State.STOPPED), ("lost_status", State.EXCITING), ("node_silent", State.EXCITING)}
+    return [case for case in loose() if (case.kind, case.state) in wanted | {("drive_fault", State.STOPPED)}]
 
 
 def ends_as_it_can(case: Case, outcome: Outcome) -> None:
@@ -121,7 +130,7 @@ def test_a_drive_that_applies_a_share_of_its_torque_is_named() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("some", together([case for case in loose() if case.state is not State.STOPPING][::3]))
+@pytest.mark.parametrize("some", together(some_loose()))
 def test_ends_of_an_arm_without_brakes(some: list[Case], tmp_path: Path) -> None:
     keep_their_promises(some, tmp_path, ends_as_it_can)
 
@@ -134,7 +143,7 @@ def test_all_ends_of_an_arm_without_brakes(case: Case, tmp_path: Path) -> None:
 
 def campaign() -> list[Any]:
     """All cases; one that is known to fail must go on failing, or be taken off the list."""
-    every = [*cases("bench canopen", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
+    every = [*cases("bench canopen", 2, 2), *cases("bench positions", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
     fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
     return [pytest.param(case, id=str(case), marks=fails if str(case) in REMAINING else ()) for case in every]
 

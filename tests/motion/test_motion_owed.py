@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from guard_bench import HOME, LIMITS, PERIOD, Bench, is_fault, unit
-from motion_bench import PRIOR, bench_model
+from motion_bench import PRIOR, bench_config, bench_model
 
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.encoder_observer import (
@@ -14,10 +14,12 @@ from ident_service.motion.encoder_observer import (
     SLIDING,
     STANDING,
     STEPS,
+    EncoderCoordinates,
     FrozenEncoderObserver,
+    encoder_coupling,
     frozen_encoder_observer,
 )
-from ident_service.motion.safety_monitor import FROZEN_CYCLES, FROZEN_EFFORT
+from ident_service.motion.safety_monitor import FROZEN_CYCLES, FROZEN_EFFORT, SUDDEN_CYCLES, SUDDEN_SPEED
 
 Array = np.ndarray
 MODEL = bench_model()
@@ -132,3 +134,99 @@ def test_friction_is_the_guess_or_more_if_the_prior_has_more(known: float | None
     owed = frozen_encoder_observer(DYNAMICS, model, LIMITS, PERIOD, STEP)
     assert cycles_until(owed, 0.99 * STANDING * expected * unit(1)) is None
     assert cycles_until(owed, 1.2 * STANDING * expected * unit(1)) is not None
+
+
+# Two drives that move both joints: d = C q, and what they give for the joints' torques.
+COUPLING = np.array([[1.0, -0.6], [1.0, 0.6]])
+TO_JOINTS, TO_DRIVES = np.linalg.inv(COUPLING), np.linalg.inv(COUPLING).T
+MOVES = np.abs(COUPLING)
+
+
+def drive(which: int) -> Array:
+    """How joints move when one drive does."""
+    return TO_JOINTS[:, which]
+
+
+@pytest.mark.parametrize("stuck", [0, 1])
+@pytest.mark.parametrize("share", [0.9, 1.1])
+def test_a_drive_that_stands_still_in_full_motion_is_found_although_no_joint_stands(stuck: int, share: float) -> None:
+    bench, other = Bench(coupling=COUPLING), drive(1 - stuck)
+    fast = share * SUDDEN_SPEED * MOVES[stuck] @ LIMITS.velocity * drive(stuck)
+    faults = [
+        bench.see(HOME + 1e-4 * cycle * other, velocity=fast + 1e-3 * other)[1] for cycle in range(SUDDEN_CYCLES + 5)
+    ]
+    found = [fault for fault in faults if fault is not None]
+    if share > 1.0:
+        is_fault(found[0], "frozen_encoder")
+        assert found[0].message.startswith("shoulder, elbow: ")
+    else:
+        assert found == []
+
+
+def test_drives_that_both_move_are_not_frozen_and_neither_are_joints_that_stand_for_one_another() -> None:
+    for way in (drive(0) + 0.01 * drive(1), np.array([1.0, 0.0]), np.array([0.0, 1.0])):
+        bench = Bench(coupling=COUPLING)
+        for cycle in range(3 * FROZEN_CYCLES):
+            push = 0.9 * FROZEN_EFFORT * LIMITS.torque * (way != 0.0)
+            assert bench.see(HOME + 1e-4 * cycle * way, velocity=0.1 * way, correction=push)[1] is None
+
+
+@pytest.mark.parametrize("stuck", [0, 1])
+def test_a_drive_that_is_pushed_hard_and_stands_is_found_although_its_joints_move_by_the_other(stuck: int) -> None:
+    hard = FROZEN_EFFORT * (np.abs(TO_DRIVES) * LIMITS.torque).max(axis=1)[stuck]
+    for share, cycles in ((0.9, None), (1.1, FROZEN_CYCLES)):
+        # The torque of the joints that is this drive's alone: tau = C^T f.
+        push = share * hard * COUPLING.T[:, stuck]
+        bench = Bench(coupling=COUPLING)
+        found = [bench.see(HOME + 1e-4 * k * drive(1 - stuck), correction=push)[1] for k in range(2 * FROZEN_CYCLES)]
+        first = next((k + 1 for k, fault in enumerate(found) if fault is not None), None)
+        assert first == cycles
+        if cycles is not None:
+            is_fault(found[cycles - 1], "frozen_encoder")
+
+
+@pytest.mark.parametrize("stuck", [0, 1])
+def test_what_a_drive_owes_is_what_the_push_beyond_its_friction_would_have_moved(stuck: int) -> None:
+    friction = np.append(FRICTION, (np.abs(TO_DRIVES) * FRICTION).max(axis=1))
+    inertia = (TO_DRIVES @ DYNAMICS.mass_matrix(HOME) @ TO_DRIVES.T)[stuck, stuck]
+    hidden = (MOVES @ HIDDEN)[stuck]
+    moving = np.append(np.ones(2), np.where(np.arange(2) == stuck, 0.0, 1.0))
+    for excess, found in ((-0.1, False), (0.5, True), (2.0, True)):
+        owed = FrozenEncoderObserver(DYNAMICS, LIMITS, PERIOD, friction, STEP, coupling=COUPLING)
+        push = (STANDING * friction[2 + stuck] + excess) * COUPLING.T[:, stuck]
+        answer = np.linalg.solve(DYNAMICS.mass_matrix(HOME), push)
+        cycles = next((k for k in range(1, 3000) if owed.update(moving, push, answer, HOME)[2 + stuck]), None)
+        assert (cycles is not None) == found
+        if cycles is not None:
+            # Its joints give way to the push as well, so that it would have moved at least as far.
+            assert cycles <= np.sqrt(2.0 * hidden * inertia / excess) / PERIOD + 2.0
+
+
+def test_a_drive_is_unknown_while_one_of_its_joints_is() -> None:
+    coordinates = EncoderCoordinates.of(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -0.6], [0.0, 1.0, 0.6]]), 3)
+    assert coordinates.valid(np.array([True, True, True])).tolist() == [True] * 5
+    assert coordinates.valid(np.array([False, True, True])).tolist() == [False, True, True, True, True]
+    assert coordinates.valid(np.array([True, True, False])).tolist() == [True, True, False, False, False]
+    assert coordinates.at_joints(np.array([False, False, False, True, False])).tolist() == [False, True, True]
+    assert not coordinates.steps(np.array([0.0, np.nan, 0.1]), np.zeros(3))[3:].any()
+
+
+def test_positions_that_are_computed_back_from_a_drive_that_stands_show_that_it_stands() -> None:
+    rng = np.random.default_rng(4)
+    coordinates = EncoderCoordinates.of(COUPLING, 2)
+    drives = rng.uniform(-3.0, 3.0, size=(200, 2))
+    drives[:, 0] = drives[0, 0]
+    positions = np.linalg.solve(COUPLING, drives.T).T
+    steps = np.array([coordinates.steps(*pair) for pair in zip(positions[1:], positions[:-1], strict=True)])
+    assert not steps[:, 2].any()
+    assert steps[:, 3].all()
+
+
+@pytest.mark.parametrize("drive_terms", ["joints", "motors"])
+def test_encoders_at_shared_drives_count_the_drives_whatever_the_parameters_are_of(drive_terms: str) -> None:
+    gears = {"ratios": (20.0, -30.0), "coupling": COUPLING.tolist(), "drive_terms": drive_terms}
+    coupling = encoder_coupling(bench_config(transmission=gears))
+    assert coupling is not None
+    np.testing.assert_array_equal(coupling, COUPLING)
+    assert encoder_coupling(bench_config()) is None
+    assert encoder_coupling(bench_config(transmission={"ratios": (20.0, 30.0)})) is None

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from daemon.conftest import commissioned as commissioned
 from daemon.conftest import checked_before, patient_text, quick_text
+from daemon.conftest import commissioned as commissioned
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, Response, expect
 

@@ -7,9 +7,10 @@ from functools import lru_cache, reduce
 import numpy as np
 from helpers.random_arms import model_around, random_chain, random_delta
 
+from ident_service.config.load import load_arm
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.payload import KnownArm
-from ident_service.model.arm_model import ArmModel
+from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
@@ -75,3 +76,25 @@ def known(rng: np.random.Generator, delta: np.ndarray = DELTA, *, scale: float =
     covariance = scale**2 * true_covariance()
     beta = BASE.K @ delta + rng.multivariate_normal(np.zeros(BASE.size), covariance, method="cholesky")
     return KnownArm(ARM, BASE, beta, covariance)
+
+
+def planar_arm() -> KnownArm:
+    """The shipped planar arm as its prior has it, known to a thousandth of a N m."""
+    model = arm_model(load_arm("planar2"))
+    base = base_parameters(model.chain, model.layout)
+    assert model.prior is not None
+    return KnownArm(model, base, base.K @ model.prior, 1e-6 * np.eye(base.size))
+
+
+def planar_blocks(arm: KnownArm, added: np.ndarray, blocks: int = 20, samples: int = 40) -> Equations:
+    """Equations of the planar arm with a body on its last link, at random states."""
+    rng, made = np.random.default_rng(16), list[Information]()
+    supports = sparsity(arm.model.chain, arm.model.layout, arm.base.base)
+    effect = arm.base.K[:, arm.model.layout.inertial(1)] @ added
+    for _ in range(blocks):
+        H = joint_regressor(
+            arm.model.chain, arm.model.layout, *rng.uniform(-3.0, 3.0, size=(3, samples, 2)), arm.base.base
+        )
+        torque = np.einsum("jps,p->sj", H, arm.beta + effect) + 0.01 * rng.normal(size=(samples, 2))
+        made.append(information_of(H, torque, np.ones(torque.shape, dtype=bool), supports))
+    return Equations(tuple(made), blocks * samples)

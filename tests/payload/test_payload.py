@@ -7,7 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy  # its statistics load for a second where they are used
-from payload.known_arms import ARM, BASE, DELTA, LAST, NOISE, blocks_of, body, known, with_body
+from payload.known_arms import (
+    ARM,
+    BASE,
+    DELTA,
+    LAST,
+    NOISE,
+    blocks_of,
+    body,
+    known,
+    planar_arm,
+    planar_blocks,
+    with_body,
+)
 
 from ident_service.errors import ParameterError
 from ident_service.estimation.feasible.feasible_set import feasible_set, symmetric
@@ -15,6 +27,7 @@ from ident_service.estimation.payload import (
     FAR,
     KnownArm,
     Payload,
+    body_words,
     center_of_mass,
     identify_payload,
     loaded_covariance,
@@ -176,6 +189,8 @@ def test_at_rest_nobody_sees_an_inertia() -> None:
     assert payload.body is not None
     assert pseudo_inertia(payload.body.delta)[0] > 0.0
     assert payload.body.delta[9] == pytest.approx(1.3, abs=0.2)
+    assert np.abs(payload.body.delta[:6]).max() < 0.1  # of a load of 1.3 kg, where its inertia shows in nothing
+    assert set(body_words(payload)[:6]) == {"chosen"}
     covariance = loaded_covariance(known(rng), payload)
     assert np.isinf(np.diag(covariance)).any()
 
@@ -192,6 +207,24 @@ def test_what_the_arm_did_not_know_the_payload_does_not_know() -> None:
     payload = identify_payload(KnownArm(ARM, BASE, beta, covariance), blocks_of(with_body(TOOL), rng))
     assert np.isinf(payload.standard_deviations).any()
     assert not np.isnan(payload.standard_deviations).any()
+
+
+@pytest.mark.parametrize("size", [0.0, 0.03], ids=["a point", "a ball"])
+def test_what_no_motion_shows_of_a_load_is_small_and_said_to_be_chosen(size: float) -> None:
+    # A planar arm shows four of the ten; nearly a point has no room inside the usual inset.
+    arm, truth = planar_arm(), body(0.3, (0.0, 0.0, 0.0), size)
+    payload = identify_payload(arm, planar_blocks(arm, truth))
+    assert payload.verdict == "added"
+    assert payload.body is not None
+    names, words = payload.base.names, body_words(payload)
+    chosen = {name for name, word in zip(names, words, strict=True) if word == "chosen"}
+    assert chosen == {"Lxx2", "Lxy2", "Lxz2", "Lyy2", "Lyz2", "lz2"}
+    found = dict(zip(names, payload.body.delta, strict=True))
+    assert found["m2"] == pytest.approx(0.3, abs=0.01)
+    assert 0.0 < found["Lxx2"] < 1e-3
+    assert 0.0 < found["Lyy2"] < 1e-3
+    (line,) = (line for line in payload_text(payload, arm).splitlines() if "not identified, chosen" in line)
+    assert all(f"{name} " in line for name in chosen)
 
 
 @pytest.mark.slow

@@ -34,6 +34,7 @@ TOOL = {
     "ly2": MASS * CENTER[1],
     "m2": MASS,
 }
+UNSEEN = {"Lxx2", "Lxy2", "Lxz2", "Lyy2", "Lyz2", "lz2"}
 
 
 @pytest.fixture(scope="session")
@@ -73,7 +74,15 @@ def test_a_tool_is_found_and_written(arms: Path, ident: Ident, tmp_path: Path) -
     )
     assert document["verdict"] == "added"
     within(document, TOOL, 1.0)
-    assert document["body"]["values"][9] == pytest.approx(MASS, abs=0.005)
+    body = dict(zip(document["body"]["names"], document["body"]["values"], strict=True))
+    assert body["m2"] == pytest.approx(MASS, abs=0.005)
+    # What a planar motion does not show is as in a compact load, and is said to be chosen, in the URDF's link, too.
+    words = dict(zip(document["body"]["names"], document["body"]["verdicts"], strict=True))
+    assert {name for name, word in words.items() if word == "chosen"} == UNSEEN
+    assert max(abs(body[name]) for name in UNSEEN) < 1e-3
+    (line,) = (line for line in text.splitlines() if "not identified, chosen as a compact load" in line)
+    assert all(f"{name} " in line for name in UNSEEN)
+    assert "m2" not in line
     assert (document["recordings"][0]["name"], document["link"]) == ("tooled.mcap", 2)
 
 
@@ -148,7 +157,8 @@ def test_a_tool_that_was_taken_off_is_a_removal(arms: Path, ident: Ident, tmp_pa
     document = json.loads(out)
     assert document["verdict"] == "removed"
     within(document, TOOL, -1.0)
-    assert document["body"]["values"][9] == pytest.approx(MASS, abs=0.005)
+    body = dict(zip(document["body"]["names"], document["body"]["values"], strict=True))
+    assert body["m2"] == pytest.approx(MASS, abs=0.005)
     assert document["files"][-1] == "manifest.json"
     assert verify_file(tmp_path / "off" / "parameters.json").verdict == "feasible"
     assert ident("compare", arms / "bare", tmp_path / "off")[0] == 0

@@ -65,11 +65,13 @@ def test_a_ticket_counts_for_what_was_checked_for_a_quarter_of_an_hour() -> None
     [
         (failed("noise", "too much", "less"), "failed: noise"),
         (Check("watchdog", Verdict.NEEDS_PERSON), "failed: watchdog"),
+        *((skipped(code, "could not be made"), f"not made: {code}") for code in ("gravity", "direction", "watchdog")),
     ],
 )
 def test_a_ticket_that_did_not_pass_counts_for_nothing(verdict: Check, reason: str) -> None:
     (found,) = ticket(verdict).valid_for(SUBJECT, later())
     assert reason in found
+    assert ticket(verdict).verdict is not Verdict.PASSED
 
 
 def test_failure_outweighs_a_missing_person_and_skipped_checks_pass() -> None:

@@ -161,6 +161,36 @@ def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
             CsvRecording(write(tmp_path / "run.csv", header))
 
 
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ("t;q1;tau1", "columns are separated by semicolons; separate them by commas, and write decimals with points"),
+        ("t\tq1\ttau1", "columns are separated by tabs"),
+        ("t q1 tau1", "columns are separated by spaces"),
+        ("0.0,-1.5,2e3", "is numbers; put a line with the names of the columns above it: t,q1..qN,tau1..tauN"),
+        ("# t, q1, tau1", "is a comment; remove what stands before the names of the columns"),
+        (
+            "time," + ",".join(f"pos_{k}" for k in range(7)) + ",eff_0",
+            "unknown columns 'time', 'pos_0', 'pos_1', 'pos_2', 'pos_3', 'pos_4', 'pos_5', 'pos_6' and 1 more; no"
+            " column 't' (time in seconds); no joints; expected a header t,q1..qN,tau1..tauN, or the names of"
+            " these columns in recording.columns of the description (or --columns): columns: {t: NAME, q1: NAME, "
+            "tau1: NAME, ...}",
+        ),
+    ],
+)
+def test_a_header_of_another_program_is_told_what_to_do(tmp_path: Path, header: str, words: str) -> None:
+    with pytest.raises(RecordingError) as caught:
+        CsvRecording(write(tmp_path / "run.csv", header + "\n0,1,2\n"))
+    assert words in str(caught.value)
+
+
+def test_a_wrong_column_map_shows_the_columns_that_there_are(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.csv", "zeit,winkel,moment\n0,1,2\n")
+    columns = {"t": "zeit", "q1": "angle", "tau1": "moment"}
+    with pytest.raises(RecordingError, match=r"no column 'angle' for q1; .*the file has the columns zeit, winkel, mom"):
+        open_recording(path, ["a"], fmt=RecordingFormat(columns=columns))
+
+
 def test_other_headers_by_column_map(tmp_path: Path) -> None:
     path = write(tmp_path / "run.csv", "stamp,current,angle,torque\n0.5,9,1,2\n0.6,9,3,4\n")
     columns = {"t": "stamp", "q1": "angle", "tau1": "torque"}

@@ -31,6 +31,8 @@ from ident_service.motion.state_machine import State
 from ident_service.operations.commissioning import record_motion
 from ident_service.recordings.open import open_recording
 
+BEGIN_ANEW = True
+
 pytestmark = pytest.mark.timeout(900)
 PATIENCE = 300.0  # s, for a machine that emulates another one and has more to do
 

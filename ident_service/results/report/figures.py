@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -71,7 +71,7 @@ class Figure:
         return self.canvas.svg(self.title, self.description, inline=inline)
 
 
-def _readable(axes: Axes, x: str, y: str, names: dict[str, str], *, logs: tuple[bool, bool] = (False, False)) -> Any:
+def _readable(axes: Axes, x: str, y: str, names: Mapping[str, str], *, logs: tuple[bool, bool] = (False, False)) -> Any:
     """Return what the page's script needs to tell the values of a plot under a cursor.
 
     Args:
