@@ -248,7 +248,7 @@ def feasible_sets() -> None:
 def deviations() -> None:
     """Draw how wrong standard deviations of independent samples are for residuals that are correlated in time."""
     rng = np.random.default_rng(1)
-    samples, block, trials = 2000, 100, 400
+    samples, block, trials = 6000, 100, 400
     time = np.arange(samples) * 0.01
     regressor = np.stack([np.sin(0.7 * time), np.sign(np.cos(0.7 * time)), np.ones(samples)], axis=1)
     inverse = np.linalg.inv(regressor.T @ regressor)
