@@ -307,10 +307,11 @@ def excitation() -> None:
     axes.set_xticks(range(len(names)), [name.split(" ")[0] for name in names])
     axes.axhline(UNKNOWN, color=GREY, lw=0.8, ls="--")
     axes.text(len(names) - 0.5, 1.3 * UNKNOWN, "not determined at all", ha="right", fontsize=8)
-    axes.set_ylim(top=300.0 * UNKNOWN)
+    axes.set_ylim(top=10.0 * UNKNOWN)
     axes.set_ylabel("expected standard deviation\n[SI unit of the parameter]")
     axes.grid(axis="y", alpha=0.3)
-    axes.legend(fontsize=8)
+    # Above the axes: within, it would cover markers.
+    figure.legend(fontsize=8, loc="outside upper center", ncols=3)
     saved(figure, "excitation", "ident preview of three motions of planar2")
 
 

@@ -101,7 +101,7 @@ _OPTIONAL: Sequence[tuple[Entry, str]] = (
 _OTHERS: Sequence[Entry] = (
     *(od.DEVICE_TYPE, od.PRODUCT, od.REVISION, od.SERIAL, od.SYNC_WINDOW, od.SYNC_OVERFLOW, od.GUARD_TIME),
     *(od.LIFE_FACTOR, od.HEARTBEAT_CONSUMER, od.HEARTBEAT_PRODUCER, od.RPDO_DEADLINE, pdo_entry(od.TPDO_PERIOD, 2)),
-    *(pdo_entry(od.TPDO_COB_ID, 2), od.VELOCITY_UNIT),
+    *(pdo_entry(od.TPDO_COB_ID, 2), od.VELOCITY_UNIT, od.SECOND_AXIS),
     *(od.TARGET_POSITION, od.TORQUE_ACTUAL, od.RATED_CURRENT, od.SUPPORTED_MODES, od.ENCODER_COUNTS, od.ENCODER_TURNS),
 )
 
@@ -163,6 +163,7 @@ class Capabilities:
         speed: entry of the largest speed; None where the drive has none, or nobody knows its unit.
         speed_size: how many of its unit a turn per minute is.
         watchdogs: kinds that it has, the most trusted first.
+        more_trusted: which of them is more trusted than the described one, in words; empty where none is.
         event: whether it has an event timer for status reports; else they come with every n-th SYNC.
         beside: whether its status is sent with its position.
         dummies: indices of what may take the room of others' torques, in the order in which they are tried.
@@ -180,6 +181,7 @@ class Capabilities:
     speed: Entry | None
     speed_size: float
     watchdogs: tuple[WatchdogKind, ...]
+    more_trusted: str
     event: bool
     beside: bool
     dummies: tuple[int, ...]
@@ -328,6 +330,8 @@ def assess(
         problems.insert(0, Problem("1000h", "does not report to be a drive of CiA 402"))
     count = _count(family, found, drive)
     limit = next((one for one in family.torque_limit if _limits(one, found)), None)
+    if found.has(od.SECOND_AXIS):
+        notes.append("6841h is there: of its axes only the first one (6041h) is driven")
     notes += _other_limits(family, found, drive, limit)
     speed, size = None, 1.0
     for entry in [parse_entry(text, "largest speed") for text in family.speed_limit]:
@@ -376,6 +380,7 @@ def assess(
         speed,
         size,
         watchdogs,
+        _more_trusted(watchdogs, drive),
         event,
         beside,
         tuple(dummies),
@@ -546,6 +551,15 @@ def _watchdogs(family: Family, found: DriveEntries, drive: CanopenDrive) -> Iter
         yield "heartbeat"
     if found.has(od.GUARD_TIME) and found.has(od.LIFE_FACTOR):
         yield "node_guarding"
+
+
+def _more_trusted(watchdogs: Sequence[WatchdogKind], drive: CanopenDrive) -> str:
+    """Tell of a watchdog that misses the data itself where the described one misses a process, which may outlive it."""
+    best = next(iter(watchdogs), drive.watchdog)
+    by_data = best in ("rpdo_timer", "vendor", "sync_loss") and drive.watchdog in ("heartbeat", "node_guarding")
+    return (
+        f"{best} misses the frames themselves, {drive.watchdog} (drives.watchdog) only their sender" if by_data else ""
+    )
 
 
 def _identifier_is_free(sheet: DataSheet | None) -> bool:

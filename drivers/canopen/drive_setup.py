@@ -53,7 +53,7 @@ _NOT_VALID = 1 << 31
 _AT_SYNC = (1, 0, 255)  # types of frames of targets, in the order in which they are tried
 
 
-def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo], dummies: Sequence[int]) -> None:
+def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo], dummies: Sequence[int]) -> bool:
     """Configure a pre-operational drive's PDOs.
 
     Args:
@@ -61,6 +61,9 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
         pdos: that it shall have; slots of other drives are `od.DUMMY_INT16`.
         unused: that it shall not have; they may be missing.
         dummies: indices of dummies that may take the room of others' slots, in the order in which they are tried.
+
+    Returns:
+        Whether frames of targets act when they come, not at a SYNC, as the drive can do no better.
 
     Raises:
         SdoRefused: it does not take one of them.
@@ -70,13 +73,14 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
         optional(lambda one: _off(objects, one), pdo)
     variants = {pdo: _variants(pdo, dummies) for pdo in pdos}
     waiting = [pdo for pdo in pdos if not any(_is_there(objects, one) for one in variants[pdo])]
+    at_once = False
     for pdo in waiting:
         _off(objects, pdo)
     for pdo in waiting:
         _map(objects, variants[pdo])
         for write in pdo.parameters:
             if write.entry.sub == od.RPDO_TYPE.sub and not pdo.sent and pdo.type == _AT_SYNC[0]:
-                _synchronous(objects, pdo, write)
+                at_once = _synchronous(objects, write) == _AT_SYNC[-1]
             elif write.entry.sub == od.TPDO_INHIBIT.sub:
                 objects.write_if_present(write)
             else:
@@ -93,10 +97,11 @@ def configure_pdos(objects: Objects, pdos: Sequence[Pdo], unused: Sequence[Pdo],
             objects.write_if_present(
                 pdo.timing
             )  # a deadline left by another host could report a silence where there is none
+    return at_once
 
 
-def _synchronous(objects: Objects, pdo: Pdo, wanted: Write) -> None:
-    """Set the type of a frame of targets: at every SYNC, where a drive lacks that at the next, or at once.
+def _synchronous(objects: Objects, wanted: Write) -> int:
+    """Set the type of a frame of targets: at every SYNC, where a drive lacks that at the next, or at once; return it.
 
     At once, a target acts by the time that its frames need on the wire before the stamp of its cycle.
     """
@@ -106,10 +111,11 @@ def _synchronous(objects: Objects, pdo: Pdo, wanted: Write) -> None:
         except SdoRefused as refused:
             if kind == _AT_SYNC[-1] or refused.code not in (*WRONG_VALUE, *READ_ONLY):
                 raise
-            if refused.code in READ_ONLY and objects.read(wanted.entry) in _AT_SYNC:
-                return
+            if refused.code in READ_ONLY and (held := objects.read(wanted.entry)) in _AT_SYNC:
+                return held
         else:
-            return
+            return kind
+    raise AssertionError("the last type is set or refused")
 
 
 def _is_timed(objects: Objects, pdo: Pdo, write: Write) -> bool:
@@ -382,7 +388,7 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     _encoder(objects, setup.drive)
     _timing(objects, setup)
     unused = setup.profile.silenced(setup.drive.node)
-    configure_pdos(objects, setup.pdos(), unused, setup.can.dummies)
+    at_once = configure_pdos(objects, setup.pdos(), unused, setup.can.dummies)
     _rated_torque(objects, setup)
     _largest_torque(objects, setup)
     _max_speed(objects, setup)
@@ -401,7 +407,7 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):
             objects.write_if_present(write)
-    return _mode(objects, setup)
+    return replace(_mode(objects, setup), at_once=at_once)
 
 
 def _timing(objects: Objects, setup: DriveConfiguration) -> None:

@@ -588,7 +588,9 @@ class CanopenArm(Arm):
             identity += f"; {can.summary}"  # a preflight ticket is for what was found of the drive
             own = self._driver.reactions, self._quick_stop, motors[number], can
             self._begun = number + 1
-            buses.modes[number] = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
+            mode = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
+            buses.modes[number] = mode
+            identity += ", its targets act when they come, not at SYNC" if mode.at_once else ""
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
                 if not self._zeros.restore_mark(objects, number, counts, buses.restarted(number)):

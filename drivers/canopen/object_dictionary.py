@@ -157,6 +157,7 @@ VELOCITY_UNIT = Entry(0x60A9, 0, Kind.U32, "unit of velocities", "prefix, unit, 
 TORQUE_OFFSET = Entry(0x60B2, 0, Kind.I16, "torque offset", "per mille of rated torque")
 PERIOD_NUMBER = Entry(0x60C2, 1, Kind.U8, "interpolation period", "10^PERIOD_POWER s")
 PERIOD_POWER = Entry(0x60C2, 2, Kind.I8, "power of ten of the interpolation period")
+SECOND_AXIS = Entry(0x6841, 0, Kind.U16, "status word of a second axis")  # 800h further for each (CiA 402-2)
 SUPPORTED_MODES = Entry(0x6502, 0, Kind.U32, "supported modes")
 
 
@@ -169,12 +170,14 @@ class OperationMode:
         display: entry that tells the mode in effect.
         wanted: value of `display` in that mode.
         enabling: bits of the control word without which the drive does not follow its target in that mode.
+        at_once: whether its target acts when its frame comes, not at SYNC, so that the host's delays are in it.
     """
 
     sent: int
     display: Entry
     wanted: int
     enabling: int = 0
+    at_once: bool = False
 
 
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h

@@ -433,8 +433,9 @@ def _problems(error: ValidationError, tree: Tree, path: Path, section: str = "")
     """Yield each mistake that the models found, those of one value as one, with what should stand there instead."""
     known = KnownKeys(section)
     found: dict[KeyPath, list[ErrorDetails]] = {}
+    keys: dict[int, list[str]] = {}
     for mistake in error.errors(include_url=False):
-        where = _where(mistake["loc"], tree.value)
+        where = _where(mistake["loc"], tree.value, keys)
         if mistake["type"] == "missing":
             where = (*where, mistake["loc"][-1])
         found.setdefault(where, []).append(mistake)
@@ -542,18 +543,25 @@ def _value(value: Any) -> str:
     return repr(str(value)) if isinstance(value, str) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _where(loc: tuple[int | str, ...], value: Any) -> KeyPath:
-    """Return the part of a validator's location that exists in the file, without union branches and missing keys."""
+def _where(loc: tuple[int | str, ...], value: Any, keys: dict[int, list[str]]) -> KeyPath:
+    """Return the part of a validator's location that exists in the file, without union branches and missing keys.
+
+    Args:
+        loc: the location.
+        value: the whole file.
+        keys: of the tables that were met, listed once each, since every value of a large table may be wrong.
+    """
     where: list[str | int] = []
     for number, part in enumerate(loc):
         if part == "values" and isinstance(value, dict) and part not in value:  # of a table of parameters
             index = loc[number + 1] if number + 1 < len(loc) else None
             if isinstance(index, int) and index < len(value):
-                where.append(list(value)[index])
+                if id(value) not in keys:
+                    keys[id(value)] = list(value)
+                where.append(keys[id(value)][index])
             break
-        if isinstance(value, tuple) and isinstance(part, int):
-            value = dict(enumerate(value))
-        if isinstance(value, dict) and part in value:
+        there = part in value if isinstance(value, dict) else isinstance(value, tuple) and part in range(len(value))
+        if there:
             where.append(part)
             value = value[part]
     return tuple(where)

@@ -23,8 +23,9 @@ from ident_service.fleet.population import Group, HeldOut, Population, Shares, U
 from ident_service.fleet.reduction import FleetRequest, Recorded, Reduced
 from ident_service.fleet.trends import Change, Dependence, Scatter, series
 from ident_service.model.chain import Array
+from ident_service.operations.drift_alarms import FLEET as FLEET
 
-FLEET, PAGE, TABLE, PROBLEMS = "fleet.json", "fleet.html", "parameters.parquet", "problems.json"
+PAGE, TABLE, PROBLEMS = "fleet.html", "parameters.parquet", "problems.json"
 FORMAT: Final = "ident-fleet"
 _ARMS_DRAWN = 12  # arms whose trends the page shows
 _GROUPS_DRAWN = 6  # of each

@@ -119,7 +119,10 @@ def _check_names(model: ArmModel) -> None:
                 f"which is neither {BASE!r} nor one of {', '.join(model.chain.names)}"
             )
     if mentioned and BASE in model.chain.names:
-        raise ModelError(f"{model.config.name}: a joint is called {BASE!r}, which here means what does not move")
+        raise ModelError(
+            f"{model.config.name}: a joint is called {BASE!r}, which in geometry and workspace.may_touch names what "
+            f"does not move; rename the joint in its kinematics, as {BASE + '_joint'!r}"
+        )
 
 
 def _pairs(chain: Chain, owners: dict[str, list[int]]) -> Iterator[tuple[str, str]]:

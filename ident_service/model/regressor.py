@@ -89,9 +89,15 @@ def joint_regressor(
 @lru_cache(maxsize=32)
 def _program(chain: Chain, layout: Layout, columns: tuple[int, ...]) -> tuple[Program, list[tuple[int, int]]]:
     """Return the traced formulas, and the (joint, column) that each output belongs to; the others are zero."""
-    tape, entries = traced_regressor(chain, layout)
+    tape, entries = _traced(chain, layout)
     kept = entries_of(entries, columns)
     return Program(tape, list(kept.values())), list(kept)
+
+
+@lru_cache(maxsize=4)
+def _traced(chain: Chain, layout: Layout) -> tuple[ExpressionGraph, dict[tuple[int, int], Value]]:
+    """Return the formulas for all columns, from which programs for some are planned; nobody adds to the tape."""
+    return traced_regressor(chain, layout)
 
 
 def traced_regressor(chain: Chain, layout: Layout) -> tuple[ExpressionGraph, dict[tuple[int, int], Value]]:

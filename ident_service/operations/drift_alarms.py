@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from typing import Any, Final
 
 from ident_service.errors import UnknownId, UsageError
 from ident_service.registry.database import Database, Row, note
 
+FLEET: Final = "fleet.json"
+"""File of a fleet's results that says which arms have changed."""
 _MOST = 4000  # characters
 
 
@@ -56,8 +59,8 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
     Args:
         db: the registry.
         arm: name.
-        reidentification: id.
-        run: id of the run that differs from the accepted set.
+        reidentification: id; empty where a fleet shows the change.
+        run: id of the run that differs from the accepted set, or of the fleet's results.
         what: the findings, in words.
         now: s since 1970 in UTC.
     """
@@ -67,6 +70,33 @@ def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: s
             *(arm, reidentification, run, what, now),
         )
         note(db, "service", "drift alarm", arm, run=run, found=what)
+
+
+def raise_fleet_alarms(db: Database, document: Mapping[str, Any], made: str, now: float) -> None:
+    """Enter a drift alarm for each change that a fleet shows and that was not told before.
+
+    A change was told if an alarm of that arm and group stands, or was raised by a fleet after the change. What goes on
+    drifting after somebody acknowledged it is told again.
+
+    Args:
+        db: the registry.
+        document: `fleet.json`.
+        made: id of the fleet's results.
+        now: s since 1970 in UTC.
+    """
+    with db.transaction():
+        for one in document["changes"]:
+            begin = f"changed: {one['what']},"
+            until = datetime.fromisoformat(one["until"]).timestamp()
+            earlier = [row for row in alarms(db, one["arm"], closed=True, most=1000) if row["what"].startswith(begin)]
+            if any(row["closed"] is None or row["at"] >= until for row in earlier):
+                continue
+            words = (
+                f"{begin} as its recordings in a fleet show: a {one['kind']} between {one['after'][:10]} and "
+                f"{one['until'][:10]}, {100.0 * one['torque_share']:.2g} % of the torque of joint {one['joint']}, "
+                f"{one['sigma']:.1f} sigma"
+            )
+            raise_alarm(db, one["arm"], "", made, words, now)
 
 
 def alarms(

@@ -529,7 +529,8 @@ def _capability_rows(one: Probed, found: Probe) -> dict[str, str]:
     facts["torque"] = f"{mode}, {named(can.torque.target)}; a count is {count}{of}"
     facts["torque_limit"] = "none" if can.limit is None else named(can.limit.entry)
     facts["speed_limit"] = "set by the host" if can.speed is None else where(can.speed)
-    facts["watchdogs"] = ", ".join(can.watchdogs) or "none"
+    better = can.more_trusted
+    facts["watchdogs"] = (", ".join(can.watchdogs) or "none") + (f"; {better}" if better else "")
     dummies = ", ".join(f"{dummy:04X}h" for dummy in can.dummies)
     shares = f"can be shared; foreign slots by {dummies}" if can.shares else "single"
     facts["torque_frames"] = f"{shares}, as far as its file and family know"

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Decimal
+from operator import methodcaller
 from pathlib import Path
 from typing import IO, Final, cast
 
@@ -270,7 +271,7 @@ class CsvRecording:
         """Parse rows to a block; `first` is the line number of the first one."""
         columns = self._columns
         separators = columns.fields - 1
-        if any(row.count(b",") != separators for row in rows):
+        if set(map(methodcaller("count", b","), rows)) != {separators}:
             self._explain(rows, first)
         text = b",".join(rows)
         try:

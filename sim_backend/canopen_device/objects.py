@@ -159,7 +159,10 @@ class Objects:
         value = self.values[key]
         if isinstance(value, bytes):
             return value
-        size = self.entries[key].size or _OF_NO_NUMBER
+        entry = self.entries[key]
+        if entry.form == "?":
+            return bytes([bool(value)])
+        size = entry.size or _OF_NO_NUMBER
         return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
     def write(self, index: int, subindex: int, data: bytes) -> None:

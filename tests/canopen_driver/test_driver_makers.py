@@ -278,6 +278,7 @@ def test_torque_frames_act_at_sync_at_the_next_or_at_once_as_a_drive_has_it(low:
     for first in (True, False):
         with bench.arm as arm:
             assert [face.objects.number(0x1400, 2) for face in bench.behind.emulator.faces] == [kind] * 2  # type: ignore[attr-defined]
+            assert ("its targets act when they come" in " ".join(arm.describe().identities)) is (kind == 255)
             # 255 is what many have from the factory: whether that is all they can shows when another is written.
             assert first or kind == 255 or not [one for one in bench.downloads() if one[1] == 0x1400]
             arm.enable()

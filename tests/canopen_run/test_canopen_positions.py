@@ -103,7 +103,7 @@ def test_a_run_ends_where_it_began_and_a_stop_is_a_stop(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fault", "codes"),
     [
-        ("frozen_encoder joint=elbow duration=5", ("torque_unexplained",)),
+        ("frozen_encoder joint=elbow duration=5", ("frozen_encoder", "torque_unexplained")),
         ("lost_feedback joint=elbow duration=1", ("feedback_gone",)),
         ("encoder_jump joint=elbow duration=1 size=0.1", ("encoder_jumps", "feedback_gone", "following_error")),
         ("drive_fault joint=elbow", ("drive_emergency", "drive_fault")),

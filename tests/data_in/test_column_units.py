@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from estimation.synthetic import recorded, waves
 from hypothesis import given
 from hypothesis import strategies as st
 from made_recordings import whole
@@ -17,6 +18,8 @@ from made_recordings import whole
 from ident_service.config.load import load_arm, load_recording_format
 from ident_service.config.recording import Column, RecordingFormat
 from ident_service.errors import ConfigError, ModelError, RecordingError
+from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.plausibility import reasons_against
 from ident_service.model.arm_model import arm_model
 from ident_service.recordings.open import open_recording
 
@@ -150,3 +153,45 @@ def test_a_factor_of_one_that_is_given_is_given_still_after_it_was_kept() -> Non
     column = Column(column="theirs", unit="A", factor=1.0)
     again = Column.model_validate_json(column.model_dump_json())
     assert again.scale("tau1") == 1.0
+
+
+ODD_COLUMNS = """\
+columns:
+  t: {column: stamp, unit: ms}
+  q1: {column: enc_1, unit: counts, factor: 1.0e-5}
+  q2: {column: axis_2, unit: deg, factor: -1}
+  tau1: {column: current_1, unit: mA, factor: 11.2}
+  tau2: {column: current_2, unit: mA, factor: -4.5}
+"""
+
+
+def test_counts_and_currents_with_their_signs_identify_as_si_does(tmp_path: Path) -> None:
+    model = arm_model(load_arm("planar2"))
+    delta, motion = model.prior, waves(4, 2)
+    assert delta is not None
+    exact = recorded(model, delta, motion, rate=100.0, seconds=20.0)
+    rng = np.random.default_rng(1)
+    time = np.arange(len(exact.position)) / 100.0
+    # An encoder of 100,000 counts a radian; the second axis and its current count the other way round.
+    counts = np.round(1e5 * exact.position[:, 0])
+    torque = exact.torque + 0.02 * rng.normal(size=exact.torque.shape)
+    plain = np.column_stack([time, 1e-5 * counts, exact.position[:, 1], torque])
+    odd = np.column_stack(
+        [1e3 * time, counts, -np.degrees(exact.position[:, 1]), 1e3 * torque[:, 0] / 11.2, 1e3 * torque[:, 1] / -4.5]
+    )
+    np.savetxt(tmp_path / "si.csv", plain, delimiter=",", header="t,q1,q2,tau1,tau2", comments="", fmt="%.15g")
+    head = "stamp,enc_1,axis_2,current_1,current_2"
+    np.savetxt(tmp_path / "odd.csv", odd, delimiter=",", header=head, comments="", fmt="%.15g")
+    (tmp_path / "columns.yaml").write_text(ODD_COLUMNS)
+    (tmp_path / "turned.yaml").write_text(ODD_COLUMNS.replace("-4.5", "4.5"))
+
+    def identified(name: str, columns: str | None) -> Estimate:
+        form = None if columns is None else load_recording_format(tmp_path / columns)
+        return identify(model, [open_recording(tmp_path / name, model.chain.names, fmt=form or RecordingFormat())])
+
+    wanted, found = identified("si.csv", None), identified("odd.csv", "columns.yaml")
+    np.testing.assert_allclose(found.beta, wanted.beta, rtol=1e-6, atol=1e-8)
+    truth = wanted.base.K @ delta
+    assert np.linalg.norm(wanted.fit.R1 @ (wanted.beta - truth)) < 0.01 * np.linalg.norm(wanted.fit.R1 @ truth)
+    assert reasons_against(found) == ()
+    assert any("wrong sign" in reason for reason in reasons_against(identified("odd.csv", "turned.yaml")))

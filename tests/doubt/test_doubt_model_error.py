@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -19,6 +20,7 @@ from ident_service.estimation.uncertainty import negligible, verdicts
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.operations.commissioning import true_parameters
+from ident_service.results.summary import noise_and_model
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RATE = 100.0
@@ -68,6 +70,17 @@ def judged(fit: Fit) -> np.ndarray:
     return np.asarray(((fit.fit.beta - base.K @ truth) / fit.deviations)[identified])
 
 
+def noise_share(fit: Fit) -> float:
+    """Read from the words beside a result how much of the variances is noise."""
+    assert fit.noise is not None
+    words = noise_and_model(np.sqrt(fit.noise), np.diag(fit.covariance))
+    found = re.match(
+        r"The motion is repeated: (\d+)% of a parameter's variance is noise .* the rest is model error", words
+    )
+    assert found is not None
+    return float(found[1]) / 100.0
+
+
 @pytest.mark.slow
 def test_more_periods_do_not_make_an_error_of_the_model_smaller(wam7_data: Path) -> None:
     one, nine = (fitted(made(wam7_data, "traj1", periods, error=0.1, seed=0)) for periods in (1, 9))
@@ -77,6 +90,9 @@ def test_more_periods_do_not_make_an_error_of_the_model_smaller(wam7_data: Path)
     assert np.median(nine.deviations[known] / one.deviations[known]) == pytest.approx(1.0, abs=0.15)
     assert np.median(np.sqrt(nine.noise[known]) / nine.deviations[known]) < 0.1
     assert len(nine.equations.clusters) == len(one.equations.clusters)
+    # The report says so: of one period nothing can be told, of nine nearly all is model error.
+    assert "cannot be separated" in noise_and_model(None, np.diag(one.covariance))
+    assert noise_share(nine) < 0.01
     for fit in (one, nine):
         errors = judged(fit)
         assert len(errors) > 20
@@ -90,6 +106,7 @@ def test_more_periods_make_noise_smaller(wam7_data: Path) -> None:
     known = np.isfinite(one.deviations) & np.isfinite(nine.deviations)
     assert np.median(nine.deviations[known] / one.deviations[known]) == pytest.approx(1.0 / 3.0, abs=0.1)
     assert len(judged(nine)) > len(judged(one))
+    assert noise_share(nine) > 0.3
 
 
 @pytest.mark.campaign

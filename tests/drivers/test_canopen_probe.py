@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from helpers.emulated_arms import weightless_config
+from helpers.emulated_arms import EDS, weightless_config
 from helpers.makers import CAPABLE, REFUSED, SHEETS, Bench, arm_of, sheet
 
 from drivers.can.can_frame import Frame
@@ -95,6 +95,17 @@ def test_drives_without_one_are_refused_in_one_sentence(name: str) -> None:
     refusals = [line for line in text.splitlines() if "REFUSED" in line]
     assert len(refusals) == 2
     assert "torque mode" in refusals[0]
+
+
+def test_a_more_trusted_watchdog_and_further_axes_are_told_of() -> None:
+    text = EDS + "".join(f"\n[{index}]\nDataType=6\nAccessType=ro\n" for index in ("6841", "7041"))
+    config = arm_of("", text=text, torque_frames="shared", drive={"watchdog": "heartbeat"})
+    told = probed(Bench(config), config)
+    assert "rpdo_timer misses the frames themselves, heartbeat (drives.watchdog) only their sender" in told
+    assert "6841h is there: of its axes only the first one (6041h) is driven" in told
+    plain = probed(Bench(weightless_config()), weightless_config())
+    assert "misses the frames" not in plain
+    assert "6841h" not in plain
 
 
 def test_a_drive_that_is_silent_is_foretold() -> None:

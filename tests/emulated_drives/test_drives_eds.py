@@ -114,6 +114,6 @@ def test_the_emulated_drive_answers_what_it_says() -> None:
 
 
 def test_what_is_no_eds_is_refused() -> None:
-    for text in ("no section", "[1000]\nParameterName=x\n", "[1000]\nParameterName=x\nDataType=0x1B\nAccessType=rw\n"):
+    for text in ("no section", "", "[DeviceInfo]\n", "[FileInfo]\nA=1\n", "[1000\nDataType=7\n", "[12]\nDataType=7\n"):
         with pytest.raises(DriverError, match="EDS"):
             Objects(text, 1)

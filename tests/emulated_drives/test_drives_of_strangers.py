@@ -20,6 +20,10 @@ from helpers.makers import CAPABLE, SHEETS, Bench, arm_of
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from drivers.can.can_frame import Frame
+from drivers.canopen.object_dictionary import Entry, Kind
+from drivers.canopen.pdo_mapping import Pdo
+from drivers.canopen.sdo import Objects, SdoRefused
 from ident_service.cli import DONE, main
 from ident_service.config.eds import DataSheet, data_sheet
 from ident_service.config.load import sheet_file
@@ -27,6 +31,7 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import IdentError
 from ident_service.operations.drive_configuration import planned_configuration, planned_text
 from ident_service.operations.fieldbus import bus_probe, probe_document, probe_text
+from sim_backend.emulator.lock_step import LockStepArm
 
 FILES = sorted(SHEETS.glob("*.[ed][dc][sf]"))
 VALUE = re.compile(
@@ -172,6 +177,37 @@ def test_the_command_takes_a_utf16_file(tmp_path: Path, capsys: pytest.CaptureFi
 KINDS = ("0x0001", "0x0002", "0x0003", "0x0004", "0x0005", "0x0006", "0x0007", "0x0008", "0x0009", "0x000F", "0x1B", "")
 ODD = ("", "0", "1", "0xFFFFFFFF", "-1", "255", "0x80000000", "9" * 30, "$NODEID", "x", "1.5")
 MATTER = ("10", "14", "16", "18", "1A", "60", "64", "65")  # how the sections begin that the driver looks at
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_the_firmware_keeps_is_read_and_sent_whatever_type_a_file_gives_it(kind: str) -> None:
+    """A status word, and a torque of -3, of too few bits, without a sign, or of no number at all."""
+    text = EDS
+    for index in ("6041", "6077"):
+        head, tail = text.split(f"[{index}]")
+        text = f"{head}[{index}]{re.sub('DataType=.*', f'DataType={kind}', tail, count=1)}"
+    config = arm_of("", text=text, torque_frames="shared", drive={"watchdog": "rpdo_timer"})
+    behind = LockStepArm(config)
+    face, link = behind.emulator.faces[0], behind.link(0)
+    link.clock.sleep_until_ns(link.clock.now_ns() + 50_000_000)  # until it has booted
+    objects = Objects(link, 1)
+    face.objects.values[0x607700] = -3  # type: ignore[attr-defined]
+    torque, status = (objects.read_bytes(index, 0, "") for index in (0x6077, 0x6041))
+    size = face.objects.entries[0x607700].size or 4  # type: ignore[attr-defined]
+    assert torque == (b"\x01" if kind == "0x0001" else (-3).to_bytes(size, "little", signed=True))
+    assert status[0] & 0x6F == (1 if kind == "0x0001" else 0x40)
+    (tpdo,) = [Pdo(3, True, 0x381, 1, (Entry(0x6077, 0, Kind[f"U{8 * size}"], "torque"),))]
+    try:
+        for write in tpdo.writes():
+            objects.write(write)
+    except SdoRefused:
+        assert not face.objects.entries[0x607700].form  # type: ignore[attr-defined]  # what is no number is not mapped
+        return
+    link.send(Frame(0x000, b"\x01\x00"))
+    face.objects.values[0x607700] = -3  # type: ignore[attr-defined]
+    link.send(Frame(0x080))
+    link.clock.sleep_until_ns(link.clock.now_ns() + 2_000_000)
+    assert torque in [frame.data for frame in link.drain() if frame.identifier == 0x381]
 
 
 def spoiled(text: str, chance: random.Random) -> str:

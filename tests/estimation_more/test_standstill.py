@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording, recorded, serial_chain, waves, with_options
+from estimation.synthetic import SampledRecording, Waves, recorded, serial_chain, waves, with_options
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
-from ident_service.config.arm import Reversal
+from ident_service.config.arm import Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.identify import identify
@@ -61,20 +61,32 @@ def test_rows_that_the_model_explains_count_in_full_and_others_as_they_deserve()
     assert not weighed.near
 
 
+def fast(amplitude: float) -> Waves:
+    """Swing the joints at 2 and 2.7 Hz."""
+    return Waves(np.array([[2.0], [2.7]]), np.array([[0.1], [0.5]]), np.full((2, 1), amplitude))
+
+
+def test_two_hertz_are_identified_by_default_and_refused_only_for_being_slow() -> None:
+    model, delta = arm()
+    default = with_options(model, Identification())
+    recording = recorded(default, delta, fast(0.3), rate=RATE, seconds=20.0)
+    estimate = identify(default, [recording])
+    assert estimate.candidates[estimate.chosen].identification.relative_percent < 3.0
+    # At 2 mrad and 2.7 Hz a joint moves with 0.034 rad/s: that is the reason, and no window around reversals is.
+    small = recorded(default, delta, fast(0.002), rate=RATE, seconds=20.0)
+    with pytest.raises(
+        RecordingError, match=r"never faster than identification\.reversal\.speed \(0\.05 rad/s"
+    ) as caught:
+        identify(default, [small])
+    assert "window" not in str(caught.value)
+
+
 def test_a_motion_that_turns_round_all_the_time_is_identified() -> None:
     # 2 Hz: no row is further than the window from a reversal.
     model, delta = arm()
     busy = with_options(model, plain_options(smoothing=plain_smoothing(cutoff=60.0), reversal=Reversal(window=0.3)))
-    time = np.arange(round(20.0 * RATE)) / RATE
     base = base_parameters(model.chain, model.layout)
-
-    class Fast:
-        def derivative(self, t: np.ndarray, order: int) -> np.ndarray:
-            rates = 2.0 * np.pi * np.array([2.0, 2.7])
-            return np.sin(np.outer(t, rates) + 0.5 * np.pi * order + np.array([0.1, 0.5])) * 0.3 * rates**order
-
-    assert len(time) == 5000
-    recording = recorded(busy, delta, Fast(), rate=RATE, seconds=20.0)  # type: ignore[arg-type]
+    recording = recorded(busy, delta, fast(0.3), rate=RATE, seconds=20.0)
     gathered = equations(recording, busy, base)
     assert gathered.total.rows.max() == 0
     np.testing.assert_array_equal(standstill_weights(gathered), 1.0)

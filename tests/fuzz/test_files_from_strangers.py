@@ -338,11 +338,13 @@ def _star() -> str:
 
 
 # What took longest or most, the worst of each kind that was found: 55 s and 1.2 GB of a URDF, 56 s of parameters, 57 s
-# of a header, 6 s of an EDS, 13 s and 3 GB of a description's JSON; and a motion whose kind of 2 MB was the answer.
+# of a header, 6 s of an EDS, minutes of a list of wrong words, 13 s and 3 GB of a description's JSON; and a motion whose
+# kind of 2 MB was the answer.
 LARGEST: dict[str, Callable[[], tuple[str, str]]] = {
     "attributes": lambda: ("urdf", "<robot " + " ".join(f"a{k}='1'" for k in range(150_000)) + "/>"),
     "joints of one link": lambda: ("urdf", _star()),
     "aliases": lambda: ("yaml", "a: &a [1, 1]\n" + "".join(f"b{k}: [*a, *a, *a]\n" for k in range(10_000))),
+    "wrong terms": lambda: ("yaml", "extends: planar2\nterms: [" + "iscous, " * 25_000 + "offset]\n"),
     "lists": lambda: ("yaml", "a: [" + "1," * 130_000),
     "sums of 200 links": lambda: ("parameters", _table(*(f"m199 + {k + 1}*m{k % 199 + 1}" for k in range(20_000)))),
     "long sums": lambda: ("parameters", _table(*[" + ".join(f"{k}*m{k % 9 + 1}" for k in range(7000))] * 5)),

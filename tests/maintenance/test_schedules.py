@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from maintenance.conftest import ARM, MONDAY, Clock
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.operations.drift_alarms import acknowledge_alarm, alarms, raise_alarm
+from ident_service.operations.drift_alarms import acknowledge_alarm, alarms, raise_alarm, raise_fleet_alarms
 from ident_service.operations.maintenance_schedule import (
     DueRule,
     add_event,
@@ -201,6 +202,30 @@ def test_a_number_never_comes_twice_and_the_trail_names_who(db: Database, clock:
     assert told["maintenance"] == "bob"
     assert told["schedule removed"] == "carl"
     assert told["due"] == "service"
+
+
+def test_a_change_that_a_fleet_shows_is_an_alarm_once(db: Database, clock: Clock) -> None:
+    change = {"arm": ARM, "what": "friction of joint elbow", "kind": "step", "after": "2026-01-15T00:00:00+00:00",
+              "until": "2026-01-22T00:00:00+00:00", "joint": "elbow", "torque_share": 0.12, "sigma": 19.1}  # fmt: skip
+    week = 7 * 86_400.0
+    begin = datetime.fromisoformat(change["until"]).timestamp()
+
+    def told(now: float, **other: str) -> list[str]:
+        before = {row["id"] for row in alarms(db, closed=True)}
+        raise_fleet_alarms(db, {"changes": [change | other]}, "export", now)
+        return [row["what"] for row in alarms(db, closed=True) if row["id"] not in before]
+
+    assert told(begin + week) == [
+        "changed: friction of joint elbow, as its recordings in a fleet show: a step between 2026-01-15 and "
+        "2026-01-22, 12 % of the torque of joint elbow, 19.1 sigma"
+    ]
+    assert told(begin + 2 * week) == [], "one stands"
+    assert len(told(begin + 2 * week, what="friction of joint shoulder")) == 1
+    assert len(told(begin + 2 * week, arm="other")) == 1
+    acknowledge_alarm(db, 1, "the seal is dry", "me", begin + 2 * week)
+    assert told(begin + 3 * week) == [], "somebody knows of it"
+    later = datetime.fromtimestamp(begin + 4 * week, UTC).isoformat()
+    assert len(told(begin + 5 * week, until=later)) == 1, "another change"
 
 
 def test_an_alarm_stands_until_a_person_says_why_it_may_go(db: Database, clock: Clock) -> None:

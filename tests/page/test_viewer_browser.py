@@ -80,19 +80,19 @@ def drawn(page: Page) -> int:
     return int(page.evaluate(PIXELS))
 
 
-def confirm_page(page: Page, reached: Reached) -> None:
-    """Ask for a run as the page of the arm does, whichever of its steps comes next."""
+def confirm_page(page: Page, reached: Reached, kind: str = "run") -> None:
+    """Ask for a motion as the page of the arm does, whichever of its steps comes next."""
     page.goto(f"{reached.url}/arms/{ARM}")
     with page.expect_navigation():
         page.evaluate(
-            """address => {
+            """([address, kind]) => {
               const form = document.createElement("form");
               Object.assign(form, { method: "post", action: address });
-              form.innerHTML = '<input name="kind" value="run"><input name="speed" value="1">';
+              form.innerHTML = `<input name="kind" value="${kind}"><input name="speed" value="1">`;
               document.body.append(form);
               form.submit();
             }""",
-            f"/arms/{ARM}/confirm",
+            [f"/arms/{ARM}/confirm", kind],
         )
     page.get_by_label("Type the arm's name").wait_for()
 
@@ -134,6 +134,27 @@ def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], p
     path = page.locator("#viewer-clearance .itself").get_attribute("d")
     assert path is not None
     assert path.count("L") == len(view["clearance"]["samples"]) - 1
+
+
+def test_distances_are_told_while_the_arm_is_on_its_way(shown: tuple[Browser, Reached, str], page: Page) -> None:
+    _, reached, _ = shown
+    confirm_page(page, reached, "rehearse")
+    page.locator("#viewer-controls").wait_for()
+    view = page.evaluate(f"fetch('/api/v1/arms/{ARM}/view?motion=own').then((answer) => answer.json())")
+    near, samples = view["clearance"]["itself"], view["clearance"]["samples"]
+    row = int(np.argmin(near["distance"]))
+    posture = [values[samples[row]] for values in view["position"]]
+    tell = """([joints, posture]) => document.dispatchEvent(new CustomEvent("samples", { detail: {
+      joints, time: [1.5], position: posture.map((value) => [0, value]) } }))"""
+    joints = [joint["name"] for joint in view["figure"]["joints"]]
+    page.evaluate(tell, [joints, posture])
+    expect(page.locator("#viewer-status")).to_have_text("As measured, 1.5 s after the recording began.")
+    pair = view["clearance"]["pairs"][near["pair"][row]]
+    expect(page.locator("#viewer-itself")).to_have_text(f"{1000 * near['distance'][row]:.0f} mm, {pair}")
+    expect(page.locator("#viewer-distances")).to_be_visible()
+    # Away from the motion nobody has computed them.
+    page.evaluate(tell, [joints, [value + 3.0 for value in posture]])
+    expect(page.locator("#viewer-distances")).to_be_hidden()
 
 
 def test_the_browser_places_joints_as_the_service_does(shown: tuple[Browser, Reached, str], page: Page) -> None:

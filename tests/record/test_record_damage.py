@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import struct
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import lz4.frame
@@ -25,6 +27,7 @@ from record_samples import (
 )
 
 from ident_service.errors import RecordingError
+from ident_service.recordings import mcap_records
 from ident_service.recordings.mcap_reader import JointStateDecoder, McapRecording, PayloadError
 from ident_service.recordings.mcap_writer import JOINT_STATE, JointStateEncoder
 
@@ -161,3 +164,55 @@ def test_any_payload_is_a_joint_state_or_refused(noise: bytes) -> None:
         except PayloadError:
             continue
         assert len(block.stamp_ns) in (2, 3)
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def _message(channel: int, time: int, payload: bytes) -> bytes:
+    return _record(5, struct.pack("<HIQQ", channel, time % 2**32, time, time) + payload)
+
+
+@st.composite
+def runs_of_records(draw: st.DrawFn) -> tuple[bytes, list[tuple[int, int, bytes]]]:
+    """A loop's messages, again and again, between single ones; and what a reader must find of channels 1 and 2."""
+    run, messages, time = b"", [], 0
+    for _ in range(draw(st.integers(1, 4))):
+        period = draw(st.lists(st.tuples(st.integers(1, 4), st.integers(0, 20)), min_size=1, max_size=5))
+        for _ in range(draw(st.sampled_from([1, 2, 9, 30]))):
+            for channel, length in period:
+                payload = bytes((time + k) % 256 for k in range(length))
+                messages.append((channel, time, payload))
+                run += _message(channel, time, payload)
+                time += 2**61 // 1000
+        if draw(st.booleans()):
+            run += _record(draw(st.sampled_from([7, 200])), b"\x00" * draw(st.integers(0, 3)))
+    return run, [one for one in messages if one[0] < 3]
+
+
+@given(made=runs_of_records(), cut=st.integers(0, 2000))
+@settings(deadline=None)
+def test_records_that_repeat_are_the_same_messages_as_one_by_one(
+    made: tuple[bytes, list[tuple[int, int, bytes]]], cut: int
+) -> None:
+    run, messages = made
+    chosen = lambda channel: channel < 3  # noqa: E731
+    assert list(mcap_records.messages(run, mcap_records.Directory(), chosen)) == messages
+    # Of a run that ends too early, all that came before.
+    short, found = run[: max(len(run) - cut, 0)], []
+    with suppress(mcap_records.TornError):
+        found.extend(mcap_records.messages(short, mcap_records.Directory(), chosen))
+    assert found == messages[: len(found)]
+
+
+def test_many_at_once_are_found_in_a_loops_records() -> None:
+    cycle = [(1, 16), (2, 8), (3, 4)]
+    run = b"".join(_message(channel, n, bytes([n]) * length) for n in range(50) for channel, length in cycle)
+    first, many = mcap_records.series(run, mcap_records.Directory(), lambda channel: channel == 2)
+    assert first == (2, 0, bytes(8))
+    assert isinstance(many, mcap_records.Series)
+    assert many.channel == 2
+    assert many.log_times.tolist() == list(range(1, 50))
+    assert many.payloads.tolist() == [[n] * 8 for n in range(1, 50)]
+    assert not list(mcap_records.series(run, mcap_records.Directory(), lambda channel: channel == 9))

@@ -78,6 +78,7 @@ def test_the_words_stand_beside_the_figures_everywhere(tmp_path: Path, capsys: p
     content = json.loads((tmp_path / "out" / "parameters.json").read_text())
     sentences = content["fit"]["rows_and_filter"]
     assert sentences[0].startswith("All rows: every sample")
+    assert any(sentence.startswith("Most of the motion is not repeated, so noise and model") for sentence in sentences)
     page = parsed((tmp_path / "out" / "report.html").read_text()).words
     for sentence in sentences:
         assert sentence in " ".join(text.split())

@@ -18,17 +18,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.makers import CAPABLE, SHEETS
 
+from drivers.arm import StopKind
+from drivers.axis_status import AxisStatus
+from ident_service.config.arm import ArmConfig
 from ident_service.config.barrett import BarrettDriver
 from ident_service.config.canopen import CanopenDriver
 from ident_service.config.load import load_arm, shipped_arms
-from ident_service.errors import ArmFault
+from ident_service.errors import ArmFault, DriverError
 from ident_service.estimation.identify import identify
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.state_machine import State
 from ident_service.operations.commissioning import record_motion
+from ident_service.operations.fieldbus import bus_probe, probe_text
 from ident_service.recordings.open import open_recording
 
 BEGIN_ANEW = True
@@ -87,8 +92,30 @@ driver:
 OF_PUCKS = "    zeroed: true\n    operator: 1.0\n    heartbeat: 4.0\n"
 
 
+MAKERS = """\
+driver:
+  kind: canopen
+  eds: {eds}
+  buses: [{{interface: {interface}, channel: {channel}}}]
+  torque_frames: single
+  watchdog_reason: an emulated arm in a slow guest
+  bring_up: 20.0
+  measured_torque: none
+  torque_deadline: 1.0
+  heartbeats: {{period: 1.0, drives: 1.0, timeout: 10.0, host_timeout: 10.0}}
+  guarding: {{period: 2.0, factor: 5}}
+  drives: {drives}
+"""
+# Files on one bus together; each that has a torque mode is in one of them.
+PAIRS = [
+    ("maxon_epos4_50-8_0110h.eds", "e35.eds"),
+    ("elmo_gold_V002.dcf", "maxon_epos4_50-5_0170h.eds"),
+    ("maxon_epos2_50-5_2126h.eds", "elmo_simpliq.dcf"),
+]
+
+
 @contextmanager
-def emulated(arm: Path, ready: str) -> Iterator[dict[str, object]]:
+def emulated(arm: Path, ready: str, ended: str = "the arm is at rest") -> Iterator[dict[str, object]]:
     """`ident emulate` in a process of its own; what it says at its end is in the dictionary then."""
     words = [sys.executable, "-m", "ident_service", "emulate", str(arm), "--json"]
     pipe, said, document = subprocess.PIPE, list[str](), dict[str, object]()
@@ -109,7 +136,7 @@ def emulated(arm: Path, ready: str) -> Iterator[dict[str, object]]:
             says(ready)
             begun = len(said)
             yield document
-            says("the arm is at rest", begun)
+            says(ended, begun)
             process.send_signal(signal.SIGINT)
             document |= json.loads(process.stdout.read())
             assert process.wait(PATIENCE) == 0
@@ -161,3 +188,55 @@ def test_a_motion_over_a_real_bus_identifies_the_arm(
     print(f"identified {identified.sum()} of {len(truth)}, deviations {deviations.round(1)}")
     assert identified.sum() >= 6
     assert deviations[identified].max() <= 4.0
+
+
+def makers_arm(folder: Path, names: tuple[str, ...], interface: str, channel: str) -> ArmConfig:
+    """The arm behind two drives of makers, by their files."""
+    planar2 = shipped_arms()["planar2"]
+    drive = {"counts": 65536, "rated_torque": 1.0, "max_torque": 2.0, "max_speed": 6000.0}
+    drives = [
+        drive | {"node": node, "eds": str(SHEETS / name), "watchdog": CAPABLE[name][0]} | CAPABLE[name][2]
+        for node, name in enumerate(names, 1)
+    ]
+    eds = [str(SHEETS / name) for name in names]
+    driver = MAKERS.format(eds=eds[0], interface=interface, channel=channel, drives=json.dumps(drives))
+    path = folder / "makers.yaml"
+    path.write_text(ARM.format(planar2=planar2, driver=driver) + f"    eds: {json.dumps(eds)}\n")
+    return load_arm(path)
+
+
+def bring_up(config: ArmConfig, path: Path) -> None:
+    """Probe drives, open, enable and stop them, all over a real bus."""
+    with emulated(path, "node 2: pre operational", "node 2: pre operational") as drives:
+        probe = bus_probe(config)
+        assert probe.good, probe_text(config, probe)
+        with make_arm(config) as arm:
+            arm.enable()
+            samples = [arm.exchange(np.zeros(2)) for _ in range(20)]
+            assert all(status & AxisStatus.POWERED for status in arm.drive_status())
+            arm.stop(StopKind.TORQUE_OFF)
+            for _ in range(5):
+                arm.exchange(None)
+            assert not any(status & AxisStatus.POWERED for status in arm.drive_status())
+        assert any(sample.valid.all() for sample in samples)
+    assert drives["unsent"] == 0
+
+
+@pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
+@pytest.mark.parametrize("names", PAIRS)
+def test_drives_of_makers_are_probed_and_brought_up_over_a_real_bus(
+    names: tuple[str, ...], can_interface: str, tmp_path: Path
+) -> None:
+    config = makers_arm(tmp_path, names, "raw", can_interface)
+    for left in reversed(range(TRIES)):
+        try:
+            bring_up(config, tmp_path / "makers.yaml")
+            break
+        except DriverError as error:
+            print(f"{names}: {error}")
+            if not (left and "in time" in str(error)):
+                raise
+
+
+def test_every_file_with_a_torque_mode_is_on_a_real_bus() -> None:
+    assert {name for pair in PAIRS for name in pair} == set(CAPABLE)

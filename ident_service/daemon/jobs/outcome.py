@@ -19,6 +19,7 @@ from ident_service.daemon.jobs.commands import FOLDERS, JOBS
 from ident_service.errors import IdentError
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.motion.ending import ENDED
+from ident_service.operations.drift_alarms import FLEET, raise_fleet_alarms
 from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database, Row, note
@@ -179,7 +180,7 @@ _ABOUT_A_RUN = frozenset({"report", "verify", "compare", "judge", "feasible"})
 
 
 def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
-    """Enter the folder that a job's process has left, if any.
+    """Enter the folder that a job's process has left, if any, and the alarms of a fleet.
 
     Args:
         db: the registry.
@@ -200,6 +201,8 @@ def register_outputs(db: Database, state: Path, row: Row, by: str) -> None:
         index_run(db, state, made)
     elif row["kind"] == "design" and (state / MOTIONS / made / MOTION_FILE).is_file():
         index_motion(db, state, made, row["arm"], by)
+    elif row["kind"] == "fleet" and (found := state / EXPORTS / made / FLEET).is_file():
+        raise_fleet_alarms(db, json.loads(found.read_text(encoding="utf-8")), made, time.time())
     elif row["kind"] == "correct":
         with suppress(OSError):  # not empty, or removed already
             (state / EXPORTS / made).rmdir()

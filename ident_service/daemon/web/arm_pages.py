@@ -494,9 +494,13 @@ def _last_look(service: Service, arm: str) -> dict[str, Any] | None:
 
 
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
-    """Return the open drift alarms of an arm, or of all, each with its comparison."""
+    """Return the open drift alarms of an arm, or of all, each with its comparison, a fleet's with its job."""
     return [
-        {**row, "compared": compared(service.db, service.state, row["run"], row["what"])}
+        {
+            **row,
+            "compared": compared(service.db, service.state, row["run"], row["what"]),
+            "job": service.db.row("SELECT id FROM jobs WHERE run = ? AND kind = 'fleet'", row["run"]),
+        }
         for row in alarms(service.db, arm, most=50)
     ]
 

@@ -7,6 +7,8 @@ const root = document.getElementById("viewer");
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const COLORS = { link: 0xd89940, base: 0x6a7079, near: 0xc8321e, around: 0x7890a8, path: 0x0072b2 };
 
+const NEAR = 0.2; // rad or m, from a posture whose distances are known; farther off nothing is said
+
 const vector = (values) => new THREE.Vector3(...values);
 function rotation(rows) {
   const [a, b, c, d, e, f, g, h, i] = rows;
@@ -263,6 +265,25 @@ class Player {
     this.draw();
   }
 
+  // Distances follow from the posture alone: those that were computed for the motion hold where the arm is on its way.
+  showLive(position) {
+    const { clearance, position: planned } = this.view;
+    if (!clearance) return;
+    let [best, least] = [0, Infinity];
+    clearance.samples.forEach((k, row) => {
+      const off = Math.max(...position.map((value, joint) => Math.abs(value - planned[joint][k])));
+      if (off < least) [best, least] = [row, off];
+    });
+    byId("distances").hidden = least > NEAR;
+    if (least > NEAR) return;
+    let nearest = null;
+    for (const { name, distance, pair } of this.kinds) {
+      byId(name).textContent = `${millimetres(distance[best])}, ${clearance.pairs[pair[best]]}`;
+      if (nearest === null || distance[best] < nearest.distance) nearest = { distance: distance[best], pair: pair[best] };
+    }
+    this.arm.mark(clearance.pairs[nearest.pair]);
+  }
+
   drawClearance(clearance) {
     this.kinds = ["itself", "surroundings"].filter((name) => clearance[name]).map((name) => ({ name, ...clearance[name] }));
     const high = Math.max(...this.kinds.flatMap(({ distance }) => distance), 1e-3);
@@ -320,6 +341,7 @@ async function begin() {
     arm.pose(newest);
     byId("controls").hidden = true;
     byId("distances").hidden = true;
+    if (player) player.showLive(newest);
     byId("clearance").setAttribute("hidden", "");
     byId("status").textContent = `As measured, ${detail.time[detail.time.length - 1].toFixed(1)} s after the recording began.`;
     draw();
