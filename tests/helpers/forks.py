@@ -48,7 +48,9 @@ class ForkedPopen(subprocess.Popen[Any]):
 
     A program that begins by `execve` spends half a second of processor time on imports before its first line. Here the
     process is forked from this one, and has the pipes, descriptors, session, folder and environment that it would have;
-    what it starts itself it starts likewise. State of modules is inherited, which patches of a test are, too.
+    what it starts itself it starts likewise. Inherited are also the state of modules with the patches of a test, the
+    libraries that are loaded, the command's words in /proc, and SQLite's own list of open files: a program that opens
+    the registry which this process has open is told "locking protocol". Tests of such have `BEGIN_ANEW`.
     """
 
     def _execute_child(self, *given: Any) -> None:
