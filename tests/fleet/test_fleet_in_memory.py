@@ -58,7 +58,13 @@ def test_recordings_and_store_in_memory(
         processes=False, n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0", silence_logs=50
     ) as cluster:
         assert main([*words, "--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "out")]) == 0
-    assert json.loads(capsys.readouterr().out)["recordings"] == COUNT
+        assert json.loads(capsys.readouterr().out)["recordings"] == COUNT
+        # A client of another version than the worker's is refused before anything is computed.
+        with monkeypatch.context() as other:
+            other.setattr(reduction, "__version__", "0.0.0")
+            assert main([*words, "--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "other")]) == 2
+        assert "this client 0.0.0: install the same on every worker" in capsys.readouterr().out
+        assert not (tmp_path / "other").exists()
     assert len(memory.find("/store/factors")) == COUNT
 
 

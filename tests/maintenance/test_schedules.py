@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 from maintenance.conftest import ARM, MONDAY, Clock
@@ -205,8 +206,16 @@ def test_a_number_never_comes_twice_and_the_trail_names_who(db: Database, clock:
 
 
 def test_a_change_that_a_fleet_shows_is_an_alarm_once(db: Database, clock: Clock) -> None:
-    change = {"arm": ARM, "what": "friction of joint elbow", "kind": "step", "after": "2026-01-15T00:00:00+00:00",
-              "until": "2026-01-22T00:00:00+00:00", "joint": "elbow", "torque_share": 0.12, "sigma": 19.1}  # fmt: skip
+    change: dict[str, Any] = {
+        "arm": ARM,
+        "what": "friction of joint elbow",
+        "kind": "step",
+        "after": "2026-01-15T00:00:00+00:00",
+        "until": "2026-01-22T00:00:00+00:00",
+        "joint": "elbow",
+        "torque_share": 0.12,
+        "sigma": 19.1,
+    }
     week = 7 * 86_400.0
     begin = datetime.fromisoformat(change["until"]).timestamp()
 
