@@ -73,7 +73,7 @@ def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
     what = f"{unknown} of its {size} base parameters are unidentified" + (", some not excited at all" if unseen else "")
     return (
         f"it was fitted to {moved:.1f} s of motion, and {what}: it predicts that motion and perhaps no other; record at"
-        f" least {ENOUGH_MOTION:g} s, or validate it on another motion (--validate)",
+        f" least {ENOUGH_MOTION:g} s of motion, or validate it on another motion (--validate)",
     )
 
 

@@ -136,7 +136,7 @@ def _no_header(header: str, names: Sequence[str]) -> str:
     """Return what is wrong with a first line that is no header at all; empty where it may be one."""
     if names and all(_is_number(name) for name in names):
         return "is numbers; put a line with the names of the columns above it: t,q1..qN,tau1..tauN"
-    if header.lstrip().startswith(("#", "%")) and "," in header:
+    if header.lstrip().startswith(("#", "%")):
         return "is a comment; remove what stands before the names of the columns"
     separators = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
     if len(names) == 1:
