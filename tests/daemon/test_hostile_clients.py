@@ -37,7 +37,6 @@ from ident_service.registry import arms
 from ident_service.registry.database import Database
 from ident_service.registry.tokens import add_token, revoke_token
 
-
 JSON = {"Content-Type": "application/json"}
 
 

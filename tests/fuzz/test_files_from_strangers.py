@@ -338,8 +338,8 @@ def _star() -> str:
 
 
 # What took longest or most, the worst of each kind that was found: 55 s and 1.2 GB of a URDF, 56 s of parameters, 57 s
-# of a header, 6 s of an EDS, minutes of a list of wrong words, 13 s and 3 GB of a description's JSON; and a motion whose
-# kind of 2 MB was the answer.
+# of a header, 6 s of an EDS, minutes of a list of wrong words, 13 s and 3 GB of a description's JSON; and a motion
+# whose kind of 2 MB was the answer.
 LARGEST: dict[str, Callable[[], tuple[str, str]]] = {
     "attributes": lambda: ("urdf", "<robot " + " ".join(f"a{k}='1'" for k in range(150_000)) + "/>"),
     "joints of one link": lambda: ("urdf", _star()),
