@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TypeVar
 
 import pytest
-from helpers.forks import ForkedPopen
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
@@ -18,7 +16,6 @@ from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
 
 _Report = TypeVar("_Report", pytest.TestReport, pytest.CollectReport)
-_POPEN = subprocess.Popen
 _CI = os.environ.get("CI") == "true"
 # Small matrices on several BLAS threads are slow, and very slow on a busy machine; child processes inherit this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -44,23 +41,6 @@ def interrupts_are_heard() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def programs_are_forked() -> Iterator[None]:
-    """Fork our own programs from this process instead of importing everything anew in each of a thousand of them."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(subprocess, "Popen", ForkedPopen)
-        yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def programs_begin_anew(request: pytest.FixtureRequest, programs_are_forked: None) -> Iterator[None]:
-    """Start programs as people do in a module with `BEGIN_ANEW = True`: where their start is what it tests."""
-    with pytest.MonkeyPatch.context() as patched:
-        if getattr(request.module, "BEGIN_ANEW", False):
-            patched.setattr(subprocess, "Popen", _POPEN)
-        yield
 
 
 @pytest.fixture

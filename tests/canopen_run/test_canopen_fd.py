@@ -36,8 +36,6 @@ from ident_service.recordings.open import open_recording
 from sim_backend.emulator.lock_step import LockStepArm
 from sim_backend.emulator.process import Emulated, emulate
 
-BEGIN_ANEW = True
-
 RATE, KP, KD = 250.0, 225.0, 30.0
 BITRATE, DATA = 500_000, 2_000_000
 IDENTITY = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])

@@ -43,8 +43,6 @@ from ident_service.motion.run import keep_host_alive
 from ident_service.recordings.open import open_recording
 from ident_service.registry.state_folder import arm_folder, fault_file
 
-BEGIN_ANEW = True
-
 NAME, RATE, KP, KD = "far", 50.0, 100.0, 16.0
 DEADLINE, BRAKING = 0.2, [4.0, 2.0]
 STOPPED = "(quick stop active|switch on disabled|fault reaction active|fault)"

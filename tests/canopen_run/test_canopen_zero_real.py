@@ -29,8 +29,6 @@ from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
 
-BEGIN_ANEW = True
-
 NAME, RATE, KP, KD = "relative", 50.0, 100.0, 16.0
 HOME = {"shoulder": 0.3, "elbow": -0.2}  # so that a zero that were ignored would show in every parameter
 

@@ -22,8 +22,6 @@ from ident_service.model.base_parameters import base_parameters
 from ident_service.recordings.open import open_recording
 from ident_service.registry.state_folder import fault_file
 
-BEGIN_ANEW = True
-
 NAME, RATE, KP, KD = "farpucks", 50.0, 100.0, 16.0
 NAMES = ("shoulder", "elbow")
 

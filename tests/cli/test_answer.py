@@ -14,8 +14,6 @@ import pytest
 
 from ident_service.cli.output import StopOnSignal, interrupting, print_answer, print_error, print_to_person, tell
 
-BEGIN_ANEW = True
-
 TALK = """
 import sys
 from argparse import Namespace

@@ -14,8 +14,6 @@ from cli.conftest import COARSE, Commissioned, Ident, Samples, left_over, quick_
 from ident_service import __version__
 from ident_service.cli import main, parser
 
-BEGIN_ANEW = True
-
 
 @pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])
 def test_help(ident: Ident, words: tuple[str, ...]) -> None:

@@ -24,8 +24,6 @@ from ident_service.registry.database import Database
 from ident_service.registry.state_folder import control_path
 from ident_service.results.manifest import verified_files
 
-BEGIN_ANEW = True
-
 ARM = "quick"
 KINDS = ("run", "run", "check", "simulate")
 

@@ -15,8 +15,6 @@ from ident_service.errors import ConfigError, ModelError
 from ident_service.operations.description_process import _require_own_meshes
 from ident_service.registry.arms import add_arm
 
-BEGIN_ANEW = True  # one test looks at what a daemon has loaded
-
 ARM = "format: ident-arm\nversion: 1\nname: spy\nkinematics: {{{kind}: arm.xml}}\n"
 INERTIAL = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
 

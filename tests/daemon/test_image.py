@@ -22,8 +22,6 @@ from daemon.served import url_of
 
 from ident_service.client import IdentClient
 
-BEGIN_ANEW = True
-
 ROOT = Path(__file__).resolve().parents[2]
 NOBODY = 65534
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]

@@ -22,8 +22,6 @@ from daemon.test_daemon_killed import ARM, begin, checked, excited
 from ident_service.motion.command_channel import in_use
 from ident_service.registry.state_folder import control_path
 
-BEGIN_ANEW = True
-
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 

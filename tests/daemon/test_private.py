@@ -25,8 +25,6 @@ from ident_service.registry.database import FILE, Database, audit_log
 from ident_service.registry.state_folder import control_path
 from ident_service.registry.tokens import add_token
 
-BEGIN_ANEW = True
-
 
 @pytest.fixture(autouse=True)
 def usual_umask() -> Iterator[None]:

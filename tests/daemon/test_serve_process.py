@@ -26,8 +26,6 @@ from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.state_folder import control_path
 
-BEGIN_ANEW = True
-
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 
 

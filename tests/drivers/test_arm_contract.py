@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from contract_bench import BACKENDS, PERIOD_NS, canopen, pucks, relative_config
+from helpers.forks import fork_plants
 
 from drivers.arm import StopKind
 from drivers.axis_status import TRIPPED, AxisStatus
@@ -13,6 +14,12 @@ from ident_service.errors import DriverError, PositionUnknown
 LIMIT = np.array([10.0, 5.0])
 NONE = np.zeros(2)
 STATUS_CYCLES = 60  # more than a drive may wait with its status report
+
+
+@pytest.fixture(autouse=True)
+def plants_are_forked(monkeypatch):
+    """How a plant is started is tests/sim's; a process of its own it is here, too."""
+    fork_plants(monkeypatch)
 
 
 @pytest.fixture(params=sorted(BACKENDS))

@@ -25,8 +25,6 @@ from ident_service.errors import DriverError
 from ident_service.motion import arm_factory
 from ident_service.motion.arm_factory import Outcome, try_driver
 
-BEGIN_ANEW = True
-
 PAGE = Path(__file__).parents[2] / "docs" / "drivers.md"
 WATCHDOG = 0.05
 

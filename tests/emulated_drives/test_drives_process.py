@@ -22,8 +22,6 @@ from drives_bench import GEARS, drives_config
 from ident_service.cli import USAGE, main
 from sim_backend.emulator.process import Emulated, emulate
 
-BEGIN_ANEW = True
-
 PATIENCE = 20.0  # s, for a busy machine
 
 

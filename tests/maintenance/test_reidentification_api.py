@@ -16,8 +16,6 @@ from maintenance.conftest import ARM, description
 
 from ident_service.cli import main
 
-BEGIN_ANEW = True  # daemons open the registry that this process has open
-
 pytestmark = pytest.mark.slow
 
 

@@ -22,8 +22,6 @@ from ident_service.motion.realtime import asked
 from ident_service.motion.run import keep_host_alive
 from ident_service.preflight import static_checks as plan
 
-BEGIN_ANEW = True
-
 
 class Looked:
     """The part of an arm that is used: cycles without torque, one of which may fail."""

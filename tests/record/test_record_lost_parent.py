@@ -16,8 +16,6 @@ from ident_service.recordings.files import require_writable
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.ring_buffer import create_ring
 
-BEGIN_ANEW = True
-
 REQUEST = {
     "joint_names": ["a"],
     "robot_description": "<robot name='r'/>",

@@ -24,8 +24,6 @@ from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recorder import RecorderProcess
 from ident_service.recordings.ring_sink import RingSink
 
-BEGIN_ANEW = True
-
 
 @pytest.fixture(autouse=True)
 def nothing_left() -> Iterator[None]:

@@ -13,8 +13,6 @@ import pytest
 
 from ident_service.registry.state_folder import control_path
 
-BEGIN_ANEW = True
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

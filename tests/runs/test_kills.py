@@ -11,8 +11,6 @@ from kill_bench import REAL, SLOW, Kill, Lane, Outcome, kills
 
 from sim_backend.plant_status import PlantState
 
-BEGIN_ANEW = True
-
 LOST = 0.2  # s of samples that may be lost with the recorder
 # Share of the velocity limit. The WAM has no brakes: its idle drives resist like friction, and a joint sinks as fast as
 # gravity drives it against them, the more slowly the nearer it is to hanging down. After a minute it at most creeps.

@@ -27,8 +27,6 @@ from ident_service.motion.control_loop import LOWERS, WAITS
 from ident_service.operations.motion_run import ProcessResult
 from ident_service.registry.state_folder import control_path, fault_file, ticket_path
 
-BEGIN_ANEW = True  # processes are found by their commands
-
 Capture = pytest.CaptureFixture[str]
 
 

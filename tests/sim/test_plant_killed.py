@@ -16,8 +16,6 @@ from sim_backend.arm import from_config
 from sim_backend.plant_process import PATIENCE, REST_SPEED
 from sim_backend.plant_status import PlantState, read_status
 
-BEGIN_ANEW = True
-
 WATCHDOG = 0.02
 
 

@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers.forks import fork_plants
 from remote_bench import listening, remote_config, wait_for
 
 from drivers.arm import StopKind
@@ -32,6 +33,11 @@ LIMIT = np.array([40.0, 15.0])
 
 def local(config: ArmConfig) -> ArmConfig:
     return config.model_copy(update={"driver": config.driver.model_copy(update={"process": "own"})})
+
+
+@pytest.fixture(autouse=True)
+def plants_are_forked(monkeypatch):
+    fork_plants(monkeypatch)
 
 
 def forgotten(arm):

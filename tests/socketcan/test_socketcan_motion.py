@@ -36,8 +36,6 @@ from ident_service.operations.commissioning import record_motion
 from ident_service.operations.fieldbus import bus_probe, probe_text
 from ident_service.recordings.open import open_recording
 
-BEGIN_ANEW = True
-
 pytestmark = pytest.mark.timeout(900)
 PATIENCE = 300.0  # s, for a machine that emulates another one and has more to do
 
