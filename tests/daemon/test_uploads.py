@@ -394,7 +394,7 @@ def test_parameters_are_identified_from_ones_own_data(
         away = json.loads(capsys.readouterr().out)["answer"]
         assert away["relative_error_percent"] == at_home["relative_error_percent"]
         # Its columns come with it; without them the arm's description does not fit.
-        with pytest.raises(RecordingError, match="unknown column 'stamp'"):
+        with pytest.raises(RecordingError, match="unknown columns 'stamp'"):
             client.upload("quick", table)
         # What was refused has made no run, and names none.
         assert main(["run", "quick", "--confirm", "quick", *there[:4]]) == 3
