@@ -17,11 +17,10 @@ demo: $(READY)
 	$(BIN)/ident simulate
 
 # What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
-# Tests by the machine's clock come last, a file on each core: most of their time they wait for it.
 test: $(READY)
 	$(MAKE) --jobs 4 --output-sync lint types docs coverage collected
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
-	$(BIN)/pytest -n 2 --dist loadfile -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
+	$(BIN)/pytest -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
 # Three workers for two cores: tests that talk to processes of their own also wait.
 TESTS := $(BIN)/pytest -n 3 --dist worksteal
