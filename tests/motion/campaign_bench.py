@@ -60,6 +60,7 @@ class Promise:
         within: cycles until the fault is found, in every state that is energised; None where the run may also end as if
             nothing had been, because nobody could tell.
         warns: what a run that goes on must have told.
+        told_after: cycles that telling it takes; a run may end before.
         words: one of these is in the sentence that a person reads.
     """
 
@@ -69,6 +70,7 @@ class Promise:
     within: int | None = None
     warns: str | None = None
     words: tuple[str, ...] = ()
+    told_after: int = 0
 
 
 PROMISES: dict[FaultKind, Promise] = {

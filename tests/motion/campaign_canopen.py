@@ -64,7 +64,9 @@ CANOPEN_PROMISES: dict[str, Promise] = {
     "load_attached": Promise(_LIES, size=2.0),
     "bus_gone": Promise({"driver"}, duration=10**6, within=SOON, words=("gone",)),
     "emergency": Promise({"drive_emergency"}, size=0x4310, within=SOON, words=("4310h drive too hot",)),
-    "warning": Promise({"repeated_warnings"}, warns="drive_warning", words=("warns",)),
+    "warning": Promise(
+        {"repeated_warnings"}, warns="drive_warning", words=("warns",), told_after=55
+    ),  # status comes every 50 ms
     "heartbeat_lost": Promise({"drive_silent"}, within=_TIMEOUT + 12, words=("no heartbeat for 0.3 s",)),
     "reboot": Promise({"feedback_gone", "drive_restarted"}, within=MAX_AGE + 1),
     "wrong_node": Promise({"repeated_warnings"}, within=25, words=("second position", "after its cycle")),

@@ -107,7 +107,7 @@ def went_on(case: Case, promise: Promise, at_cycle: int, outcome: Outcome) -> No
     assert list(dict.fromkeys(outcome.story.states)) == list(
         windows(case.arm, case.state, case.speed, finish=case.finish)
     )
-    if promise.warns is not None:
+    if promise.warns is not None and outcome.arm.cycle > at_cycle + promise.told_after:
         (told,) = [message for _, _, message in outcome.story.events if message.startswith(f"{promise.warns}: ")]
         assert any(words in told for words in promise.words), told
 

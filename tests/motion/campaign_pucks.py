@@ -57,7 +57,7 @@ PUCK_PROMISES: dict[str, Promise] = {
     "load_attached": Promise(_LIES, size=2.0),
     "bus_gone": Promise({"driver"}, duration=10**6, within=SOON, words=("gone",)),
     "emergency": Promise(_GONE, size=0x11, within=STATUS),
-    "warning": Promise(set(), warns="drive_warning", words=("the pendant shows voltage warning",)),
+    "warning": Promise(set(), warns="drive_warning", words=("the pendant shows voltage warning",), told_after=STATUS),
     "reboot": Promise({"feedback_gone"}, within=LOST + 2),
     "wrong_node": Promise({"repeated_warnings"}, within=25, words=("second position", "after its cycle")),
     "short_frame": Promise({"feedback_gone"}, duration=50, within=LOST + 2),
