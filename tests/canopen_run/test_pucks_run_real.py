@@ -102,21 +102,24 @@ def pucks(bench: Bench) -> Iterator[Pucks]:
 def test_a_run_against_pucks_in_another_process_finds_the_arms_parameters(
     bench: Bench, pucks: Pucks, tmp_path: Path
 ) -> None:
-    for _ in range(TRIES):
+    for left in reversed(range(TRIES)):
         run, folder = bench.run()
         with run:
             code = run.code()
         if code == 0:
-            break
+            assert "waiting for a person: stand clear" in run.text
+            assert json.loads((folder / "ended.json").read_text())["state"] == "done"
+            out = tmp_path / f"out{left}"
+            verdict = main(["identify", str(folder / "run.mcap"), "--arm", str(bench.arm), "--out", str(out)])
+            if verdict == 0:
+                break
+            assert verdict == 3  # where stalls have left gaps, too little of the motion is whole
+            continue
         assert any(word in run.text for word in STALLS), run.text
         bench.acknowledge()
         pucks.hears("idle")
     else:
         raise AssertionError("the machine stalls all the time")
-    assert "waiting for a person: stand clear" in run.text
-    assert json.loads((folder / "ended.json").read_text())["state"] == "done"
-    out = tmp_path / "out"
-    assert main(["identify", str(folder / "run.mcap"), "--arm", str(bench.arm), "--out", str(out)]) == 0
     document = json.loads((out / "parameters.json").read_text())["base_parameters"]
     model = arm_model(load_arm(bench.arm))
     base = base_parameters(model.chain, model.layout)
