@@ -266,10 +266,12 @@ class ReadingTurns:
 
     def _turn(self) -> None:
         self._scheduled, self._spent = False, 0.0
-        while self._waiting and self._spent < _TURN:
-            self.read(self._waiting.popleft())
-        if self._waiting:
-            self._schedule()
+        try:
+            while self._waiting and self._spent < _TURN:
+                self.read(self._waiting.popleft())
+        finally:  # whatever one connection's request ends in, the others have their turn
+            if self._waiting:
+                self._schedule()
 
 
 class FairReader(H11Protocol):

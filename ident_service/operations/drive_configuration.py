@@ -11,6 +11,7 @@ so, and only while they are off.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,7 +69,7 @@ def planned_configuration(
         raise UsageError(f"{config.name}: the description has no transmission")
     profiles = {profile.number: profile for profile in bus_profiles(driver, config.control.rate)}
     found, zeros, option = coordinates(driver, gears), zeros_of(config), quick_stop_option(config)
-    planned = []
+    planned: list[PlannedDrive] = []
     with asking(config, open_bus) as (_, links, heard):
         every = [
             DryRunObjects(links[one.bus], one.node, hearing(heard, one.bus), _fixed(sheet))
@@ -80,16 +81,10 @@ def planned_configuration(
                 found = found.zeroed(known, zeros.home) if len(known) == len(held) else found
         motors = motor_limits(config, found)
         for number, (drive, objects) in enumerate(zip(driver.drives, every, strict=True)):
-            refused = ""
-            try:
+            with _planning(number, objects, planned):
                 identify(objects, drive.identity)
                 own = driver.reactions, option, motors[number], required(objects, driver, number)
                 configure(objects, DriveConfiguration(drive, profiles[drive.bus], *own))
-            except BusError:
-                raise
-            except DriverError as error:
-                refused = str(error)
-            planned.append(PlannedDrive(number + 1, drive.node, tuple(objects.changes), refused))
     return tuple(planned)
 
 
@@ -109,20 +104,28 @@ def planned_zero(
     driver = require_drives(config)
     if (zeros := zeros_of(config)) is None:
         raise DriverError(f"{config.name}: its encoders know their position (driver.zero: absolute); no home is set")
-    planned = []
+    planned: list[PlannedDrive] = []
     with asking(config, open_bus) as (_, links, heard):
         for number, drive in enumerate(driver.drives):
-            objects, refused = DryRunObjects(links[drive.bus], drive.node, hearing(heard, drive.bus)), ""
-            try:
+            objects = DryRunObjects(links[drive.bus], drive.node, hearing(heard, drive.bus))
+            with _planning(number, objects, planned):
                 _require_off(objects)
                 zeros.require_volatile_storage(objects)
                 zeros.keep(objects, number, objects.read(od.POSITION))
-            except BusError:
-                raise
-            except DriverError as error:
-                refused = str(error)
-            planned.append(PlannedDrive(number + 1, drive.node, tuple(objects.changes), refused))
     return tuple(planned)
+
+
+@contextmanager
+def _planning(number: int, objects: DryRunObjects, planned: list[PlannedDrive]) -> Iterator[None]:
+    """Add to `planned` what is written to a drive meanwhile, and why it is refused, if it is."""
+    refused = ""
+    try:
+        yield
+    except BusError:
+        raise
+    except DriverError as error:
+        refused = str(error)
+    planned.append(PlannedDrive(number + 1, objects.node, tuple(objects.changes), refused))
 
 
 def _fixed(sheet: DataSheet) -> frozenset[int]:

@@ -330,7 +330,7 @@ def ipos(**drive: Any) -> ArmConfig:
 
 
 def test_torques_of_32_bits_act_once_the_mode_has_what_it_needs() -> None:
-    """As Technosoft's iPOS takes them: 201Ch = counts << 16, 201Dh = 1, mode -5, bit 4 of the control word."""
+    """Stream as Technosoft's iPOS wants it: 201Ch = counts << 16, 201Dh = 1, mode -5, bit 4 of the control word."""
     bench = Bench(ipos())
     with bench.arm as arm:
         objects = [face.objects for face in bench.behind.emulator.faces]  # type: ignore[attr-defined]

@@ -164,7 +164,7 @@ def test_a_drive_with_one_tpdo_tells_its_status_beside_its_position(measured: st
 
 
 def behind_frames(arm: CanopenArm, taps: list[Tapped]) -> list[Frame]:
-    """What the drives send as their position in some cycles."""
+    """Return the position frames that the drives send in some cycles."""
     found: list[Frame] = []
     for tap in taps:
         tap.misses = lambda frame: 0x180 < frame.identifier < 0x200 and bool(found.append(frame))

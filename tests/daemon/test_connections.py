@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import os
@@ -285,3 +286,30 @@ def test_the_doors_know_who_waits(daemon: Asked) -> None:
             assert answer.status_code in (200, 401)
             assert list(book._waiting) == [peer]
     assert book.count == 0
+
+
+class _Reader:
+    """A connection with one piece of a request to read."""
+
+    def __init__(self, *, torn: bool = False) -> None:
+        self.piece, self.torn, self.has_read, self.waits = 512, torn, False, False
+
+    def read_piece(self) -> None:
+        self.has_read = True
+        if self.torn:
+            raise RuntimeError("torn")
+
+
+def test_a_request_that_raises_while_it_is_read_keeps_no_other_from_its_turn() -> None:
+    readers = [_Reader(torn=True), _Reader(), _Reader()]
+
+    async def read() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda loop, context: None)
+        turns = connections.ReadingTurns()
+        for reader in readers:
+            turns.wait(reader)  # type: ignore[arg-type]
+        for _ in range(5):
+            await asyncio.sleep(0)
+
+    asyncio.run(read())
+    assert [reader.has_read for reader in readers] == [True, True, True]

@@ -41,7 +41,7 @@ needs_sheets = pytest.mark.skipif(not FILES, reason="the makers' data sheets are
 
 
 def meaning(sheet: DataSheet) -> dict[int, tuple[object, ...]]:
-    """What counts of every entry, for node 5."""
+    """Return of every entry what the driver uses, for node 5."""
     return {
         key: (one.kind, one.access, one.mappable, one.low, one.high, one.number(5), one.configured)
         for key, one in sheet.entries.items()

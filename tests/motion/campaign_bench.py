@@ -149,7 +149,7 @@ class Subject:
 
     @property
     def period(self) -> float:
-        """Of its cycles [s]."""
+        """Return the time between its cycles [s]."""
         return 1.0 / self.config.control.rate
 
 
