@@ -237,11 +237,12 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     """Return the reasons, from its recordings and its errors, why an estimate must not be used."""
     model = estimate.model
     seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
-    fitted = set(estimate.recordings)
-    seconds = sum(one.duration_s for recording, one in found if (recording.path.name, recording.sha256) in fitted)
+    known = set(estimate.recordings)
+    fitted = [(recording, one) for recording, one in found if (recording.path.name, recording.sha256) in known]
+    seconds = sum(one.duration_s for _, one in fitted)
     return (
         *(reason for reasons in seen for reason in reasons),
-        *reasons_against(estimate),
+        *reasons_against(estimate, [recording for recording, _ in fitted]),
         *reasons_in_length(estimate, seconds),
     )
 

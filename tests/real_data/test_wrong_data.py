@@ -171,9 +171,9 @@ def written(folder: Path, change: Change, tree: dict[str, Any]) -> list[str]:
 WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
     "degrees": (degrees, {}, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
     "q and tau": (swapped, {}, "lwr_1_joint is recorded from -38.05"),
-    "two joints": (two_joints, {}, "its torque error is 8. % where joints move on run1"),
+    "two joints": (two_joints, {}, "the torques of lwr_1_joint and lwr_2_joint seem to be exchanged"),
     "sign": (negated, {}, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
-    "one sign": (one_negated, {}, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
+    "one sign": (one_negated, {}, "the torque of lwr_5_joint seems to have the wrong sign"),
     "thousand": (thousandfold, {}, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
     "spike": (
         spike,

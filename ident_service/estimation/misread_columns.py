@@ -1,0 +1,252 @@
+"""Find columns of a recording that were read with the wrong sign or for another joint, by fitting each other reading.
+
+Forced into the feasible set, an estimate predicts a part of any torque, so that its error alone does not tell wrong
+columns from a poor model. The reading that is right leaves an error smaller by an order of magnitude than all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ident_service.estimation.equations import Rows, equation_rows
+from ident_service.estimation.feasible.problems import constrained_least_squares
+from ident_service.estimation.identify import Estimate
+from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
+from ident_service.model.blas_threads import one_blas_thread
+from ident_service.model.chain import Array
+from ident_service.model.information import Information, sparsity, triangle
+from ident_service.recordings.adapters import RangeRecording
+from ident_service.recordings.cached_recording import payload_of
+from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Recording
+from ident_service.recordings.resampling import grid
+
+SUSPECTED_FROM, CONCERNED_FROM = 10.0, 5.0  # percent of a joint's torque: to search at all, and to try a joint
+NO_ERROR = 1.0  # percent of a joint's torque; smaller errors count as this one
+BETTER = 3.0  # by which the product of the joints' errors must shrink; real arms with right columns reach 1.7
+NONE_WORSE = 1.3  # by which the error of no joint may grow
+_LONGEST = 60.0  # s of all recordings together that are fitted
+_ROWS = 1000  # that are fitted, about
+_TRIED = 6  # readings that are fitted under the conditions; without them, too, the right one is among the best
+
+_Which = Literal["torque", "position", "both"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another reading of the columns.
+
+    Attributes:
+        which: columns that it is about.
+        joints: one whose sign is negated, or two that are exchanged.
+    """
+
+    which: _Which
+    joints: tuple[int, ...]
+
+    def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
+        """Return positions, velocities or torques, shape (samples, joints), as they are read."""
+        if self.which not in (what, "both"):
+            return columns
+        read = columns.copy()
+        if len(self.joints) == 1:
+            read[:, self.joints[0]] *= -1.0
+        else:
+            read[:, self.joints] = columns[:, self.joints[::-1]]
+        return read
+
+
+@dataclass(frozen=True)
+class MisreadColumns:
+    """A reading that explains the recordings far better.
+
+    Attributes:
+        reading: that does.
+        before: torque error in motion with the columns as they are.
+        after: the same with that reading.
+    """
+
+    reading: Reading
+    before: TorqueError
+    after: TorqueError
+
+    def sentence(self, names: Sequence[str]) -> str:
+        """Return it as a reason why an estimate must not be used, with what to correct.
+
+        Args:
+            names: of the joints.
+        """
+        named = [names[joint] for joint in self.reading.joints]
+        before, after = self.before.joint_relative_percent, self.after.joint_relative_percent
+        each = ", ".join(
+            f"of {name} {before[joint]:.0f} % and {after[joint]:.2g} %"
+            for name, joint in zip(named, self.reading.joints, strict=True)
+        )
+        whole, then = self.before.relative_percent, self.after.relative_percent
+        errors = f"the torque error in motion is {whole:.1f} %, and {then:.2g} % with"
+        if len(named) == 1:
+            if self.reading.which == "both":
+                return (
+                    f"{named[0]} seems to count in the other direction than described: {errors} position and torque"
+                    f" negated ({each}): turn its axis in the description, or give both columns the factor -1"
+                    " (recording.columns)"
+                )
+            return (
+                f"the {self.reading.which} of {named[0]} seems to have the wrong sign: {errors} the other sign"
+                f" ({each}): correct it where it is recorded, or give the column the factor -1 (recording.columns)"
+            )
+        what = {"torque": "the torques", "position": "the positions", "both": "positions and torques"}
+        return (
+            f"{what[self.reading.which]} of {named[0]} and {named[1]} seem to be exchanged: {errors} them exchanged"
+            f" ({each}): correct the order of the joints or of the columns (recording.columns)"
+        )
+
+
+@one_blas_thread()
+def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> MisreadColumns | None:
+    """Return the reading of the columns that explains recordings best, where it is far better than theirs; else None.
+
+    Nothing is tried where every joint's torque is predicted to a tenth. At most a minute of the recordings is fitted.
+
+    Args:
+        estimate: what was identified.
+        recordings: that it was fitted to; without them only signs of torques are tried, on the estimate's equations.
+    """
+    own = estimate.candidates[estimate.chosen].moving.joint_relative_percent
+    if own.max(initial=0.0) < SUSPECTED_FROM:
+        return None
+    # Weights of the joints come from their errors with the columns as they are: a joint that is wrong counts less.
+    rms = estimate.candidates[estimate.chosen].moving.joint_rms
+    weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
+    weights /= np.exp(np.mean(np.log(weights)))
+    parts = _parts(recordings)
+    as_read = _Equations(estimate, parts, None) if recordings else _EstimatesEquations(estimate)
+    before = _constrained_error(estimate, as_read.information(None), weights)
+    found: list[tuple[float, Reading, Information]] = []
+    at_positions: dict[tuple[int, ...], _Equations | _EstimatesEquations] = {(): as_read}
+    for reading in _readings(estimate, np.flatnonzero(own > CONCERNED_FROM)):
+        if not recordings and (reading.which != "torque" or len(reading.joints) > 1):
+            continue
+        moved = () if reading.which == "torque" else reading.joints
+        if moved not in at_positions:
+            at_positions[moved] = _Equations(estimate, parts, reading)
+        information = at_positions[moved].information(reading)
+        free = torque_error(information, ordinary_least_squares(information, weights).beta)
+        found.append((float(_gains(before, free).sum()), reading, information))
+    best, most = None, float(np.log(BETTER))
+    for without_conditions, reading, information in sorted(found, key=lambda one: -one[0])[:_TRIED]:
+        if without_conditions < most:  # conditions only add to the error
+            break
+        after = _constrained_error(estimate, information, weights)
+        gains = _gains(before, after)
+        if gains.sum() >= most and gains.min() >= -np.log(NONE_WORSE):
+            best, most = MisreadColumns(reading, before, after), float(gains.sum())
+    return best
+
+
+def _readings(estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]:
+    kinds: tuple[_Which, ...] = ("torque", "position", "both")
+    turns = estimate.model.chain.revolute
+    for which in kinds:
+        for joint in joints.tolist():
+            yield Reading(which, (joint,))
+        for one, other in combinations(joints.tolist(), 2):
+            if turns[one] == turns[other]:
+                yield Reading(which, (one, other))
+
+
+def _constrained_error(estimate: Estimate, information: Information, weights: Array) -> TorqueError:
+    fit = ordinary_least_squares(information, weights)
+    return torque_error(information, constrained_least_squares(fit, estimate.base, estimate.conditions).beta)
+
+
+def _gains(before: TorqueError, after: TorqueError) -> Array:
+    """Return per joint the logarithm of the factor by which its error shrinks, shape (joints,)."""
+    was, will = (np.maximum(one.joint_relative_percent, NO_ERROR) for one in (before, after))
+    return np.asarray(np.log(was / will))
+
+
+class _EstimatesEquations:
+    """Equations that an estimate keeps, for other signs of torques."""
+
+    def __init__(self, estimate: Estimate) -> None:
+        self._moving = estimate.prepared.equations.moving
+
+    def information(self, reading: Reading | None) -> Information:
+        """Return their information with a reading of the torques."""
+        signs = np.ones((1, self._moving.joints))
+        return self._moving.with_torques_times((signs if reading is None else reading.read(signs, "torque"))[0])
+
+
+class _Equations:
+    """Equations of recordings with one reading of the positions, for every reading of the torques."""
+
+    def __init__(self, estimate: Estimate, recordings: Sequence[Recording], reading: Reading | None) -> None:
+        model, base = estimate.prepared.model, estimate.base
+        self._supports = sparsity(model.chain, model.layout, base.base)
+        self._scales, self._base = estimate.prepared.torque_scales, base.size
+        stamps = [grid(one, model.config.recording) for one in recordings]
+        step = sum(one.last_ns - one.first_ns for one in stamps) * 1e-9 / _ROWS
+        rows = [
+            thin
+            for recording in recordings
+            for one in equation_rows(_Rearranged(recording, reading) if reading else recording, model, base)
+            for thin in [_thinned(one, step)]
+        ]
+        torques, keep = (np.concatenate([getattr(one, name) for one in rows]) for name in ("torque", "keep"))
+        keep = keep if keep.any() else np.ones_like(keep)
+        self._factors: list[Array] = []
+        self._rows = keep.sum(axis=0)
+        for joint, support in enumerate(self._supports):
+            H = np.concatenate([one.H_b[joint, support].T for one in rows])
+            # With all torques beside the columns, every reading of them needs no other decomposition.
+            self._factors.append(triangle(np.column_stack([H, torques])[keep[:, joint]]))
+
+    def information(self, reading: Reading | None) -> Information:
+        """Return their information with a reading of the torques, which is about the same positions or none."""
+        factors = []
+        for joint, (support, factor) in enumerate(zip(self._supports, self._factors, strict=True)):
+            torques = factor[:, len(support) :]
+            torques = torques if reading is None else reading.read(torques, "torque")
+            factors.append(np.column_stack([factor[:, : len(support)], self._scales[joint] * torques[:, joint]]))
+        return Information(self._supports, tuple(factors), self._rows.astype(np.int64), self._base)
+
+
+def _thinned(rows: Rows, step: float) -> Rows:
+    """Return a copy of the first row in each step of time [s]."""
+    first = np.unique(np.floor(rows.time / step), return_index=True)[1]
+    H_b = rows.H_b[:, :, first]  # a copy: the next chunk is written into the same memory
+    of = {name: getattr(rows, name)[first] for name in Rows.__dataclass_fields__ if name != "H_b"}
+    return Rows(H_b=H_b, **of)
+
+
+def _parts(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the same number of seconds of each recording."""
+    seconds = _LONGEST / max(len(recordings), 1)
+    return [
+        RangeRecording(one, start := one.start if isinstance(one, RangeRecording) else 0.0, start + seconds)
+        for one in recordings
+    ]
+
+
+class _Rearranged:
+    """Read another recording with the positions of other joints, or with other signs."""
+
+    def __init__(self, whole: Recording, reading: Reading) -> None:
+        self.path, self.sha256 = whole.path, whole.sha256
+        self.joint_names, self.joints = whole.joint_names, whole.joints
+        self.torque_held, self.torn = whole.torque_held, whole.torn
+        self.payload = payload_of(whole)
+        self._whole, self._reading = whole, reading
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """Read the samples in order; see `Recording.blocks`."""
+        for block in self._whole.blocks(samples):
+            position = self._reading.read(block.position, "position")
+            velocity = None if block.velocity is None else self._reading.read(block.velocity, "position")
+            yield Block(block.stamp_ns, position, block.torque, velocity, block.repeats, block.skipped)

@@ -1,0 +1,94 @@
+"""Columns with a wrong sign or of another joint are named; what is only poor data is not taken for them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from estimation.synthetic import SampledRecording, recorded, waves
+
+from ident_service.config.load import load_arm
+from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.misread_columns import Reading, misread_columns
+from ident_service.estimation.plausibility import reasons_against
+from ident_service.model.arm_model import ArmModel, arm_model
+from ident_service.recordings.adapters import RangeRecording
+
+
+@cache
+def elbowed() -> tuple[ArmModel, SampledRecording]:
+    """The shipped planar arm with friction, and what was recorded of it, with noise."""
+    model = arm_model(load_arm("planar2"))
+    assert model.prior is not None
+    delta = model.prior.copy()
+    for term, value in (("viscous", 0.4), ("coulomb", 0.5), ("offset", 0.05)):
+        delta[model.layout.term_columns(term)] = value
+    right = recorded(model, delta, waves(4, 2, highest=0.8), rate=100.0)
+    noise = 0.02 * np.random.default_rng(1).normal(size=right.torque.shape)
+    return model, replace(right, torque=right.torque + noise)
+
+
+def misread(reading: Reading) -> SampledRecording:
+    """The recording with columns as somebody would write them who errs like this."""
+    _, right = elbowed()
+    position, torque = reading.read(right.position, "position"), reading.read(right.torque, "torque")
+    return replace(right, position=position, torque=torque)
+
+
+def identified(recording: SampledRecording) -> Estimate:
+    return identify(elbowed()[0], [recording], method="wls")
+
+
+@pytest.mark.parametrize("which", ["torque", "position", "both"])
+@pytest.mark.parametrize("joints", [(0,), (1,), (0, 1)])
+def test_the_wrong_columns_are_named(which: str, joints: tuple[int, ...]) -> None:
+    wrong = Reading(which, joints)  # type: ignore[arg-type]
+    recording = misread(wrong)
+    estimate = identified(recording)
+    found = misread_columns(estimate, [recording])
+    assert found is not None
+    assert found.reading == wrong
+    assert found.after.relative_percent < 0.25 * found.before.relative_percent
+    (reason,) = reasons_against(estimate, [recording])
+    names = ["shoulder", "elbow"]
+    assert all(names[joint] in reason for joint in joints)
+    assert ("exchanged" if len(joints) == 2 else "other direction" if which == "both" else "wrong sign") in reason
+    assert "recording.columns" in reason
+
+
+def test_the_sign_of_a_torque_is_found_without_the_recordings() -> None:
+    estimate = identified(misread(Reading("torque", (1,))))
+    found = misread_columns(estimate, [])
+    assert found is not None
+    assert found.reading == Reading("torque", (1,))
+    assert "wrong sign" in reasons_against(estimate)[0]
+
+
+def test_right_columns_are_left_alone() -> None:
+    recording = elbowed()[1]
+    estimate = identified(recording)
+    assert misread_columns(estimate, [recording]) is None
+    assert reasons_against(estimate, [recording]) == ()
+
+
+def test_a_torque_of_noise_is_no_misread_column() -> None:
+    right = elbowed()[1]
+    torque = right.torque.copy()
+    torque[:, 1] = np.random.default_rng(5).normal(size=len(torque))
+    poor = replace(right, torque=torque)
+    estimate = identified(poor)
+    assert estimate.candidates[estimate.chosen].moving.joint_relative_percent[1] > 50.0
+    assert misread_columns(estimate, [poor]) is None
+
+
+def test_a_range_of_a_recording_is_read_within_its_range() -> None:
+    wrong = misread(Reading("torque", (1,)))
+    position = wrong.position.copy()
+    position[wrong.stamp_ns < wrong.stamp_ns[0] + 5_000_000_000] = 0.0  # another arm's, say
+    part = RangeRecording(replace(wrong, position=position), 5.0, 20.0)
+    found = misread_columns(identify(elbowed()[0], [part], method="wls"), [part])
+    assert found is not None
+    assert found.reading == Reading("torque", (1,))
+    assert found.after.relative_percent < 2.0
