@@ -611,7 +611,9 @@ def read_claim(document: dict[str, object], certificate: dict[str, object]) -> C
     expressions = _as_list(table.get("expressions"), "base_parameters.expressions")
     K = tuple(parse_expression(_as_text(text, "base_parameters.expressions")) for text in expressions)
     values = _as_list(table.get("values"), "base_parameters.values")
-    beta = tuple(_as_number(value, "base_parameters.values") for value in values if isinstance(value, _Number))
+    if (wrong := next((k for k, value in enumerate(values, 1) if not isinstance(value, _Number)), None)) is not None:
+        raise VerificationError(f"base_parameters.values: number {wrong} is not a number")
+    beta = tuple(_as_number(value, "base_parameters.values") for value in values)
     if not K or len(K) != len(beta):
         raise VerificationError(f"base_parameters: {len(K)} expressions but {len(beta)} values")
     links = tuple(sorted({_link(number) for number in _as_list(certificate.get("links"), "certificate.links")}))

@@ -591,6 +591,7 @@ def _feasible(arguments: argparse.Namespace) -> Answer:
         "feasible": result.feasible,
         "margin": result.margin,
         "tight": list(result.tight),
+        "certified": tested.certified,
         "notes": list(tested.notes),
     }
     return (DONE if result.feasible else VERDICT_NO), text, document

@@ -184,7 +184,9 @@ def _stopped(ended: Ended) -> list[str] | None:
 
 def _identified(ended: Ended) -> list[str]:
     if not ended.good:
-        return ["design", ended.arm]
+        # A longer or richer motion is no remedy for what is wrong with the recording or the description.
+        short = not ended.said.get("unusable") or all("s of motion" in one for one in ended.said["unusable"])
+        return ["design", ended.arm] if short else ["report", ended.run]
     given = getattr(ended.given, "recordings", None)
     how = "commissioned in simulation" if given is None else f"identified from {', '.join(p.name for p in given)}"
     return ["accept", ended.run, "--note", how]
@@ -199,16 +201,19 @@ def _compared(ended: Ended) -> list[str]:
 
 def _tested(ended: Ended) -> list[str]:
     file = str(ended.given.file)
-    return ["verify", file] if ended.good else ["project", file, "--out", "feasible.json"]
+    # A table without a certificate gets one by its projection, which changes nothing where it is feasible.
+    return ["verify", file] if ended.good and ended.said["certified"] else ["project", file, "--out", "feasible.json"]
 
 
-def _verified(ended: Ended) -> list[str]:
+def _verified(ended: Ended) -> list[str] | None:
     file = ended.given.file
-    if not ended.good:
+    if ended.said.get("verdict") == "infeasible":
         return ["project", str(file), "--out", "feasible.json"]
+    if not ended.good:  # without a proof, nothing is known of the parameters that nearer ones could be near to
+        return None
     if ended.remote or file.is_dir() or (file.parent / "manifest.json").is_file():
         return ["export", ended.short(file if file.is_dir() or ended.remote else file.parent)]
-    return ["feasible", str(file)]
+    return None
 
 
 def _fleet(ended: Ended) -> list[str]:
@@ -313,7 +318,7 @@ _FOLLOWS: dict[str, Follows] = {
     "payload": lambda ended: ["export", ended.short(ended.given.run)],
     "verify": _verified,
     "feasible": _tested,
-    "project": lambda ended: ["feasible", str(ended.given.out)],
+    "project": lambda ended: ["verify", str(ended.given.out)],
     **dict.fromkeys(("fleet identify", "fleet status"), _fleet),
     "jobs": _listed_jobs,
     **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), _job),

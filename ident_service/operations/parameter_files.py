@@ -53,11 +53,12 @@ from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VE
 
 @dataclass(frozen=True)
 class CheckedFile:
-    """Result of a feasibility test of a parameter file."""
+    """Result of a feasibility test of a parameter file, and whether the file has a certificate to verify."""
 
     kind: FeasibleSetName
     result: FeasibilityTest
     notes: tuple[str, ...] = ()
+    certified: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ def check_file(
         SolverError: the solver stopped without an optimum.
     """
     file, conditions, notes = _read(path, kind, arm, notation)
-    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes)
+    certified = file.content.get("feasibility", {}).get("certificate", {}).get("kind") in ("witness", "dual")
+    return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes, certified)
 
 
 def correct_file(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Literal
@@ -54,14 +55,16 @@ def open_recording(
     except OSError as error:
         raise RecordingError(path, f"cannot be read: {error.strerror}") from error
     if not start:
-        raise RecordingError(path, "is empty")
+        raise RecordingError(path, "is empty; record again, or give another file")
     recording: McapRecording | CsvRecording
     if start.startswith(MAGIC):
         recording = McapRecording(path, order=joints, bag=fmt)
         if recording.own:
             return _with_torque(recording, torque)
+    elif start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise RecordingError(path, "is text in UTF-16; save it as UTF-8")
     elif not start.startswith(GZIP_MAGIC) and b"\x00" in start:
-        raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip)")
+        raise RecordingError(path, "is neither MCAP nor CSV (plain or gzip); export the recording as one of them")
     else:
         skip = fmt.missing == "skip"
         recording = CsvRecording(path, columns=fmt.columns or None, joints=joints, skip_missing=skip)

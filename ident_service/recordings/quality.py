@@ -134,7 +134,7 @@ class Quality:
             )
         for joint in self.joints:
             if joint.saturated > _MUCH_SATURATION:
-                found.append(f"joint {joint.name}: torque saturated in {100.0 * joint.saturated:.2g} % of the samples")
+                found.append(f"joint {joint.name}: torque saturated in {100.0 * joint.saturated:.3g} % of the samples")
             if joint.torque[0] == joint.torque[1]:
                 found.append(f"joint {joint.name}: torque is always {joint.torque[0]:g}")
             if joint.standstill > _MUCH_STANDSTILL:

@@ -350,7 +350,7 @@ def uniform(
         raise RecordingError(
             recording.path,
             f"the longest stretch without a gap (a step above {stamps.gap_s * 1e3:.4g} ms) is {longest:.4g} s; "
-            f"at least {least:.4g} s are needed",
+            f"at least {least:.4g} s are needed; record a longer stretch, or cut or mend the gaps",
         )
     parts = _parts(trimmed(recording.blocks(samples), fmt.trim), stamps.segments)
     for segment, group in groupby(parts, key=itemgetter(0)):

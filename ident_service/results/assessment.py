@@ -307,7 +307,8 @@ def _knowledge(content: Mapping[str, Any]) -> Weighted:
         are = "is" if count == 1 else "are"
         said = f"{count} of {len(verdicts)} base parameters {are} unidentified: these recordings do not determine them."
         return [(1, said)]
-    return [(0, f"{len(verdicts) - weak} of {len(verdicts)} base parameters are identified, {weak} are weak.")]
+    and_weak = f", {weak} {'is' if weak == 1 else 'are'} weak" if weak else ""
+    return [(0, f"{len(verdicts) - weak} of {len(verdicts)} base parameters are identified{and_weak}.")]
 
 
 def _warnings(content: Mapping[str, Any]) -> Weighted:

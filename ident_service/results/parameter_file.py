@@ -184,7 +184,7 @@ def read_parameters(
     """Read a parameter file.
 
     Args:
-        path: the file.
+        path: the file, or the folder of results that holds it.
         names: the link parameters of an arm; without them, the ten of every link up to the highest number that the
             expressions mention, and the joint terms that they mention.
         notation: of the file's names, where it is not ours.
@@ -194,6 +194,8 @@ def read_parameters(
         ParameterError: not JSON, not of the schema, a name that is no link parameter, or expressions that do not parse
             or depend on each other.
     """
+    if path.is_dir():
+        path = path / "parameters.json"
     if not path.is_file():
         raise UsageError(f"no such file: {path}")
     if path.stat().st_size > MAX_BYTES:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 import shutil
 from collections.abc import Mapping
@@ -65,6 +66,8 @@ TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("set-home planar2", 0, {}, "watch planar2"),
     ("identify a.mcap --arm planar2", 0, {"folder": "/r"}, "accept /r --note 'identified from a.mcap'"),
     ("identify a.mcap --arm planar2", 3, {"folder": "/r"}, "design planar2"),
+    ("identify a.csv --arm planar2", 3, {"folder": "/r", "unusable": ["fitted to 2 s of motion"]}, "design planar2"),
+    ("identify a.csv --arm planar2", 3, {"folder": "/r", "unusable": ["a wrong sign"]}, "report /r"),
     ("compare a b", 3, {"verdict": "changed"}, "accept b --note WHY"),
     ("compare a b", 0, {"verdict": "unchanged"}, "report b"),
     ("feasible t.json", 3, {}, "project t.json --out feasible.json"),
@@ -155,3 +158,21 @@ def test_a_motion_is_followed_by_the_identification_of_its_recording(ident: Iden
     assert ended.next[2:] == ["--arm", str(arm)]
     assert (state / "runs" / ended.next[1] / "run.mcap").is_file()
     assert ident(*ended.next).code in (0, 3)
+
+
+def test_a_table_gets_its_certificate_and_the_commands_then_end(ident: Ident, tmp_path: Path) -> None:
+    table = {"expressions": ["m1", "lz1", "Lxx1", "Lyy1", "Lzz1"], "values": [1.0, 0.1, 0.2, 0.2, 0.1]}
+    file = tmp_path / "table.json"
+    file.write_text(json.dumps({"format": "ident-parameters", "version": 1, "base_parameters": table}))
+    ended = ident("feasible", file)
+    assert (ended.code, ended.next[0]) == (0, "project")
+    ended = ident(*ended.next[:-1], tmp_path / "projected.json")
+    assert (ended.code, ended.next) == (0, ["verify", str(tmp_path / "projected.json")])
+    assert ident(*ended.next).out.endswith("base parameters\n")  # nothing follows
+
+    forged = json.loads((tmp_path / "projected.json").read_text())
+    forged["base_parameters"]["values"][0] += 1.0
+    file.write_text(json.dumps(forged))
+    ended = ident("verify", file)
+    assert ended.code == 3
+    assert "next:" not in ended.out + ended.err

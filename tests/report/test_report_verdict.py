@@ -75,7 +75,7 @@ def test_use_is_said_only_where_nothing_stands_against_it(good: Made) -> None:
         "Predicts motions that were not fitted: torque error 0.9 %, 0.8 % on the fitted; no joint is off by more than "
         "15 %.",
         "Physically feasible, and no constraint is active.",
-        f"{good.estimate.base.size} of {good.estimate.base.size} base parameters are identified, 0 are weak.",
+        f"{good.estimate.base.size} of {good.estimate.base.size} base parameters are identified.",
     )
     assert found.further == ()
     assert {one.word for one in found.joints} == {"use"}

@@ -136,8 +136,9 @@ def _knowledge(parameters: ParameterFile) -> str:
     if verdicts is None:
         return "The uncertainty of its parameters is unknown."
     counts = {word: verdicts.count(word) for word in ("identified", "weak", "unidentified")}
-    words = f"Of {len(verdicts)} base parameters {counts['identified']} are identified to {100 * IDENTIFIED_BELOW:g} %"
-    words += f", {counts['weak']} are weak (to {100 * WEAK_BELOW:g} %) and {counts['unidentified']} unidentified"
+    identified, weak = (f"{counts[word]} {'is' if counts[word] == 1 else 'are'} {word}" for word in list(counts)[:2])
+    words = f"Of {len(verdicts)} base parameters {identified} to {100 * IDENTIFIED_BELOW:g} %"
+    words += f", {weak} (to {100 * WEAK_BELOW:g} %) and {counts['unidentified']} unidentified"
     unknown = unidentified(parameters)
     if not unknown:
         return words + "."
