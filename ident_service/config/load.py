@@ -405,6 +405,9 @@ class KnownKeys:
                     below.append(one["properties"][step])
                 elif isinstance(one.get("additionalProperties"), dict):
                     below.append(one["additionalProperties"])
+                elif isinstance(step, str):
+                    patterns = one.get("patternProperties", {}).items()
+                    below += [part for pattern, part in patterns if re.search(pattern, step)]
                 if isinstance(step, int) and isinstance(one.get("items"), dict):
                     below.append(one["items"])
             parts = self._fitting(below, value)

@@ -155,6 +155,8 @@ def _listed(what: str, names: Sequence[str], most: int = 8) -> str:
 def _what_then(names: Sequence[str], columns: Mapping[str, Column] | None) -> str:
     if columns is not None:
         return f"the file has the {_listed('column', names, 40)}"
+    if any(_NAME.fullmatch(name.lower()) and not _NAME.fullmatch(name) for name in names):
+        return "write the names in small letters: t,q1..qN,tau1..tauN"
     return (
         "expected a header t,q1..qN,tau1..tauN, or the names of these columns in recording.columns of the description"
         " (or --columns): columns: {t: NAME, q1: NAME, tau1: NAME, ...}"

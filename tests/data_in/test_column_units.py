@@ -78,6 +78,7 @@ def test_a_number_times_this_is_si(name: str, column: dict[str, Any], factor: fl
         ("t", {"factor": -1}, "a factor of -1 lets time run backwards"),
         ("t", {"unit": "rad"}, "'rad' is a unit of position, not of time"),
         ("tau1", {"sign": -1}, "unknown key 'sign'"),
+        ("tau1", {"factr": -1}, "unknown key 'factr'; did you mean 'factor'?"),
     ],
 )
 def test_a_slip_is_named_with_its_place(name: str, column: dict[str, Any], words: str, tmp_path: Path) -> None:

@@ -169,6 +169,7 @@ def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
         ("t q1 tau1", "columns are separated by spaces"),
         ("0.0,-1.5,2e3", "is numbers; put a line with the names of the columns above it: t,q1..qN,tau1..tauN"),
         ("# recorded by us", "is a comment; remove what stands"),
+        ("T,Q1,Tau1", "write the names in small letters: t,q1..qN,tau1..tauN"),
         ("# t, q1, tau1", "is a comment; remove what stands before the names of the columns"),
         (
             "time," + ",".join(f"pos_{k}" for k in range(7)) + ",eff_0",

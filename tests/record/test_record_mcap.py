@@ -244,6 +244,9 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
     empty.write_bytes(b"\x7fELF\x00\x00")
     with pytest.raises(RecordingError, match="neither MCAP nor CSV"):
         open_recording(empty)
+    empty.write_text("t,q1,tau1\n0,1,2\n", encoding="utf-16")
+    with pytest.raises(RecordingError, match="UTF-16; save it as UTF-8"):
+        open_recording(empty)
 
 
 def test_the_high_level_ros2_reader_takes_our_files(tmp_path: Path) -> None:
