@@ -94,7 +94,7 @@ class RequestGuardMiddleware:
             return  # the service has no other protocols
         began, status, started = time.perf_counter(), 500, False
         peer: Peer | None = scope.get("client")
-        urgent = scope["path"].endswith(_URGENT)
+        urgent = scope["method"] == "POST" and scope["path"].endswith(_URGENT)
         busy = not urgent and self._connections.busy(peer)
         self._connections.headers_received(peer, body=_has_body(scope))
         body = _Body(scope, receive, self._bodies, urgent=urgent)

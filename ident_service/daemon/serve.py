@@ -201,7 +201,8 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             proxy_headers=False,
             ws="none",
             lifespan="on",
-            http=functools.partial(FairReader, turns=ReadingTurns()),  # type: ignore[arg-type] # it is called once each
+            # Called for each connection.
+            http=functools.partial(FairReader, turns=ReadingTurns(), urgent=ReadingTurns()),  # type: ignore[arg-type]
             loop="asyncio",  # this loop accepts connections from `Listener`
             h11_max_incomplete_event_size=_MOST_HEADERS,
             timeout_graceful_shutdown=_LAST_ANSWERS,
