@@ -21,6 +21,7 @@ import re
 import resource
 import socket
 import time
+from asyncio import sslproto
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -37,13 +38,14 @@ _MOST, _FEWEST = 512, 16
 _DESCRIPTORS = 4096  # descriptors that are asked for, if the hard limit of the process allows it
 _RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are being closed
 _LEAVING = 64
-_AT_ONCE = 16  # connections accepted before the event loop turns to other work
+_AT_ONCE, _GONE_AT_ONCE = 8, 64  # connections accepted before the event loop turns to other work; whose client has gone
 _TURN: Final = 0.002  # s of the processor for reading requests in each turn of the event loop
+_PIECES: Final = 16  # that are read in each turn; behind one, TLS may have 16 kB of one-byte records to decrypt
 _REQUESTS: Final = 4  # that begin, or whose bodies become whole, in each turn; JSON of 64 kB takes 3 ms to read
 _PIECE = 1024  # bytes; of one-byte chunks or empty headers 2 ms to read
 _URGENT: Final = re.compile(rb"POST [^ ?]*/(?:stop|lease)[ ?]")
 _URGENT_BYTES: Final = 4096  # of the head of such a request
-_AT_A_TIME: Final = 32 * 1024  # bytes received of a connection before they are read
+_AT_A_TIME: Final = 16 * 1024  # bytes received of a connection before they are read
 _MOST_LINES: Final = 100  # of a head; of 16 kB that are four thousand, 50 ms to read
 Peer = tuple[str, int]
 
@@ -56,6 +58,11 @@ def raise_connection_limit() -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
         soft = wanted
     return _MOST if soft == resource.RLIM_INFINITY else max(_FEWEST, min(_MOST, soft - _RESERVE))
+
+
+def receive_little_of_tls() -> None:
+    """Let asyncio decrypt and hold little of a connection at a time; 256 kB of one-byte records take 20 ms."""
+    sslproto.SSLProtocol.max_size = _AT_A_TIME
 
 
 class Connections:
@@ -210,7 +217,7 @@ class Listener(socket.socket):
             book: counts.
         """
         super().__init__(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        self._book, self._accepted = book, 0
+        self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept the next connection that is admitted.
@@ -219,15 +226,29 @@ class Listener(socket.socket):
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.
         """
         while True:
-            self._accepted += 1
-            if self._accepted > _AT_ONCE or self._book.full:
-                self._accepted = 0
+            if self._accepted >= _AT_ONCE or self._gone >= _GONE_AT_ONCE or self._book.full:
+                self._accepted = self._gone = 0
                 raise BlockingIOError
             accepted, address = super().accept()
+            if _gone(accepted):  # without the half millisecond that a protocol for it takes
+                self._gone += 1
+                accepted.close()
+                continue
+            self._accepted += 1
             connection = Connection.of(accepted, (str(address[0]), int(address[1])), self._book)
             if self._book.admit(connection):
                 return connection, address
             connection.close()
+
+
+def _gone(accepted: socket.socket) -> bool:
+    """Return whether the client has closed a connection on which it had sent nothing."""
+    try:
+        return not accepted.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 class ReadingTurns:
@@ -239,6 +260,7 @@ class ReadingTurns:
     def __init__(self, now: Callable[[], float] = time.thread_time) -> None:
         """Begin without connections; `now` is the clock of the event loop's thread [s]."""
         self._now, self._spent, self._requests, self._scheduled = now, 0.0, 0, False
+        self._pieces = 0
         self._waiting: dict[str, deque[FairReader]] = {}  # by address, the one whose turn it is first
 
     @property
@@ -248,7 +270,7 @@ class ReadingTurns:
 
     @property
     def _goes_on(self) -> bool:
-        return self._spent < _TURN and self._requests < _REQUESTS
+        return self._spent < _TURN and self._requests < _REQUESTS and self._pieces < _PIECES
 
     def read(self, reader: FairReader) -> None:
         """Read one piece of a request now."""
@@ -257,6 +279,7 @@ class ReadingTurns:
             self._requests += reader.read_piece()
         finally:
             self._spent += self._now() - began
+            self._pieces += 1
             self._schedule()
 
     def wait(self, reader: FairReader) -> None:
@@ -270,7 +293,7 @@ class ReadingTurns:
             asyncio.get_running_loop().call_soon(self._turn)
 
     def _turn(self) -> None:
-        self._scheduled, self._spent, self._requests = False, 0.0, 0
+        self._scheduled, self._spent, self._requests, self._pieces = False, 0.0, 0, 0
         try:
             while self._waiting and self._goes_on:
                 self.read(self._next())
@@ -305,7 +328,7 @@ class FairReader(H11Protocol):
         """Begin to read."""
         super().connection_made(transport)
         self.host = self.client[0] if self.client else ""
-        if hasattr(transport, "max_size"):  # asyncio's buffer, unless it speaks TLS
+        if hasattr(transport, "max_size"):  # with TLS as `receive_little_of_tls` says
             transport.max_size = _AT_A_TIME
         self.flow = _ReaderFlow(transport, self)
 
@@ -352,8 +375,9 @@ class FairReader(H11Protocol):
                 self._more_requests = False
                 super().handle_events()
             elif self._received:
-                piece = bytes(self._received[: self._piece])
-                del self._received[: self._piece]
+                size = max(self._piece, self._plain_bytes())
+                piece = bytes(self._received[:size])
+                del self._received[:size]
                 super().data_received(piece)
             self._require_few_lines()
         except BaseException:
@@ -386,6 +410,10 @@ class FairReader(H11Protocol):
     def _forget(self) -> None:
         self._received.clear()
         self._more_requests = False
+
+    def _plain_bytes(self) -> int:
+        """Return how much follows of a body whose length was told; h11 reads any amount of it at once."""
+        return int(getattr(getattr(self.conn, "_reader", None), "_remaining", 0))
 
     def _require_few_lines(self) -> None:
         """Refuse a head, or trailers, of so many lines that reading them would take long; h11 reads all at once."""

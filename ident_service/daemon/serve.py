@@ -38,6 +38,7 @@ from ident_service.daemon.connections import (
     Listener,
     ReadingTurns,
     raise_connection_limit,
+    receive_little_of_tls,
 )
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
@@ -183,6 +184,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
     _require_tls(settings)
     require_private(settings.state)
     book = Connections(raise_connection_limit())
+    receive_little_of_tls()
     with single_instance(settings.state), _listening(settings, book) as listening:
         host, port = listening.getsockname()[:2]
         url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"

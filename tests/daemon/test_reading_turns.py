@@ -6,9 +6,15 @@ import asyncio
 import hashlib
 import random
 import re
+import socket
+import ssl
+import struct
+import subprocess
+from asyncio import sslproto
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,7 +25,7 @@ from hypothesis import strategies as st
 from uvicorn.server import ServerState
 
 from ident_service.daemon import connections
-from ident_service.daemon.connections import Connections, FairReader, ReadingTurns
+from ident_service.daemon.connections import Connections, FairReader, Listener, ReadingTurns
 from ident_service.daemon.serve import _MOST_HEADERS
 
 App = Callable[[Any, Any, Any], Awaitable[None]]
@@ -28,7 +34,9 @@ START = {"type": "http.response.start", "status": 200}
 
 
 @asynccontextmanager
-async def served(app: App, readers: list[FairReader] | None = None) -> AsyncIterator[int]:
+async def served(
+    app: App, readers: list[FairReader] | None = None, tls: ssl.SSLContext | None = None
+) -> AsyncIterator[int]:
     """Serve an application by `FairReader` on a port of its own, as the daemon does."""
     config = uvicorn.Config(
         app, log_config=None, ws="none", lifespan="off", h11_max_incomplete_event_size=_MOST_HEADERS
@@ -42,7 +50,7 @@ async def served(app: App, readers: list[FairReader] | None = None) -> AsyncIter
             readers.append(made)
         return made
 
-    server = await asyncio.get_running_loop().create_server(reader, "127.0.0.1", 0)
+    server = await asyncio.get_running_loop().create_server(reader, "127.0.0.1", 0, ssl=tls)
     try:
         yield server.sockets[0].getsockname()[1]
     finally:
@@ -54,9 +62,9 @@ async def served(app: App, readers: list[FairReader] | None = None) -> AsyncIter
         await asyncio.sleep(0)
 
 
-async def answered(port: int, data: list[bytes], count: int) -> list[bytes]:
+async def answered(port: int, data: list[bytes], count: int, tls: ssl.SSLContext | None = None) -> list[bytes]:
     """Send pieces of requests and return the bodies of so many answers."""
-    read, write = await asyncio.open_connection("127.0.0.1", port)
+    read, write = await asyncio.open_connection("127.0.0.1", port, ssl=tls)
 
     async def send() -> None:
         for piece in data:
@@ -170,6 +178,75 @@ def test_a_flood_begins_a_few_requests_in_each_turn_of_the_loop(path: bytes) -> 
     # Four urgent ones and four others; a turn of ours may see the ends of two of the loop's.
     assert max(begun.values()) <= 16
     assert most < 2 * connections._AT_A_TIME
+
+
+def test_a_body_of_known_length_is_read_in_large_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    pieces, read = list[int](), FairReader.read_piece
+
+    def count(reader: FairReader) -> bool:
+        pieces.append(len(reader._received))
+        return read(reader)
+
+    monkeypatch.setattr(FairReader, "read_piece", count)
+
+    async def ask() -> list[bytes]:
+        body = b" " * 2**20
+        head = b"POST /read HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(body)
+        async with served(digest) as port, asyncio.timeout(SOON):
+            return await answered(port, [head + body], 1)
+
+    assert asyncio.run(ask()) == [b"/read " + hashlib.sha256(b" " * 2**20).hexdigest().encode()]
+    assert len(pieces) < 250  # of 1 kB they would be a thousand, and an upload would take five times the processor
+
+
+def test_tls_decrypts_little_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sslproto.SSLProtocol, "max_size", sslproto.SSLProtocol.max_size)  # set back at the end
+    connections.receive_little_of_tls()
+    words = "req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -subj /CN=localhost"
+    files = ["-keyout", str(tmp_path / "key"), "-out", str(tmp_path / "cert")]
+    subprocess.run(["openssl", *words.split(), *files], check=True, capture_output=True)
+    ours, theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER), ssl.create_default_context(cafile=str(tmp_path / "cert"))
+    ours.load_cert_chain(tmp_path / "cert", tmp_path / "key")
+    theirs.check_hostname = False
+    sizes, received = list[int](), FairReader.data_received
+    monkeypatch.setattr(
+        FairReader, "data_received", lambda one, data: (sizes.append(len(data)), received(one, data))[1]
+    )
+
+    async def ask() -> list[bytes]:
+        data = b"POST /unread HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n" * 5000
+        async with served(digest, tls=ours) as port, asyncio.timeout(SOON):
+            return await answered(port, [data], 200, theirs)
+
+    assert asyncio.run(ask()) == [b"/unread " + hashlib.sha256(b"").hexdigest().encode()] * 200
+    assert max(sizes) <= 2 * connections._AT_A_TIME
+
+
+def test_connections_whose_clients_have_gone_are_no_protocols_any_more() -> None:
+    # Clients that connect and go, 20,000 a second, held up stops by seconds.
+    book = Connections()
+    with Listener(socket.AF_INET, book) as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen(100)
+        listening.setblocking(False)
+        for k in range(100):
+            with socket.create_connection(listening.getsockname()) as gone:
+                if k % 2:  # as a client that is killed
+                    gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with socket.create_connection(listening.getsockname()) as silent:
+            accepted = list[socket.socket]()
+            for _ in range(2):  # turns of the event loop
+                with suppress(BlockingIOError):
+                    while True:
+                        accepted.append(listening.accept()[0])
+            assert [one.getpeername() for one in accepted] == [silent.getsockname()]
+            assert book.count == 1
+        with socket.create_connection(listening.getsockname()) as asked:
+            asked.sendall(b"POST /api/v1/stop")  # and is gone: it is heard all the same
+        accepted.append(listening.accept()[0])
+        assert accepted[-1].recv(100) == b"POST /api/v1/stop"
+        for one in accepted:
+            one.close()
 
 
 def test_addresses_take_turns() -> None:
