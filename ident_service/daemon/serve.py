@@ -30,6 +30,7 @@ from typing import Any, Final, TextIO
 
 import uvicorn
 from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
 
 from ident_service.daemon.app import create_app
 from ident_service.daemon.connections import (
@@ -287,6 +288,7 @@ async def _make_routes(app: FastAPI) -> None:
     scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "scheme": "http"}
     place = {"path": "/nothing", "raw_path": b"/nothing", "query_string": b"", "root_path": "", "headers": []}
     await app.router({**scope, **place}, receive, send)
+    await run_in_threadpool(lambda: None)  # loads what the first use of a thread needs (50 ms)
 
 
 def _require_tls(settings: Settings) -> None:
