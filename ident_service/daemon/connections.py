@@ -4,7 +4,8 @@ A new connection is always admitted. Where there are too many, of one address or
 has waited longest without a complete request: half a request, a TLS handshake that does not go on, an idle connection.
 So a stop always finds a place, whoever keeps connections open. Requests that are being answered keep theirs; they are
 fewer than the places, of one address and of all, because the middleware refuses more (`busy`), a stop and a lease
-excepted. A client that does not read its answer is closed, too.
+excepted. A client that does not read its answer is closed, too; one without a token gives way to newcomers as if it had
+not asked, and has a minute for all of it.
 
 uvicorn's own `limit_concurrency` counts idle connections and would refuse the stop; it has no deadline for a request.
 
@@ -132,6 +133,12 @@ class Connections:
         """Note that a request is complete."""
         if peer is not None:
             self._waiting.pop(peer, None)
+
+    def answering_stranger(self, peer: Peer | None) -> None:
+        """Note that an answer to a client without a token begins; its deadline to read all of it begins."""
+        if peer in self._open:
+            self._waiting.pop(peer, None)
+            self._waiting[peer] = self._now() + ANSWER_SECONDS
 
     def sending(self, peer: Peer | None) -> None:
         """Note that a piece of an answer is being sent; the client's deadline to read it begins."""

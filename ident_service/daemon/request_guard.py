@@ -108,6 +108,8 @@ class RequestGuardMiddleware:
                 if b"cache-control" not in given:
                     more.append((b"cache-control", b"no-store"))
                 message["headers"] = [*message.get("headers", ()), *more]
+                if not scope.get("state", {}).get("who"):
+                    self._connections.answering_stranger(peer)
             self._connections.sending(peer)
             await send(message)
             self._connections.sent(peer)
