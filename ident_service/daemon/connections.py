@@ -371,7 +371,7 @@ class FairReader(H11Protocol):
             Whether a request has begun, or has become whole, so that the application goes to work.
 
         Raises:
-            Exception: whatever the request ends in; the connection is closed.
+            Exception: whatever else than a mistake of the client the request ends in; the connection is closed.
         """
         self._queued, self._reading = False, True
         before = self.cycle, self.conn.their_state
@@ -387,9 +387,11 @@ class FairReader(H11Protocol):
                 del self._received[:size]
                 super().data_received(piece)
             self._require_few_lines()
+        except h11.ProtocolError:  # a mistake of the client after its answer has begun: it cannot be told any more
+            self.logger.warning("an invalid request was broken off")
+            self._break_off()
         except BaseException:
-            self._forget()
-            self.transport.abort()
+            self._break_off()
             raise
         finally:
             self._reading, self._piece = False, _PIECE
@@ -417,6 +419,10 @@ class FairReader(H11Protocol):
     def _forget(self) -> None:
         self._received.clear()
         self._more_requests = False
+
+    def _break_off(self) -> None:
+        self._forget()
+        self.transport.abort()
 
     def _plain_bytes(self) -> int:
         """Return how much follows of a body whose length was told; h11 reads any amount of it at once."""
