@@ -359,6 +359,11 @@ class FairReader(H11Protocol):
             self._more_requests = True
             self.go_on()
 
+    def send_400_response(self, msg: str) -> None:
+        """Answer a mistake of the client; what the application answers to the torn request is dropped."""
+        super().send_400_response(msg)
+        self._drop_answer()
+
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget what has not been read."""
         self._forget()
@@ -420,8 +425,14 @@ class FairReader(H11Protocol):
         self._received.clear()
         self._more_requests = False
 
+    def _drop_answer(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+
     def _break_off(self) -> None:
         self._forget()
+        self._drop_answer()
         self.transport.abort()
 
     def _plain_bytes(self) -> int:
@@ -438,7 +449,7 @@ class FairReader(H11Protocol):
         if self.conn.our_state is h11.IDLE:
             self.send_400_response(f"a request has {_MOST_LINES} lines of headers at most")
         else:
-            self.transport.abort()
+            self._break_off()
 
     def _urgent(self, data: bytes) -> bool:
         """Return whether this is the whole head of a stop or a lease's renewal, on a connection that waits for one."""

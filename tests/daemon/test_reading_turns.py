@@ -329,6 +329,19 @@ def test_a_request_that_raises_while_it_waits_for_its_turn_ends_its_connection()
     assert errors == []  # no traceback for a mistake of a client's
 
 
+def test_a_torn_request_is_told_once_and_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
+    async def ask() -> bytes:
+        async with served(digest) as port, asyncio.timeout(SOON):
+            read, write = await asyncio.open_connection("127.0.0.1", port)
+            write.write(b"POST /unread HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nnone\r\n")
+            answer = await read.read()
+            write.close()
+            return answer
+
+    assert asyncio.run(ask()).startswith(b"HTTP/1.1 400 ")
+    assert [record.levelname for record in caplog.records if record.name.startswith("uvicorn")] == ["WARNING"]
+
+
 def test_only_a_stop_and_a_renewal_pass_a_busy_service(state: Any) -> None:
     with serving(state) as daemon:
         daemon.app.user_middleware[0].kwargs["connections"].__class__ = type(
