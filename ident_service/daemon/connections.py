@@ -4,13 +4,15 @@ A new connection is always admitted. Where there are too many, of one address or
 has waited longest without a complete request: half a request, a TLS handshake that does not go on, an idle connection.
 So a stop always finds a place, whoever keeps connections open. Requests that are being answered keep theirs; they are
 fewer than the places, of one address and of all, because the middleware refuses more (`busy`), a stop and a lease
-excepted. A client that does not read its answer is closed, too.
+excepted. A client that does not read its answer is closed, too; one without a token gives way to newcomers as if it had
+not asked, and has a minute for all of it.
 
 uvicorn's own `limit_concurrency` counts idle connections and would refuse the stop; it has no deadline for a request.
 
 Reading takes the event loop's time, too: of 256 kB that are one-byte chunks a second and more. So requests are read in
-small pieces, and all connections together have a few milliseconds of each turn of the loop for it; only the head of a
-stop or of a lease's renewal is read at once (`ReadingTurns`).
+small pieces, and in each turn of the loop all connections together have a few milliseconds for it and begin a few
+requests. The heads of stops and of leases' renewals have as much for themselves, and are read at once where there is no
+flood of them. A request that was sent behind another one waits for its turn as well (`ReadingTurns`, `FairReader`).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import re
 import resource
 import socket
 import time
+from asyncio import sslproto
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -36,12 +39,15 @@ _MOST, _FEWEST = 512, 16
 _DESCRIPTORS = 4096  # descriptors that are asked for, if the hard limit of the process allows it
 _RESERVE = 256  # descriptors for files, pipes of jobs, and connections that are being closed
 _LEAVING = 64
-_AT_ONCE = 16  # connections accepted before the event loop turns to other work
+_AT_ONCE, _GONE_AT_ONCE = 8, 64  # connections accepted before the event loop turns to other work; whose client has gone
 _TURN: Final = 0.002  # s of the processor for reading requests in each turn of the event loop
-_SHORT, _LONG = 0.0005, 0.002  # s for a piece, below and above which the next one is larger or smaller
-_LEAST, _LARGEST = 512, 8192  # bytes of a piece
+_PIECES: Final = 16  # that are read in each turn; behind one, TLS may have 16 kB of one-byte records to decrypt
+_REQUESTS: Final = 4  # that begin, or whose bodies become whole, in each turn; JSON of 64 kB takes 3 ms to read
+_PIECE = 1024  # bytes; of one-byte chunks or empty headers 2 ms to read
 _URGENT: Final = re.compile(rb"POST [^ ?]*/(?:stop|lease)[ ?]")
 _URGENT_BYTES: Final = 4096  # of the head of such a request
+_AT_A_TIME: Final = 16 * 1024  # bytes received of a connection before they are read
+_MOST_LINES: Final = 100  # of a head; of 16 kB that are four thousand, 50 ms to read
 Peer = tuple[str, int]
 
 
@@ -53,6 +59,11 @@ def raise_connection_limit() -> int:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
         soft = wanted
     return _MOST if soft == resource.RLIM_INFINITY else max(_FEWEST, min(_MOST, soft - _RESERVE))
+
+
+def receive_little_of_tls() -> None:
+    """Let asyncio decrypt and hold little of a connection at a time; 256 kB of one-byte records take 20 ms."""
+    sslproto.SSLProtocol.max_size = _AT_A_TIME
 
 
 class Connections:
@@ -122,6 +133,12 @@ class Connections:
         """Note that a request is complete."""
         if peer is not None:
             self._waiting.pop(peer, None)
+
+    def answering_stranger(self, peer: Peer | None) -> None:
+        """Note that an answer to a client without a token begins; its deadline to read all of it begins."""
+        if peer in self._open:
+            self._waiting.pop(peer, None)
+            self._waiting[peer] = self._now() + ANSWER_SECONDS
 
     def sending(self, peer: Peer | None) -> None:
         """Note that a piece of an answer is being sent; the client's deadline to read it begins."""
@@ -207,7 +224,7 @@ class Listener(socket.socket):
             book: counts.
         """
         super().__init__(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        self._book, self._accepted = book, 0
+        self._book, self._accepted, self._gone = book, 0, 0
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept the next connection that is admitted.
@@ -216,47 +233,65 @@ class Listener(socket.socket):
             BlockingIOError: nobody waits, or it is somebody else's turn in the event loop.
         """
         while True:
-            self._accepted += 1
-            if self._accepted > _AT_ONCE or self._book.full:
-                self._accepted = 0
+            if self._accepted >= _AT_ONCE or self._gone >= _GONE_AT_ONCE or self._book.full:
+                self._accepted = self._gone = 0
                 raise BlockingIOError
             accepted, address = super().accept()
+            if _gone(accepted):  # without the half millisecond that a protocol for it takes
+                self._gone += 1
+                accepted.close()
+                continue
+            self._accepted += 1
             connection = Connection.of(accepted, (str(address[0]), int(address[1])), self._book)
             if self._book.admit(connection):
                 return connection, address
             connection.close()
 
 
+def _gone(accepted: socket.socket) -> bool:
+    """Return whether the client has closed a connection on which it had sent nothing."""
+    try:
+        return not accepted.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
 class ReadingTurns:
-    """Turns of the connections that wait to have the next piece of a request read, the longest waiting first."""
+    """Turns of the connections that wait to have the next piece of a request read.
+
+    Addresses take turns, and so do the connections of one address: a flood from one delays no other.
+    """
 
     def __init__(self, now: Callable[[], float] = time.thread_time) -> None:
         """Begin without connections; `now` is the clock of the event loop's thread [s]."""
-        self._now, self._spent, self._scheduled = now, 0.0, False
-        self._waiting = deque[FairReader]()
+        self._now, self._spent, self._requests, self._scheduled = now, 0.0, 0, False
+        self._pieces = 0
+        self._waiting: dict[str, deque[FairReader]] = {}  # by address, the one whose turn it is first
 
     @property
     def free(self) -> bool:
         """Return whether a piece may be read at once: nobody waits, and there is time left in this turn."""
-        return not self._waiting and self._spent < _TURN
+        return not self._waiting and self._goes_on
+
+    @property
+    def _goes_on(self) -> bool:
+        return self._spent < _TURN and self._requests < _REQUESTS and self._pieces < _PIECES
 
     def read(self, reader: FairReader) -> None:
-        """Read one piece of a request now; the connection waits for its next turn if there is more."""
+        """Read one piece of a request now."""
         began = self._now()
-        reader.read_piece()
-        took = self._now() - began
-        self._spent += took
-        if took < _SHORT:
-            reader.piece = min(2 * reader.piece, _LARGEST)
-        elif took > _LONG:
-            reader.piece = max(reader.piece // 2, _LEAST)
-        if reader.waits:
-            self._waiting.append(reader)
-        self._schedule()
+        try:
+            self._requests += reader.read_piece()
+        finally:
+            self._spent += self._now() - began
+            self._pieces += 1
+            self._schedule()
 
     def wait(self, reader: FairReader) -> None:
         """Let a connection wait for its turn."""
-        self._waiting.append(reader)
+        self._waiting.setdefault(reader.host, deque()).append(reader)
         self._schedule()
 
     def _schedule(self) -> None:
@@ -265,65 +300,156 @@ class ReadingTurns:
             asyncio.get_running_loop().call_soon(self._turn)
 
     def _turn(self) -> None:
-        self._scheduled, self._spent = False, 0.0
+        self._scheduled, self._spent, self._requests, self._pieces = False, 0.0, 0, 0
         try:
-            while self._waiting and self._spent < _TURN:
-                self.read(self._waiting.popleft())
+            while self._waiting and self._goes_on:
+                self.read(self._next())
         finally:  # whatever one connection's request ends in, the others have their turn
             if self._waiting:
                 self._schedule()
 
+    def _next(self) -> FairReader:
+        host = next(iter(self._waiting))
+        queue = self._waiting.pop(host)
+        reader = queue.popleft()
+        if queue:
+            self._waiting[host] = queue
+        return reader
+
 
 class FairReader(H11Protocol):
-    """HTTP protocol of one connection that reads its requests in pieces, each in its turn."""
+    """HTTP protocol of one connection that reads its requests in pieces, each in its turn.
 
-    def __init__(self, *settings: Any, turns: ReadingTurns, **more: Any) -> None:
-        """Take uvicorn's settings, and the turns that all connections share."""
+    A piece is what has been received, or a request behind the one that was answered. While one waits, nothing more is
+    received.
+    """
+
+    def __init__(self, *settings: Any, turns: ReadingTurns, urgent: ReadingTurns, **more: Any) -> None:
+        """Take uvicorn's settings, and the turns that all connections share: of urgent heads, and of all else."""
         super().__init__(*settings, **more)
-        self.turns, self.pending, self.piece = turns, bytearray(), _LEAST
+        self._turns, self._urgent_turns, self.host = turns, urgent, ""
+        self._received, self._piece = bytearray(), _PIECE
+        self._more_requests = self._queued = self._reading = False
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to read; nothing more is received while something waits to be read."""
+        """Begin to read."""
         super().connection_made(transport)
+        self.host = self.client[0] if self.client else ""
+        if hasattr(transport, "max_size"):  # with TLS as `receive_little_of_tls` says
+            transport.max_size = _AT_A_TIME
         self.flow = _ReaderFlow(transport, self)
 
     def data_received(self, data: bytes) -> None:
-        """Read what has come, or the first piece of it, if it is this connection's turn or it is urgent."""
-        if self.pending:
-            self.pending += data
-            self.transport.pause_reading()
-        elif self._urgent(data):
-            super().data_received(data)
-        else:
-            self.pending += data
-            if self.turns.free:
-                self.turns.read(self)
+        """Read what has come, or the first piece of it, if it is this connection's turn."""
+        urgent = not self._waits and self._urgent(data)
+        self._received += data
+        if not self._queued:
+            self._piece = _URGENT_BYTES if urgent else _PIECE
+            turns = self._urgent_turns if urgent else self._turns
+            if turns.free and not self.flow.read_paused:
+                turns.read(self)
             else:
-                self.transport.pause_reading()
-                self.turns.wait(self)
+                self._wait(turns)
+
+    def handle_events(self) -> None:
+        """Handle what has been read; a request behind the one that was answered waits for its turn."""
+        if self._reading:
+            super().handle_events()
+        elif self.conn.trailing_data[0]:
+            self._more_requests = True
+            self.go_on()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer a mistake of the client; what the application answers to the torn request is dropped."""
+        super().send_400_response(msg)
+        self._drop_answer()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget what has not been read."""
-        self.pending.clear()
+        self._forget()
         super().connection_lost(exc)
 
-    @property
-    def waits(self) -> bool:
-        """Return whether something is to be read, and may be: the application has taken what came before."""
-        return bool(self.pending) and not self.flow.read_paused
+    def read_piece(self) -> bool:
+        """Read the next piece.
 
-    def read_piece(self) -> None:
-        """Read the next piece, and receive more once all is read."""
-        piece = bytes(self.pending[: self.piece])
-        del self.pending[: self.piece]
-        if self.transport.is_closing():
-            self.pending.clear()
-        elif piece:
-            super().data_received(piece)
-        if self.pending:
-            self.transport.pause_reading()
+        Returns:
+            Whether a request has begun, or has become whole, so that the application goes to work.
+
+        Raises:
+            Exception: whatever else than a mistake of the client the request ends in; the connection is closed.
+        """
+        self._queued, self._reading = False, True
+        before = self.cycle, self.conn.their_state
+        try:
+            if self.transport.is_closing():
+                self._forget()
+            elif self._more_requests:
+                self._more_requests = False
+                super().handle_events()
+            elif self._received:
+                size = max(self._piece, self._plain_bytes())
+                piece = bytes(self._received[:size])
+                del self._received[:size]
+                super().data_received(piece)
+            self._require_few_lines()
+        except h11.ProtocolError:  # a mistake of the client after its answer has begun: it cannot be told any more
+            self.logger.warning("an invalid request was broken off")
+            self._break_off()
+        except BaseException:
+            self._break_off()
+            raise
+        finally:
+            self._reading, self._piece = False, _PIECE
+        self.go_on()
+        return before != (self.cycle, self.conn.their_state)
+
+    def go_on(self) -> None:
+        """Wait for the next turn if something waits to be read, else receive more."""
+        if self._waits:
+            self._wait(self._turns)
         elif not self.flow.read_paused and not self.transport.is_closing():
             self.transport.resume_reading()
+
+    @property
+    def _waits(self) -> bool:
+        return bool(self._received) or self._more_requests
+
+    def _wait(self, turns: ReadingTurns) -> None:
+        self.transport.pause_reading()
+        # The application takes what came before first (`_ReaderFlow`).
+        if not self._queued and (self._more_requests or not self.flow.read_paused):
+            self._queued = True
+            turns.wait(self)
+
+    def _forget(self) -> None:
+        self._received.clear()
+        self._more_requests = False
+
+    def _drop_answer(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+
+    def _break_off(self) -> None:
+        self._forget()
+        self._drop_answer()
+        self.transport.abort()
+
+    def _plain_bytes(self) -> int:
+        """Return how much follows of a body whose length was told; h11 reads any amount of it at once."""
+        return int(getattr(getattr(self.conn, "_reader", None), "_remaining", 0))
+
+    def _require_few_lines(self) -> None:
+        """Refuse a head, or trailers, of so many lines that reading them would take long; h11 reads all at once."""
+        if self.conn.their_state not in (h11.IDLE, h11.SEND_BODY):
+            return
+        if self.conn.trailing_data[0].count(b"\n") <= _MOST_LINES or self.transport.is_closing():
+            return
+        self.logger.warning("a request with too many lines of headers was refused")
+        if self.conn.our_state is h11.IDLE:
+            self.send_400_response(f"a request has {_MOST_LINES} lines of headers at most")
+        else:
+            self._break_off()
 
     def _urgent(self, data: bytes) -> bool:
         """Return whether this is the whole head of a stop or a lease's renewal, on a connection that waits for one."""
@@ -332,6 +458,7 @@ class FairReader(H11Protocol):
             and _URGENT.match(data) is not None
             and b"\r\n\r\n" in data
             and b"chunked" not in data.lower()
+            and data.count(b"\n") <= _MOST_LINES
             and self.conn.their_state is h11.IDLE
         )
 
@@ -345,9 +472,6 @@ class _ReaderFlow(FlowControl):
 
     def resume_reading(self) -> None:
         """Let the application take more: first what waits to be read, then what is received."""
-        if self._reader.pending:
-            if self.read_paused:
-                self.read_paused = False
-                self._reader.turns.wait(self._reader)
-        else:
-            super().resume_reading()
+        if self.read_paused:
+            self.read_paused = False
+            self._reader.go_on()

@@ -94,7 +94,7 @@ class RequestGuardMiddleware:
             return  # the service has no other protocols
         began, status, started = time.perf_counter(), 500, False
         peer: Peer | None = scope.get("client")
-        urgent = scope["path"].endswith(_URGENT)
+        urgent = scope["method"] == "POST" and scope["path"].endswith(_URGENT)
         busy = not urgent and self._connections.busy(peer)
         self._connections.headers_received(peer, body=_has_body(scope))
         body = _Body(scope, receive, self._bodies, urgent=urgent)
@@ -108,6 +108,8 @@ class RequestGuardMiddleware:
                 if b"cache-control" not in given:
                     more.append((b"cache-control", b"no-store"))
                 message["headers"] = [*message.get("headers", ()), *more]
+                if not scope.get("state", {}).get("who"):
+                    self._connections.answering_stranger(peer)
             self._connections.sending(peer)
             await send(message)
             self._connections.sent(peer)

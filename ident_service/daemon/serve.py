@@ -30,6 +30,7 @@ from typing import Any, Final, TextIO
 
 import uvicorn
 from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
 
 from ident_service.daemon.app import create_app
 from ident_service.daemon.connections import (
@@ -38,6 +39,7 @@ from ident_service.daemon.connections import (
     Listener,
     ReadingTurns,
     raise_connection_limit,
+    receive_little_of_tls,
 )
 from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
@@ -183,6 +185,7 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
     _require_tls(settings)
     require_private(settings.state)
     book = Connections(raise_connection_limit())
+    receive_little_of_tls()
     with single_instance(settings.state), _listening(settings, book) as listening:
         host, port = listening.getsockname()[:2]
         url = f"{'https' if settings.tls else 'http'}://{f'[{host}]' if ':' in host else host}:{port}"
@@ -201,7 +204,8 @@ def serve(settings: Settings, tell: Callable[[str], None] = lambda _: None) -> N
             proxy_headers=False,
             ws="none",
             lifespan="on",
-            http=functools.partial(FairReader, turns=ReadingTurns()),  # type: ignore[arg-type] # it is called once each
+            # Called for each connection.
+            http=functools.partial(FairReader, turns=ReadingTurns(), urgent=ReadingTurns()),  # type: ignore[arg-type]
             loop="asyncio",  # this loop accepts connections from `Listener`
             h11_max_incomplete_event_size=_MOST_HEADERS,
             timeout_graceful_shutdown=_LAST_ANSWERS,
@@ -284,6 +288,7 @@ async def _make_routes(app: FastAPI) -> None:
     scope = {"type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "POST", "scheme": "http"}
     place = {"path": "/nothing", "raw_path": b"/nothing", "query_string": b"", "root_path": "", "headers": []}
     await app.router({**scope, **place}, receive, send)
+    await run_in_threadpool(lambda: None)  # loads what the first use of a thread needs (50 ms)
 
 
 def _require_tls(settings: Settings) -> None:

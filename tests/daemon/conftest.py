@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import httpx
 import pytest
+from daemon.served import LEASES
 from fastapi import FastAPI
 from helpers.once import made_once
 from helpers.tickets import write_checked_ticket
@@ -27,9 +28,7 @@ from ident_service.registry.tokens import add_token
 
 Until = Callable[[dict[str, Any]], bool]
 URL = "http://127.0.0.1:8470"
-# Machines that run tests stall; a lease that is to lapse is not renewed at all.
-LEASES = 15.0
-RENEWED = 1.0  # s between two renewals, of the tens that a lease lasts then
+RENEWED = 1.0  # s between two renewals, of the tens that a lease lasts in tests
 
 
 class Asked:

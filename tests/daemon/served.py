@@ -1,16 +1,25 @@
-"""The daemon as a process of its own, and how it is asked there."""
+"""The daemon as a process of its own, or as a thread of this one, and how it is asked there."""
 
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
+
+import uvicorn
 
 from ident_service.client import IdentClient
+from ident_service.daemon.app import create_app
+from ident_service.daemon.dependencies import Service
+from ident_service.daemon.settings import Settings
 
 
 def started(state: Path, *words: str, **environment: str) -> subprocess.Popen[bytes]:
@@ -55,3 +64,39 @@ def daemon_process(
         if process.poll() is None:
             process.kill()
         process.wait()
+
+
+LEASES: Final = 15.0
+"""How much longer than usual a service waits for a renewal: machines that run tests stall."""
+
+
+@dataclass(frozen=True)
+class Reached:
+    """A service that listens."""
+
+    url: str
+    service: Service
+    token: str
+
+
+@contextmanager
+def listening(state: Path) -> Iterator[Reached]:
+    """A service on a state folder and a free port of this machine."""
+    link = socket.socket()
+    link.bind(("127.0.0.1", 0))
+    app = create_app(Settings(state, port=link.getsockname()[1], lease_factor=LEASES))
+    config = uvicorn.Config(app, log_config=None, access_log=False, ws="none", http="h11", timeout_graceful_shutdown=3)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [link]})
+    thread.start()
+    try:
+        while not server.started:
+            assert thread.is_alive()
+            time.sleep(0.01)
+        service = app.state.service
+        token = (state / "token").read_text().strip()
+        yield Reached(f"http://127.0.0.1:{link.getsockname()[1]}", service, token)
+    finally:
+        server.should_exit = True
+        thread.join(60)
+        link.close()

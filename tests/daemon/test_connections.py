@@ -292,12 +292,13 @@ class _Reader:
     """A connection with one piece of a request to read."""
 
     def __init__(self, *, torn: bool = False) -> None:
-        self.piece, self.torn, self.has_read, self.waits = 512, torn, False, False
+        self.host, self.torn, self.has_read = NEAR, torn, False
 
-    def read_piece(self) -> None:
+    def read_piece(self) -> bool:
         self.has_read = True
         if self.torn:
             raise RuntimeError("torn")
+        return False
 
 
 def test_a_request_that_raises_while_it_is_read_keeps_no_other_from_its_turn() -> None:

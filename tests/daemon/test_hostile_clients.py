@@ -72,14 +72,48 @@ def test_who_does_not_read_an_answer_is_let_go() -> None:
     book.end()
 
 
-def test_the_doors_know_who_does_not_read(state: Path) -> None:
+def test_answers_that_strangers_do_not_read_keep_nobody_out() -> None:
+    book = Book(8)
+    for port in range(4):
+        assert book.come(FAR, port)
+        book.headers_received((FAR, port), body=False)
+    for port in range(2):
+        assert book.come(NEAR, port)
+        book.headers_received((NEAR, port), body=False)
+    assert book.busy((NEAR, 9))
+    for port in range(4):
+        book.answering_stranger((FAR, port))
+        book.sending((FAR, port))
+    assert not book.busy((NEAR, 9))
+    for port in range(2, 4):
+        assert book.come(NEAR, port)
+        book.headers_received((NEAR, port), body=False)
+    assert book.come("10.0.0.1", 1)
+    book.headers_received(("10.0.0.1", 1), body=False)
+    assert book.gone() == [(FAR, 0)]
+    book.answered((FAR, 1))
+    book.at += HEADER_SECONDS + 1.0
+    book.sending((FAR, 2))  # it reads, slowly
+    book.sweep()
+    assert book.gone() == [(FAR, 0), (FAR, 1)]
+    book.at += ANSWER_SECONDS - HEADER_SECONDS
+    book.sweep()
+    assert book.gone() == [(FAR, 0), (FAR, 1), (FAR, 2), (FAR, 3)]
+    book.end()
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_the_doors_know_who_does_not_read(state: Path, known: bool) -> None:
     book = Book(8)
     with serving(state) as daemon:
         daemon.app.user_middleware[0].kwargs["connections"] = book
         assert book.come(NEAR, 5)
-        read, scope = asyncio.Event(), {"type": "http", "http_version": "1.1", "method": "GET", "path": "/healthz"}
-        scope |= {"raw_path": b"/healthz", "query_string": b"", "scheme": "http", "client": (NEAR, 5)}  # type: ignore[dict-item]
-        scope |= {"headers": [(b"host", b"127.0.0.1")], "root_path": ""}  # type: ignore[dict-item]
+        path = b"/api/v1/jobs" if known else b"/healthz"
+        read, scope = asyncio.Event(), {"type": "http", "http_version": "1.1", "method": "GET", "path": path.decode()}
+        scope |= {"raw_path": path, "query_string": b"", "scheme": "http", "client": (NEAR, 5)}  # type: ignore[dict-item]
+        token = daemon.headers["Authorization"].encode()
+        headers = [(b"host", b"127.0.0.1"), *([(b"authorization", token)] if known else [])]
+        scope |= {"headers": headers, "root_path": ""}  # type: ignore[dict-item]
 
         async def receive() -> dict[str, Any]:
             return {"type": "http.request", "body": b"", "more_body": False}
@@ -91,6 +125,8 @@ def test_the_doors_know_who_does_not_read(state: Path) -> None:
         until = time.monotonic() + 30.0
         while not book._sending and time.monotonic() < until:
             time.sleep(0.01)
+        assert (NEAR, 5) in book._sending
+        assert ((NEAR, 5) in book._waiting) == (not known)  # a stranger gives way to newcomers
         book.at += ANSWER_SECONDS + 1.0
         daemon._loop.call_soon_threadsafe(book.sweep)
         while not book.gone() and time.monotonic() < until:

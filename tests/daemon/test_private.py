@@ -22,7 +22,7 @@ from ident_service.daemon.settings import Settings
 from ident_service.errors import UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.registry.database import FILE, Database, audit_log
-from ident_service.registry.state_folder import control_path
+from ident_service.registry.state_folder import control_path, fault_file
 from ident_service.registry.tokens import add_token
 
 
@@ -90,6 +90,13 @@ def test_what_lies_below_a_closed_folder_is_not_refused(entered: Path) -> None:
 
 def test_what_a_verb_writes_is_its_owners_alone(entered: Path) -> None:
     assert main([*VERBS[0], "--state", str(entered)]) == 0
+    os.umask(0o077)
+    for code in ("late_cycle", "lease_lost"):
+        fault_file(entered, "planar2").latch(code, "test")
+    os.umask(0o022)
+    assert main(["ack", "planar2", "late_cycle", "--state", str(entered)]) == 0  # which writes the file anew
+    assert readable(entered) == []
+    os.umask(0o022)
     assert main(["stop", "planar2", "--state", str(entered)]) == 0  # nobody moves it: what was wanted is so
     assert readable(entered) == []
 

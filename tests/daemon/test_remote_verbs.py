@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from cli.hands import Hands
 from daemon.conftest import checked_before, patient_text, quick_text
-from daemon.served import daemon_process
+from daemon.served import daemon_process, listening
 from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
@@ -294,7 +294,8 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
     texts = {"patient": patient_text("patient"), "short": quick_text("short", 1)}
     for text in texts.values():
         checked_before(state, text)
-    with daemon_process(state) as (_, client):
+    # The lease of a rehearsal is a quarter of a second, and on a busy machine the next renewal comes later.
+    with listening(state) as reached, IdentClient(reached.url, reached.token) as client:
         server = ["--server", client.url, "--state", str(state)]
         for text in texts.values():
             client.post("/api/v1/arms", {"description": text})
@@ -302,24 +303,17 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
         assert main([*rehearse, "--json"]) == 2  # a program holds no key
         assert "no terminal" in capsys.readouterr().err
         before = termios.tcgetattr(slave)
-        said: list[str] = []
-        for _ in range(5):  # on a busy machine the lease may end before anything has moved
-            with os.fdopen(os.dup(slave)) as stdin, Hands(master) as hands:
-                monkeypatch.setattr("sys.stdin", stdin)
+        with os.fdopen(os.dup(slave)) as stdin, Hands(master) as hands:
+            monkeypatch.setattr("sys.stdin", stdin)
 
-                def told(_: object, line: str, hands: Hands = hands) -> None:
-                    said.append(line)
-                    if line in ("approaching", "exciting"):
-                        hands.let_go()
+            def told(_: object, line: str) -> None:
+                if line in ("approaching", "exciting"):
+                    hands.let_go()
 
-                monkeypatch.setattr("ident_service.cli.remote_watching.tell", told)
-                assert main(rehearse) == 1
-            if {"approaching", "exciting"} & set(said):
-                break
+            monkeypatch.setattr("ident_service.cli.remote_watching.tell", told)
+            assert main(rehearse) == 1
         job = client.get("/api/v1/jobs?most=1")[0]
-        assert (job["kind"], job["state"]) == ("rehearse", "cancelled"), (job, said)
-        # On a busy machine the lease, which nobody renews without the key, may end before the word comes.
-        assert re.search("cancelled by owner|its lease was not renewed", job["detail"])
+        assert (job["kind"], job["state"], job["detail"]) == ("rehearse", "cancelled", "cancelled by owner")
         assert client.get(f"/api/v1/runs/{job['run']}")["ending"] == "stopped"
         assert client.get("/api/v1/arms/patient")["faults"] == []
         assert termios.tcgetattr(slave) == before

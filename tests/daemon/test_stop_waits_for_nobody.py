@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -121,7 +122,13 @@ def test_a_lease_is_renewed_by_memory_and_a_stop_reaches_what_waits(state: Path)
                 time.sleep(0.01)
             (job,) = engine.live._jobs
             assert daemon.post(f"/api/v1/jobs/{job}/lease").json() == {"job": job, "seconds": 2.0}
+            running = {"state": "running", "started": time.time(), "id": job, "kind": "run", "arm": "planar2"}
+            (state / "jobs" / job / "log").write_text("planar2: motion of 60 s\n")
+            assert (before := engine.progress(running)) is not None
+            assert before.remaining == pytest.approx(60.0, abs=5.0)
             assert daemon.post("/api/v1/arms/planar2/stop").json() == {"arms": [], "jobs": [job]}
+            # It ends when the arm rests, which may take longer than the motion.
+            assert engine.progress(running) == replace(before, fraction=None, remaining=None)
             assert not made.done()
             other = sqlite3.connect(state / FILE)
             assert other.execute("SELECT COUNT(*) FROM jobs").fetchone() == (0,)

@@ -2,55 +2,13 @@
 
 from __future__ import annotations
 
-import socket
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import uvicorn
-from daemon.conftest import LEASES
+from daemon.served import Reached, listening
 from helpers.browser import chromium_program
 from playwright.sync_api import Browser, Page, sync_playwright
-
-from ident_service.daemon.app import create_app
-from ident_service.daemon.dependencies import Service
-from ident_service.daemon.settings import Settings
-
-
-@dataclass(frozen=True)
-class Reached:
-    """A service that listens."""
-
-    url: str
-    service: Service
-    token: str
-
-
-@contextmanager
-def listening(state: Path) -> Iterator[Reached]:
-    """A service on a state folder and a free port of this machine."""
-    link = socket.socket()
-    link.bind(("127.0.0.1", 0))
-    app = create_app(Settings(state, port=link.getsockname()[1], lease_factor=LEASES))
-    config = uvicorn.Config(app, log_config=None, access_log=False, ws="none", http="h11", timeout_graceful_shutdown=3)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [link]})
-    thread.start()
-    try:
-        while not server.started:
-            assert thread.is_alive()
-            time.sleep(0.01)
-        service = app.state.service
-        token = (state / "token").read_text().strip()
-        yield Reached(f"http://127.0.0.1:{link.getsockname()[1]}", service, token)
-    finally:
-        server.should_exit = True
-        thread.join(60)
-        link.close()
 
 
 @pytest.fixture

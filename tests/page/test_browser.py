@@ -12,7 +12,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
-from daemon.conftest import LEASES, checked_before, patient_text, quick_text
+from daemon.conftest import checked_before, patient_text, quick_text
+from daemon.served import LEASES
 from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 

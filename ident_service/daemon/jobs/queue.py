@@ -277,6 +277,11 @@ class LiveJobs:
         with self._lock:
             child.close()
 
+    def ending(self, job: str) -> bool:
+        """Return whether a job is to end; a motion then ends when its arm rests."""
+        live = self._jobs.get(job)
+        return live is not None and bool(live.asked_to_end)
+
     # --- leases and stops
 
     def lease_holder(self, job: str) -> str | None:
@@ -528,7 +533,8 @@ class Engine:
         if row["state"] != "running" or row["started"] is None:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
-        return progress(said(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
+        found = progress(said(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
+        return Progress(found.phase, None, None) if self.live.ending(row["id"]) else found
 
     def moving(self) -> list[str]:
         """Return the names of the arms that any process moves."""
