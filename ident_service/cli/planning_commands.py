@@ -15,6 +15,7 @@ from ident_service.cli.arguments import Parser, VerbList, count, frequency, seco
 from ident_service.cli.motion_commands import add_dry_run, dry_run
 from ident_service.cli.output import (
     DONE,
+    USAGE,
     VERDICT_NO,
     Answer,
     StopOnSignal,
@@ -296,7 +297,7 @@ def _add_bus(verbs: VerbList) -> None:
         "probe",
         _probe,
         "read what each drive can do",
-        more="Modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable).",
+        more="Modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable; 2: a file is no EDS).",
         examples=("wam7_canopen", "my_arm.yaml --eds drive.eds"),
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
@@ -465,7 +466,7 @@ def _probe(arguments: argparse.Namespace) -> Answer:
         path = arm_folder(writable_state_folder(arguments), config.name) / FILE
         document |= {"changed": keep_outcome(path, document), "kept": str(path)}
         text += "".join(f"CHANGED: {line}\n" for line in document["changed"]) + f"kept in {path}\n"
-    return DONE if found.good else VERDICT_NO, text, document
+    return DONE if found.good else VERDICT_NO if found.readable else USAGE, text, document
 
 
 _DEFAULT_RATE = 1000.0  # Hz

@@ -413,7 +413,7 @@ def test_a_puck_that_does_not_answer_or_is_none_is_named() -> None:
 def test_an_arm_is_woken_and_zeroed_at_home_by_a_person() -> None:
     bench = Bench(wam(emulation={"zeroed": False}))
     assert all(state == "asleep" for state in bench.behind.emulator.states[:7])
-    with pytest.raises(PositionUnknown, match="ident set-home wam7_pucks"):
+    with pytest.raises(PositionUnknown, match="ident set-home ARM"):
         bench.arm.open()
     said = bench.arm.zero()
     assert len(said) == 7
