@@ -516,31 +516,33 @@ def probe_text(config: ArmConfig, found: Probe) -> str:
 
 
 def probe_advice(found: Probe) -> list[str]:
-    """Return what to do about each drive or file that cannot be driven as described, one sentence each."""
-    advice = []
+    """Return what to do about drives or files that cannot be driven as described, one sentence for all alike."""
+    advice: dict[str, list[str]] = {}
     for one in found.probed:
-        if one.drivable:
-            continue
-        if found.of_files and one.can is None:
-            advice.append(f"{one.title}: take the EDS or DCF of the drive's maker, undamaged")
-        elif one.silent:
-            advice.append(
-                f"{one.title}: check power, cable, 60 ohm between CAN_H and CAN_L, bit rate and node number; "
-                "`ident bus scan` lists who answers"
-            )
-        elif one.cut_off and found.of_files:
-            advice.append(f"{one.title}: get the whole file, and probe it again")
-        elif one.can is not None and one.can.problems and one.moves_by_position:
-            advice.append(
-                f"{one.title}: it takes positions: `driver: {{streams: position, ...}}` at 100 to 500 Hz "
-                '(docs/fieldbus.md, "Drives that are given positions")'
-            )
-        elif one.can is not None and one.can.problems:
-            report = "" if found.of_files else "; `ident bus report` writes what others need to see why"
-            advice.append(f"{one.title}: another drive is needed, for the reasons at REFUSED{report}")
-        else:
-            advice.append(f"{one.title}: write what `to change` says into the description, and probe again")
-    return advice
+        if not one.drivable:
+            advice.setdefault(_advice(one, found), []).append(one.title)
+    return [f"{', '.join(titles)}: {words}" for words, titles in advice.items()]
+
+
+def _advice(one: Probed, found: Probe) -> str:
+    if found.of_files and one.can is None:
+        return "take the EDS or DCF of the drive's maker, undamaged"
+    if one.silent or one.can is None:
+        return (
+            "check power, cable, 60 ohm between CAN_H and CAN_L, bit rate and node number; `ident bus scan ARM` lists "
+            "who answers"
+        )
+    if one.cut_off and found.of_files:
+        return "get the whole file, and probe it again"
+    if one.can.problems and one.moves_by_position:
+        return (
+            "positions can be streamed: `driver: {streams: position, ...}` at 100 to 500 Hz "
+            '(docs/fieldbus.md, "Drives that are given positions")'
+        )
+    if one.can.problems:
+        report = "" if found.of_files else "; `ident bus report ARM` writes what others need to see why"
+        return f"another drive is needed, for the reasons above{report}"
+    return "write what `to change` says into the description, and probe again"
 
 
 def _lines(one: Probed, found: Probe) -> Iterator[str]:

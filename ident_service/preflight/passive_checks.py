@@ -26,7 +26,7 @@ from ident_service.motion.ticket import (
     measures,
     skipped,
 )
-from ident_service.preflight.session import ANSWERS_REMEDY, RATE_REMEDY, REMEDIES, UNREACHABLE_REMEDY
+from ident_service.preflight.session import ANSWERS_REMEDY, RATE_REMEDY, UNREACHABLE_REMEDY
 from ident_service.preflight.stability import delay_of
 from ident_service.preflight.static_checks import LONG_SILENCE_REMEDY, long_silence
 
@@ -40,7 +40,7 @@ VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
 TORQUE_NOISE = 0.05  # of the torque limit, standard deviation, that the gains make of the noise
 LOST = 0.01  # of all answers
 STOPPED = {
-    AxisStatus.EMERGENCY_STOP: REMEDIES["emergency_stop"],
+    AxisStatus.EMERGENCY_STOP: "Release the emergency stop; on a WAM's pendant press Shift-Idle, too.",
     AxisStatus.FAULT: "Read the drive's own fault code and mend its cause; `ident recover ARM` resets it.",
 }
 
@@ -141,15 +141,15 @@ def identities_check(
     if too_long := long_silence(model, limits, described.watchdog):
         return failed(code, too_long, LONG_SILENCE_REMEDY)
     last = looked.samples[-1]
-    stopped: dict[str, list[str]] = {}
-    for name, word in zip(names, last.status, strict=False):
-        if flags := AxisStatus(word) & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP):
-            words = " and ".join(flag.name.lower().replace("_", " ") for flag in flags if flag.name)
-            stopped.setdefault(words, []).append(name)
+    stopped: dict[str, list[str]] = {}  # axes, by what their drives tell
+    for name, state in zip(names, last.status, strict=False):
+        if flags := AxisStatus(state) & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP):
+            told = " and ".join(flag.name.lower().replace("_", " ") for flag in flags if flag.name)
+            stopped.setdefault(told, []).append(name)
     if stopped:
-        remedies = [remedy for flag, remedy in STOPPED.items() if any(AxisStatus(word) & flag for word in last.status)]
-        reason = "; ".join(f"{', '.join(axes)}: {words}" for words, axes in stopped.items())
-        return failed(code, reason, " ".join(remedies))
+        todo = [remedy for flag, remedy in STOPPED.items() if any(AxisStatus(word) & flag for word in last.status)]
+        reason = "; ".join(f"{', '.join(axes)}: {told}" for told, axes in stopped.items())
+        return failed(code, reason, " ".join(todo))
     answers = np.array([sample.valid & np.isfinite(sample.position) for sample in looked.samples])
     nothing = np.zeros(len(names))
     found = [

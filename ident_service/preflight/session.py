@@ -59,8 +59,8 @@ _SUPPLY = "Check the limits that the drive keeps by itself, its temperature and 
 # By codes of `faults.FAULTS`, also of warnings that went on for too long.
 REMEDIES: dict[str, str] = {
     "emergency_stop": (
-        "Find out why the emergency stop was pressed or its circuit is open, then release and reset it (on a WAM's "
-        "pendant by Shift-Idle)."
+        "Find out why the emergency stop was pressed or its circuit is open, then release it; on a WAM's pendant "
+        "press Shift-Idle, too."
     ),
     "drive_fault": _DRIVE,
     "drive_emergency": _DRIVE,
