@@ -161,11 +161,6 @@ def _probed(ended: Ended) -> list[str] | None:
     return None if ended.given.eds else ["bus", "report", ended.arm]
 
 
-def _emulated(ended: Ended) -> list[str]:
-    """Return what looks at emulated drives: a scan where nodes are CANopen's."""
-    return ["bus", "scan", ended.arm] if _driver(ended.arm) == "canopen" else ["watch", ended.arm]
-
-
 def _designed(ended: Ended) -> list[str]:
     if not ended.good:
         return ["design", ended.arm, "--search-time", "300"]
@@ -315,7 +310,6 @@ _FOLLOWS: dict[str, Follows] = {
     "doctor": lambda ended: (
         ["arms"] if ended.given.arm is None else ["preflight" if ended.good else "doctor", ended.given.arm]
     ),
-    "emulate": _emulated,
     "design": _designed,
     "preview": lambda ended: _move(ended, *ended.motion) if ended.good else ["design", ended.arm],
     "motions": lambda ended: (
@@ -374,5 +368,5 @@ _FOLLOWS: dict[str, Follows] = {
     "restore": _of("serve"),
 }
 
-WITHOUT = frozenset({"serve", "completion", "schema", "tokens add"})
+WITHOUT = frozenset({"serve", "emulate", "completion", "schema", "tokens add"})
 """Verbs after which no line follows: their output is for a program, or they end when everything does."""

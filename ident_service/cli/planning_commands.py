@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import Parser, VerbList, count, frequency, seconds, seed, share, weight, workers
 from ident_service.cli.motion_commands import add_dry_run, dry_run
+from ident_service.cli.next_command import command
 from ident_service.cli.output import (
     DONE,
     USAGE,
@@ -610,7 +611,9 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     from sim_backend.emulator.process import emulate
 
     config = with_sheets(load_arm(arguments.arm), arguments.eds)
-    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")
+    first = ["set-home", arguments.arm] if config.zeroed_at_home else ["bus", "scan", arguments.arm]
+    then = f"; in another terminal: `{command(arguments, first)}`"
+    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then if config.can_buses else ''}")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.
     with stopping, asked(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):

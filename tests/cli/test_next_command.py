@@ -88,8 +88,6 @@ TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("prune --keep 3", 0, {"deleted": False, "recordings": [{}]}, "prune --keep 3 --yes"),
     ("prune --keep 3 --yes", 0, {"deleted": True, "recordings": [{}]}, "runs"),
     ("backup f.zip --state s", 0, {}, "restore f.zip --state restored"),
-    ("emulate wam7_canopen", 0, {}, "bus scan wam7_canopen"),
-    ("emulate wam7_pucks", 0, {}, "watch wam7_pucks"),
     ("preflight wam7_canopen --dry-run", 0, {}, "preflight wam7_canopen"),
     ("preflight wam7_pucks", 3, {"ticket": NOT_ZEROED}, "set-home wam7_pucks"),
     ("preflight a.yaml", 3, {"ticket": STALLED}, "doctor a.yaml"),
