@@ -185,7 +185,8 @@ def _ran(ended: Ended) -> list[str]:
         return [ended.given.word, ended.arm, *ended.motion]
     if not ended.good:
         return ["recover", ended.arm]
-    recording = ended.run if ended.remote or "/" not in ended.run else f"{ended.run}/run.mcap"
+    folder = not ended.remote and ("/" in ended.run or Path(ended.run).is_dir())  # else the id of a run
+    recording = f"{ended.run}/run.mcap" if folder else ended.run
     return ["identify", recording, "--arm", ended.arm]
 
 

@@ -131,6 +131,15 @@ def test_a_probe_of_files_that_no_command_helps_names_none() -> None:
     assert next_line(arguments, 2, {"drives": [UNLIKE | {"can": None}]}) == ""
 
 
+def test_a_run_in_a_folder_of_the_working_directory_is_named_by_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    arguments = TOP.parse_args(["run", "planar2", "--out", "run"])
+    assert next_line(arguments, 0, {"folder": "run"}) == "next: ident identify run/run.mcap --arm planar2\n"
+
+
 def test_commands_in_a_message_name_the_arm_as_it_was_typed() -> None:
     arguments, text = TOP.parse_args(["watch", "my arm.yaml"]), "ARM: then `ident set-home ARM`; ARMS, `ident stop`"
     assert with_arm(arguments, text) == "ARM: then `ident set-home 'my arm.yaml'`; ARMS, `ident stop`"
