@@ -10,8 +10,6 @@ from typing import Any
 
 from drivers.can.bus_load import Budget
 from ident_service.config.arm import ArmConfig, Joint
-from ident_service.config.canopen import CanopenDriver
-from ident_service.config.eds import data_sheet
 from ident_service.config.load import config_error, load_arm, located
 from ident_service.config.motion_limits import NEEDED, motion_limits
 from ident_service.config.quantities import ParameterTable, did_you_mean
@@ -20,7 +18,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.motion.arm_factory import GROUP
-from ident_service.operations.fieldbus import bus_lines, require_budget
+from ident_service.operations.fieldbus import bus_lines, cut_sheets, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
 _NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a mechanism begins with
@@ -86,7 +84,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         _require_names(arm, model, config, where)
     budget = require_budget(arm, model.config)
-    warnings = (*_cut_sheets(config), *remarks_on_angles(base_parameters(model.chain, model.layout)))
+    warnings = (*cut_sheets(config), *remarks_on_angles(base_parameters(model.chain, model.layout)))
     if missing := _missing(arm, model):
         checked = CheckedDescription(model, budget, None, None, warnings=warnings)
         # An arm without a driver is identified from recordings, and needs none of them.
@@ -112,15 +110,6 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         remedy = "lower kp and kd, or raise control.rate or control.velocity_cutoff"
         objections.append(located(arm, where, f"gains: {words}; {remedy}"))
     return CheckedDescription(model, budget, gains, follows, tuple(objections), (), warnings, falling)
-
-
-def _cut_sheets(config: ArmConfig) -> tuple[str, ...]:
-    """Return the data sheets of drives that seem to be cut off, in words."""
-    if not isinstance(config.driver, CanopenDriver):
-        return ()
-    files = dict.fromkeys(config.driver.sheet_file(number) for number in range(len(config.driver.drives)))
-    found = ((file.name, data_sheet(file.text).cut_off) for file in files)
-    return tuple(f"{name} seems to end too early: {why}; get the whole file" for name, why in found if why)
 
 
 def _missing(arm: str | Path, model: ArmModel) -> tuple[Problem, ...]:

@@ -496,6 +496,15 @@ def _capabilities_from_sheet(driver: CanopenDriver, number: int, file: TextFile)
     return assess(found, family, drive, driver, sheet)
 
 
+def cut_sheets(config: ArmConfig) -> tuple[str, ...]:
+    """Return the data sheets of drives that seem to be cut off, in words."""
+    if not isinstance(config.driver, CanopenDriver):
+        return ()
+    files = dict.fromkeys(config.driver.sheet_file(number) for number in range(len(config.driver.drives)))
+    found = ((file.name, data_sheet(file.text).cut_off) for file in files)
+    return tuple(f"{name} seems to end too early: {why}; get the whole file" for name, why in found if why)
+
+
 def probe_text(config: ArmConfig, found: Probe) -> str:
     """Format a probe as text, with a last line break."""
     bad = [one for one in found.probed if not one.drivable]

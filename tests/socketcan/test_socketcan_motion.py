@@ -6,6 +6,7 @@ with zero torque over slow cycles.
 
 from __future__ import annotations
 
+import gc
 import json
 import signal
 import subprocess
@@ -143,6 +144,21 @@ def emulated(arm: Path, ready: str, ended: str = "the arm is at rest") -> Iterat
             reader.join()
 
 
+@contextmanager
+def no_garbage_collection() -> Iterator[None]:
+    """Keep the garbage collector off, as the motion process does: over what pytest has loaded it takes 40 ms, and several
+    times that in the guest.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
+        gc.unfreeze()
+
+
 @pytest.mark.parametrize(
     ("interface", "kind"), [("raw", "canopen"), ("socketcan", "canopen"), ("raw", "barrett"), ("socketcan", "barrett")]
 )
@@ -161,7 +177,7 @@ def test_a_motion_over_a_real_bus_identifies_the_arm(
     for left in reversed(range(TRIES)):
         recording.unlink(missing_ok=True)
         try:
-            with emulated(path, ready) as drives:
+            with emulated(path, ready) as drives, no_garbage_collection():
                 report = record_motion(make_arm(config), model, motion, recording)
             break
         except ArmFault as fault:
@@ -210,7 +226,7 @@ def bring_up(config: ArmConfig, path: Path) -> None:
     with emulated(path, "node 2: pre operational", "node 2: pre operational") as drives:
         probe = bus_probe(config)
         assert probe.good, probe_text(config, probe)
-        with make_arm(config) as arm:
+        with no_garbage_collection(), make_arm(config) as arm:
             arm.enable()
             samples = [arm.exchange(np.zeros(2)) for _ in range(20)]
             assert all(status & AxisStatus.POWERED for status in arm.drive_status())
