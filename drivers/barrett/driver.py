@@ -182,7 +182,7 @@ class BarrettArm(Arm):
             if not setup.is_zeroed(port, found):
                 raise PositionUnknown(
                     f"{self._config.name} has not been zeroed since its pucks have power (ZERO is 0): lead it home by "
-                    f"hand, then `ident set-home {self._config.name}`"
+                    "hand, then `ident set-home ARM`"
                 )
             codec = PuckCodec(self._driver, found.motors, found.safety)
             self._bus = PuckBus(port.link, codec, self._driver, self._period_ns)
@@ -415,7 +415,9 @@ class BarrettArm(Arm):
         codec = self._require_open().codec
         bad = [name for name, p in zip(self._names, codec.pucks, strict=True) if p.stat == Status.ERROR]
         if bad:
-            raise DriverError(f"{', '.join(bad)} has an error (STAT 1); `ident recover` clears it")
+            raise DriverError(
+                f"{', '.join(bad)} has an error (STAT 1), which `ident recover ARM` clears once its cause has gone"
+            )
         if codec.safety.mode == SafetyMode.ESTOP:
             raise DriverError("the emergency stop is pressed, or has been: release it, then press Shift-Idle")
         causes = [cause for cause in codec.safety.pendant.faults if cause not in ("heartbeat", "e-stop")]

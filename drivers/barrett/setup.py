@@ -47,7 +47,7 @@ from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.motor_units import Coordinates, Vector
 from ident_service.config.barrett import VELOCITY_UNIT, WARNING, BarrettDriver, Puck
-from ident_service.errors import DriverError
+from ident_service.errors import DriverError, PositionUnknown
 
 TIMEOUT: Final = 0.05  # s that a puck may take to answer
 _TRIES: Final = 3
@@ -193,8 +193,9 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
         wakes: whether pucks in their monitor are woken; otherwise nothing is sent but questions.
 
     Raises:
-        DriverError: pucks do not answer, are asleep, are no motor or safety puck, or have numbers of their own for
-            position or torque, so that one frame cannot reach all of them.
+        DriverError: pucks do not answer, are no motor or safety puck, or have numbers of their own for position or
+            torque, so that one frame cannot reach all of them.
+        PositionUnknown: some are asleep, and are not to be woken.
     """
     nodes = [*(puck.node for puck in driver.pucks), driver.safety_node]
     stat = _FIXED.number("STAT")
@@ -205,7 +206,10 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
         )
     asleep = [node for node, state in states.items() if state == Status.RESET]
     if asleep and not wakes:
-        raise DriverError(f"pucks {', '.join(map(str, asleep))} have just been switched on and are not awake")
+        raise PositionUnknown(
+            f"pucks {', '.join(map(str, asleep))} have just been switched on and are not awake: lead the arm home by "
+            "hand, then `ident set-home ARM`, which wakes them"
+        )
     for node in asleep:
         port.write(node, _FIXED, "STAT", Status.READY, verify=False)
     if asleep:

@@ -51,7 +51,6 @@ class Zeros:
             raise DriverError(f"{config.name}: driver.zero is at_home, which needs joints.*.home for every joint")
         self.home: Vector = np.array(homes, dtype=float)
         self.home.setflags(write=False)
-        self._name = config.name
         coupling = np.eye(len(homes)) if gears.coupling is None else np.array(gears.coupling)
         self._about = [
             # Numbers, not their rounded text: what is nearly the same is another arm.
@@ -149,7 +148,7 @@ class Zeros:
         return (
             f"drives {', '.join(map(str, sorted(nodes)))} do not know where the arm stands: their encoders count from "
             "where they were when power came, and nobody has zeroed them since (with this description); lead the arm "
-            f"to its home by hand, then `ident set-home {self._name}`"
+            "to its home by hand, then `ident set-home ARM`"
         )
 
 

@@ -27,7 +27,7 @@ from ident_service.cli import (
     remote,
 )
 from ident_service.cli.arguments import ArgumentsError, Parser, TopParser, VerbList, asks_for_json
-from ident_service.cli.next_command import next_after_error, next_line
+from ident_service.cli.next_command import next_after_error, next_line, with_arm
 from ident_service.cli.output import (
     DONE,
     FAILED,
@@ -119,11 +119,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = next(number for kind, number in _EXIT_CODES if isinstance(error, kind))
         notes = list(getattr(error, "__notes__", ()))
         head = styled(sys.stderr, "ident:", "error")
-        print_to_person("\n".join([f"{head} {error}", *notes]) + f"\n{next_after_error(arguments, error)}")
+        said = with_arm(arguments, "\n".join([str(error), *notes]))
+        print_to_person(f"{head} {said}\n{next_after_error(arguments, error)}")
         if arguments.json:
             print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
         return code
     try:
+        text = text if arguments.json else with_arm(arguments, text)
         print_answer(arguments, code, text, document, "" if arguments.json else next_line(arguments, code, document))
     except OSError as error:
         print_to_person(f"ident: done, but the output cannot be written: {error.strerror}\n")

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from ident_service.cli.arguments import LOCAL_ONLY
-from ident_service.cli.output import DONE, state_folder
-from ident_service.errors import ArmFault, IdentError, MotionRefused
+from ident_service.cli.output import DONE, VERDICT_NO, state_folder
+from ident_service.errors import ArmFault, IdentError, MotionRefused, PositionUnknown
 
 _COMMAND = re.compile(r"`ident ([^`]+)`")
+_FOR_ARM = re.compile(r"(`ident [^`\n]*?)\bARM\b")
 WHY = "WHY"
 """Stands for a reason that only a person can give."""
 
@@ -92,6 +93,8 @@ def next_after_error(arguments: argparse.Namespace, error: IdentError) -> str:
     arm = getattr(arguments, "arm", None)
     if arguments.word == "reidentify" and "nothing has been accepted" in str(error):
         return f"next: {command(arguments, ['preflight', str(arm)])}\n"
+    if arm is not None and isinstance(error, PositionUnknown):
+        return f"next: {command(arguments, ['set-home', str(arm)])}\n"
     if arm is None or not isinstance(error, ArmFault | MotionRefused):
         return ""
     words = ["recover", str(arm)]
@@ -99,6 +102,14 @@ def next_after_error(arguments: argparse.Namespace, error: IdentError) -> str:
         slow = arguments.word in ("home", "recover")
         words = ["preflight", str(arm), *(["--home"] if slow else Ended(arguments, 0, {}, "").motion)]
     return f"next: {command(arguments, words)}\n"
+
+
+def with_arm(arguments: argparse.Namespace, text: str) -> str:
+    """Return text for a person whose commands name the arm as the arguments do, instead of ARM."""
+    arm = getattr(arguments, "arm", None)
+    if not isinstance(arm, str):
+        return text
+    return _FOR_ARM.sub(lambda found: f"{found[1]}{shlex.quote(arm)}", text)
 
 
 def command(arguments: argparse.Namespace, words: Sequence[str]) -> str:
@@ -138,6 +149,18 @@ def _checked(ended: Ended) -> list[str]:
     return after.get(driver, ["watch", file])
 
 
+def _probed(ended: Ended) -> list[str] | None:
+    """Return what follows a probe: none where another drive or another file is needed before any command."""
+    if ended.good:
+        return ["config", "check", ended.arm] if ended.given.eds else ["preflight", ended.arm, "--dry-run"]
+    bad = [one for one in ended.said["drives"] if not one["drivable"]]
+    if not ended.given.eds and any(one["silent"] for one in bad):
+        return ["bus", "scan", ended.arm]
+    if all(one["can"] and (one["moves_by_position"] or not one["can"]["problems"]) for one in bad):
+        return ["config", "check", ended.arm]
+    return None if ended.given.eds else ["bus", "report", ended.arm]
+
+
 def _designed(ended: Ended) -> list[str]:
     if not ended.good:
         return ["design", ended.arm, "--search-time", "300"]
@@ -147,7 +170,12 @@ def _designed(ended: Ended) -> list[str]:
 
 def _preflown(ended: Ended) -> list[str]:
     given = ended.given
-    if given.scale or not ended.good:
+    if ended.code == VERDICT_NO and (said := ended.said.get("ticket")):
+        failed = " ".join(f"{one['reason']} {one['remedy']}" for one in said["checks"] if one["verdict"] == "failed")
+        for verb in ("set-home", "doctor"):
+            if f"`ident {verb} " in failed:
+                return [verb, ended.arm]
+    if given.scale or not ended.good or given.dry_run:
         return ["preflight", ended.arm, *(["--home"] if given.home else ended.motion)]
     return ["home", ended.arm] if given.home else ["run", ended.arm, *ended.motion]
 
@@ -157,7 +185,8 @@ def _ran(ended: Ended) -> list[str]:
         return [ended.given.word, ended.arm, *ended.motion]
     if not ended.good:
         return ["recover", ended.arm]
-    recording = ended.run if ended.remote or "/" not in ended.run else f"{ended.run}/run.mcap"
+    folder = not ended.remote and ("/" in ended.run or Path(ended.run).is_dir())  # else the id of a run
+    recording = f"{ended.run}/run.mcap" if folder else ended.run
     return ["identify", recording, "--arm", ended.arm]
 
 
@@ -278,7 +307,7 @@ _FOLLOWS: dict[str, Follows] = {
     "arms": lambda ended: ["config", "check", ended.said["arms"][-1]["name"]] if ended.said["arms"] else ["simulate"],
     "bus load": _arm("bus", "scan", otherwise=("config", "check")),
     "bus scan": _arm("bus", "probe", otherwise=("bus", "scan")),
-    "bus probe": _arm("preflight", otherwise=("bus", "probe")),
+    "bus probe": _probed,
     "bus import": lambda ended: (
         ["bus", "import", ended.arm, *ended.given.files] if ended.given.dry_run else ["bus", "store", ended.arm]
     ),
@@ -287,7 +316,6 @@ _FOLLOWS: dict[str, Follows] = {
     "doctor": lambda ended: (
         ["arms"] if ended.given.arm is None else ["preflight" if ended.good else "doctor", ended.given.arm]
     ),
-    "emulate": _arm("bus", "scan"),
     "design": _designed,
     "preview": lambda ended: _move(ended, *ended.motion) if ended.good else ["design", ended.arm],
     "motions": lambda ended: (
@@ -346,5 +374,5 @@ _FOLLOWS: dict[str, Follows] = {
     "restore": _of("serve"),
 }
 
-WITHOUT = frozenset({"serve", "completion", "schema", "tokens add"})
+WITHOUT = frozenset({"serve", "emulate", "completion", "schema", "tokens add"})
 """Verbs after which no line follows: their output is for a program, or they end when everything does."""

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import Parser, VerbList, count, frequency, seconds, seed, share, weight, workers
 from ident_service.cli.motion_commands import add_dry_run, dry_run
+from ident_service.cli.next_command import command
 from ident_service.cli.output import (
     DONE,
+    USAGE,
     VERDICT_NO,
     Answer,
     StopOnSignal,
@@ -296,7 +298,7 @@ def _add_bus(verbs: VerbList) -> None:
         "probe",
         _probe,
         "read what each drive can do",
-        more="Modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable).",
+        more="Modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable; 2: a file is no EDS).",
         examples=("wam7_canopen", "my_arm.yaml --eds drive.eds"),
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
@@ -465,7 +467,7 @@ def _probe(arguments: argparse.Namespace) -> Answer:
         path = arm_folder(writable_state_folder(arguments), config.name) / FILE
         document |= {"changed": keep_outcome(path, document), "kept": str(path)}
         text += "".join(f"CHANGED: {line}\n" for line in document["changed"]) + f"kept in {path}\n"
-    return DONE if found.good else VERDICT_NO, text, document
+    return DONE if found.good else VERDICT_NO if found.readable else USAGE, text, document
 
 
 _DEFAULT_RATE = 1000.0  # Hz
@@ -609,7 +611,9 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     from sim_backend.emulator.process import emulate
 
     config = with_sheets(load_arm(arguments.arm), arguments.eds)
-    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends")
+    first = ["set-home", arguments.arm] if config.zeroed_at_home else ["bus", "scan", arguments.arm]
+    then = f"; in another terminal: `{command(arguments, first)}`"
+    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then if config.can_buses else ''}")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.
     with stopping, asked(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):

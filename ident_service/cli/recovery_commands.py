@@ -205,7 +205,7 @@ def _move_slowly(arguments: argparse.Namespace, config: ArmConfig, destination: 
     from ident_service.motion.faults import HOLD
 
     ends = {
-        "hold": f"the arm is held until `ident supported {config.name}`, then lowered",
+        "hold": f"the arm is held until `{command(arguments, ['supported', arguments.arm])}`, then lowered",
         "lower": f"the arm is held for {HOLD:g} s, then lowered until it rests",
     }.get(config.control.after_stop or "", f"the arm is held for {HOLD:g} s, then its drives brake it")
     lease = requested_lease(arguments, config)
@@ -232,7 +232,9 @@ def _text(found: Recovery) -> str:
         lines.append(f"  the arm does not answer: {found.unreachable}")
     if found.zero_lost:
         lines.append(f"  the zero of the encoders is lost: {found.zero_lost}")
-    lines += [f"  {axis}: drive fault: {words}" for axis, words in found.tripped.items()]
+    for words in dict.fromkeys(found.tripped.values()):
+        axes = ", ".join(axis for axis, said in found.tripped.items() if said == words)
+        lines.append(f"  {axes}: latched by the drive: {words}")
     if found.reset:
         lines.append(f"  reset just now: {', '.join(found.reset)}")
     lines += [f"  outside its position limits: {words}" for words in found.outside]

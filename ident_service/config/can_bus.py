@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from ident_service.config.quantities import Count, Section
 
 _KERNELS = ("raw", "socketcan")  # two ways to access the same kernel interfaces
+WIRE_INTERFACE = "ident_wire"  # a bus that is a program on this computer, for emulated drives in real time
 
 
 class CanBus(Section):

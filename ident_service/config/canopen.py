@@ -245,7 +245,8 @@ class Emulation(ExtendedSection):
     windings_off: WindingsOff = "open"
     """Windings of a drive whose power stage is off: `open` coasts, `shorted` brakes."""
     eds: tuple[AnyTextBeside, ...] = ()
-    """Data sheets of makers by which the drives are emulated, one after the other and then from the first again."""
+    """Data sheets by which the drives are emulated instead of the described ones, one after the other and then from
+    the first again."""
     later = frozenset({"windings_off", "eds"})
     faults: tuple[SimulatedFault, ...] = ()
     """Faults to inject."""

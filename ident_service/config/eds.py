@@ -1,6 +1,7 @@
 """Read the entries of an EDS or DCF (CiA 306-1) as far as possible, in spite of oddities in makers' files.
 
-Lines that are none of an ini file are passed over, and so is every value that is none: the drive has the last word.
+Lines that are none of an ini file are passed over, and so is every value that is none: the drive has the last word. The
+loop over lines is our own, because neither `canopen` nor `configparser` reads such files ([decision 0064]).
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ _MOST_SUBS, _MOST_PDOS, _MOST_MAPPED = 0xFE, 512, 8
 # Of `CompactPDO`: sub-index of a PDO's parameters and its type, for each bit of the mask.
 _COMPACT = {1: _UNSIGNED32, 2: _UNSIGNED8, 3: _UNSIGNED16, 5: _UNSIGNED16, 6: _UNSIGNED8}
 _YES = ("true", "yes")
+_LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")  # of all objects (CiA 306-1)
+_UNLISTED = 0.03  # of the announced objects, of which whole files of makers lack one or two in two hundred
 
 
 @dataclass(frozen=True)
@@ -74,12 +77,14 @@ class DataSheet:
         dummies: indices of the dummies that can be mapped (CiA 306-1, `DummyUsage`).
         identity: what 1018h answers by sub-index, where the file tells it.
         mistake: why the text is no EDS; None where it may be one.
+        cut_off: why its end seems to be missing, in words; empty where it seems to be whole.
     """
 
     entries: Mapping[int, DataSheetEntry] = field(default_factory=dict)
     dummies: frozenset[int] = frozenset()
     identity: Mapping[int, int] = field(default_factory=dict)
     mistake: str | None = None
+    cut_off: str = ""
 
     def has(self, index: int, sub: int | None = None) -> bool:
         """Return whether the data sheet lists an object, or one sub-index of it."""
@@ -111,7 +116,21 @@ def data_sheet(text: str) -> DataSheet:
     mistake = None if entries or "deviceinfo" in sections else "it lists no object and has no section [DeviceInfo]"
     identity = {sub: _number(info.get(key, ""), 0) for sub, key in told.items()}
     identity |= {s: n for s in told if (one := entries.get(0x1018 << 8 | s)) and (n := one.number(0)) is not None}
-    return DataSheet(entries, dummies, {sub: value for sub, value in identity.items() if value is not None}, mistake)
+    known = {sub: value for sub, value in identity.items() if value is not None}
+    return DataSheet(entries, dummies, known, mistake, _cut_off(sections, {index for index, _ in objects}))
+
+
+def _cut_off(sections: Mapping[str, Mapping[str, str]], there: set[int]) -> str:
+    """Return why a file's end seems to be missing: lists of objects, or sections of many that are listed."""
+    lists = [sections[name] for name in _LISTS if name in sections]
+    if not lists:
+        return ""
+    if len(lists) < len(_LISTS):
+        return "it lists mandatory objects, and not all others" if _LISTS[0] in sections else ""
+    announced = sum(max(_number(one.get("supportedobjects", ""), 0) or 0, len(one) - 1) for one in lists)
+    listed = {_number(value, 0) for one in lists for key, value in one.items() if key.isdecimal()}
+    missing = min(announced, 0x10000) - len(listed & there)
+    return f"of {announced} announced objects {missing} are missing" if missing > _UNLISTED * announced else ""
 
 
 def _sections(text: str) -> dict[str, dict[str, str]]:

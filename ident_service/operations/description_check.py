@@ -18,7 +18,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.motion.arm_factory import GROUP
-from ident_service.operations.fieldbus import bus_lines, require_budget
+from ident_service.operations.fieldbus import bus_lines, cut_sheets, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
 _NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a mechanism begins with
@@ -84,7 +84,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         _require_names(arm, model, config, where)
     budget = require_budget(arm, model.config)
-    warnings = remarks_on_angles(base_parameters(model.chain, model.layout))
+    warnings = (*cut_sheets(config), *remarks_on_angles(base_parameters(model.chain, model.layout)))
     if missing := _missing(arm, model):
         checked = CheckedDescription(model, budget, None, None, warnings=warnings)
         # An arm without a driver is identified from recordings, and needs none of them.

@@ -359,7 +359,9 @@ def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive], what: str =
 
 
 def _count(one: PlannedDrive) -> str:
-    return f"{len(one.changes)} entries would be written" if one.changes else "has everything already"
+    if one.changes:
+        return f"{len(one.changes)} entries would be written" + (", then it is refused" if one.refused else "")
+    return "would be refused, and nothing written" if one.refused else "has everything already"
 
 
 def _change_lines(changes: Sequence[Change]) -> Iterator[str]:

@@ -370,12 +370,16 @@ class Probed:
         node: number of the drive, as the description has it.
         silent: why it was not asked, or did not answer; empty for one that did.
         can: its capabilities; None where neither the drive nor a file tells them.
+        cut_off: why its file seems to be cut off, in words; empty where it seems to be whole.
+        moves_by_position: whether it could be driven with `streams: position` where it cannot with torques.
     """
 
     title: str
     node: int
     silent: str
     can: Capabilities | None
+    cut_off: str = ""
+    moves_by_position: bool = False
 
     @property
     def drivable(self) -> bool:
@@ -392,17 +396,24 @@ class Probe:
         shares: whether all of them can share torque frames, as far as files and families know.
         rates: cycles per second that the buses carry at most, by kind of torque frames (`shared`, `single`).
         status_syncs: SYNCs from one status report to the next, of drives without a timer for them.
+        of_files: whether files were judged, and no drive was asked.
     """
 
     probed: tuple[Probed, ...]
     shares: bool
     rates: dict[str, int]
     status_syncs: int
+    of_files: bool = False
 
     @property
     def good(self) -> bool:
         """Return whether every drive can be driven."""
         return all(one.drivable for one in self.probed)
+
+    @property
+    def readable(self) -> bool:
+        """Return whether every file could be read as a data sheet; true where drives were asked."""
+        return not self.of_files or all(one.can is not None for one in self.probed)
 
     @property
     def highest_rate(self) -> int:
@@ -444,27 +455,37 @@ def bus_probe(
         for frames in ("shared", "single")
     }
     shares = all(one.can is not None and one.can.shares for one in probed)
-    return Probe(tuple(probed), shares, rates, bus_profiles(driver, rate)[0].status_syncs)
+    return Probe(tuple(probed), shares, rates, bus_profiles(driver, rate)[0].status_syncs, bool(files))
 
 
 def _of_drive(driver: CanopenDriver, number: int, objects: Objects) -> Probed:
-    drive = driver.drives[number]
-    title = f"drive {number + 1}"
+    file, silent = driver.sheet_file(number), ""
+    can: Capabilities | None
     try:
-        return Probed(title, drive.node, "", capabilities(objects, driver, number))
+        can = capabilities(objects, driver, number)
     except BusError:
         raise
     except DriverError as error:
-        return Probed(
-            title, drive.node, str(error), _capabilities_from_sheet(driver, number, driver.sheet_file(number))
-        )
+        silent, can = str(error), _capabilities_from_sheet(driver, number, file)
+    return _probed_one(f"drive {number + 1}", silent, can, driver, number, file)
 
 
 def _of_file(driver: CanopenDriver, number: int, file: TextFile) -> Probed:
     sheet = data_sheet(file.text)
     mistake = sheet.mistake or ("" if sheet.entries else "it lists no object")
     why = f"is no EDS: {mistake}" if mistake else ""
-    return Probed(file.name, driver.drives[number].node, why, _capabilities_from_sheet(driver, number, file))
+    return _probed_one(file.name, why, _capabilities_from_sheet(driver, number, file), driver, number, file)
+
+
+def _probed_one(
+    title: str, silent: str, can: Capabilities | None, driver: CanopenDriver, number: int, file: TextFile
+) -> Probed:
+    drive, sheet = driver.drives[number], data_sheet(file.text)
+    other = False
+    if can is not None and can.problems and driver.streams != "position":
+        positions = driver.model_copy(update={"streams": "position"})
+        other = not assess(can.found, can.family, drive, positions, sheet).problems
+    return Probed(title, drive.node, silent, can, sheet.cut_off, other)
 
 
 def _capabilities_from_sheet(driver: CanopenDriver, number: int, file: TextFile) -> Capabilities | None:
@@ -475,6 +496,15 @@ def _capabilities_from_sheet(driver: CanopenDriver, number: int, file: TextFile)
     return assess(found, family, drive, driver, sheet)
 
 
+def cut_sheets(config: ArmConfig) -> tuple[str, ...]:
+    """Return the data sheets of drives that seem to be cut off, in words."""
+    if not isinstance(config.driver, CanopenDriver):
+        return ()
+    files = dict.fromkeys(config.driver.sheet_file(number) for number in range(len(config.driver.drives)))
+    found = ((file.name, data_sheet(file.text).cut_off) for file in files)
+    return tuple(f"{name} seems to end too early: {why}; get the whole file" for name, why in found if why)
+
+
 def probe_text(config: ArmConfig, found: Probe) -> str:
     """Format a probe as text, with a last line break."""
     bad = [one for one in found.probed if not one.drivable]
@@ -483,12 +513,45 @@ def probe_text(config: ArmConfig, found: Probe) -> str:
     for one in found.probed:
         lines += ["", *_lines(one, found)]
     frames = "shared" if found.shares else "single"
-    lines += ["", f"highest rate: {found.highest_rate} Hz, with {frames} torque frames (driver.torque_frames)"]
-    if found.shares:
-        lines.append(f"with single ones: {found.rates['single']} Hz")
-    if config.control.rate > found.highest_rate:
-        lines.append(f"control.rate is {config.control.rate:g} Hz, which is TOO MUCH")
+    if all(one.can is not None and not one.can.problems for one in found.probed):
+        lines += ["", f"highest rate: {found.highest_rate} Hz, with {frames} torque frames (driver.torque_frames)"]
+        if found.shares:
+            lines.append(f"with single ones: {found.rates['single']} Hz")
+        if config.control.rate > found.highest_rate:
+            lines.append(f"control.rate is {config.control.rate:g} Hz, which is TOO MUCH")
+    if advice := probe_advice(found):
+        lines += ["", "what helps:", *(f"  {line}" for line in advice)]
     return "\n".join(lines) + "\n"
+
+
+def probe_advice(found: Probe) -> list[str]:
+    """Return what to do about drives or files that cannot be driven as described, one sentence for all alike."""
+    advice: dict[str, list[str]] = {}
+    for one in found.probed:
+        if not one.drivable:
+            advice.setdefault(_advice(one, found), []).append(one.title)
+    return [f"{', '.join(titles)}: {words}" for words, titles in advice.items()]
+
+
+def _advice(one: Probed, found: Probe) -> str:
+    if found.of_files and one.can is None:
+        return "take the EDS or DCF of the drive's maker, undamaged"
+    if one.silent or one.can is None:
+        return (
+            "check power, cable, 60 ohm between CAN_H and CAN_L, bit rate and node number; `ident bus scan ARM` lists "
+            "who answers"
+        )
+    if one.cut_off and found.of_files:
+        return "get the whole file, and probe it again"
+    if one.can.problems and one.moves_by_position:
+        return (
+            "positions can be streamed: `driver: {streams: position, ...}` at 100 to 500 Hz "
+            '(docs/fieldbus.md, "Drives that are given positions")'
+        )
+    if one.can.problems:
+        report = "" if found.of_files else "; `ident bus report ARM` writes what others need to see why"
+        return f"another drive is needed, for the reasons above{report}"
+    return "write what `to change` says into the description, and probe again"
 
 
 def _lines(one: Probed, found: Probe) -> Iterator[str]:
@@ -496,11 +559,15 @@ def _lines(one: Probed, found: Probe) -> Iterator[str]:
     if can is None:
         yield f"{one.title}, node {one.node}: {one.silent}"
         return
+    file = "it" if found.of_files else "its EDS"
+    torn = f"  {'CUT OFF':<16}{file} seems to end too early: {one.cut_off}" if one.cut_off else ""
     verdict = "CANNOT BE DRIVEN" if can.problems else "not as described" if can.changes else "can be driven"
     by = "" if can.found.asked else ", predicted from its EDS"
     yield f"{one.title}, node {one.node}: {can.family.name}: {verdict}{by}"
     if one.silent:
         yield f"  {one.silent}"
+    if torn:
+        yield torn
     for problem in can.problems:
         yield f"  {'REFUSED':<16}{problem}"
     for change in can.changes:
@@ -551,12 +618,14 @@ def probe_document(config: ArmConfig, found: Probe) -> dict[str, Any]:
         "shares": found.shares,
         "rates": found.rates,
         "highest_rate": found.highest_rate,
+        "advice": probe_advice(found),
         "drives": [_document(one, found) for one in found.probed],
     }
 
 
 def _document(one: Probed, found: Probe) -> dict[str, Any]:
     document: dict[str, Any] = {"title": one.title, "node": one.node, "drivable": one.drivable, "silent": one.silent}
+    document |= {"cut_off": one.cut_off, "moves_by_position": one.moves_by_position}
     can = one.can
     if can is None:
         return {**document, "can": None}

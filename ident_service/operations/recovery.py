@@ -183,6 +183,7 @@ def _before(
 ) -> list[str]:
     """Return what must be done before the arm is usable, in order."""
     steps = [f"`ident acknowledge {name} {one.code}`, when you know the cause: {one.cause}." for one in faults]
+    zero_lost, refusal = (words.replace(" ARM`", f" {name}`") for words in (zero_lost, refusal))
     if unreachable:
         steps.append(f"Check power, cables, emergency stop, and that no other program uses the arm: {unreachable}.")
     if zero_lost:
@@ -195,7 +196,7 @@ def _before(
     if bool((np.abs(seen.velocity) > REST_SPEED * limits.velocity).any()):
         steps.append("Keep out of its reach until it rests: the arm moves without a command.")
     if tripped and refusal:
-        steps.append(f"Release the emergency stop, or read the drive's own fault code and mend its cause: {refusal}.")
+        steps.append(_to_mend(tripped, refusal))
     if tripped or (faults and steps):
         steps.append(f"`ident recover {name}` again: it resets the drives when every fault is acknowledged.")
     if not silent and (out := position_limit_violations(seen.position, limits, seen.joint_names)):
@@ -208,6 +209,15 @@ def _before(
         except MotionRefused as error:
             steps.append(f"Bring it back by hand: {error}.")
     return [support, *steps] if steps or support is not _SUPPORT else steps
+
+
+def _to_mend(tripped: dict[str, str], refusal: str) -> str:
+    """Return what must be done before drives that refuse to be reset can be."""
+    if "press " in refusal:  # it says so itself
+        return f"{refusal[0].upper()}{refusal[1:]}."
+    stopped = any("emergency stop" in words for words in tripped.values())
+    what = "Release the emergency stop" if stopped else "Read the drive's own fault code and mend its cause"
+    return f"{what}: {refusal}."
 
 
 def _last_step(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:

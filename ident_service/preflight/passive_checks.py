@@ -26,6 +26,7 @@ from ident_service.motion.ticket import (
     measures,
     skipped,
 )
+from ident_service.preflight.session import ANSWERS_REMEDY, RATE_REMEDY, UNREACHABLE_REMEDY
 from ident_service.preflight.stability import delay_of
 from ident_service.preflight.static_checks import LONG_SILENCE_REMEDY, long_silence
 
@@ -38,10 +39,10 @@ STEPS_OF_NOISE = 3.0  # encoder steps: an axis at rest stays on one, or between 
 VELOCITY_NOISE = 0.1  # of the velocity limit, peak: the guard stops at 1.2
 TORQUE_NOISE = 0.05  # of the torque limit, standard deviation, that the gains make of the noise
 LOST = 0.01  # of all answers
-RATE_REMEDY = (
-    "Give the process a core of its own and real-time priority (`ident doctor ARM` says what is missing), stop "
-    "other load, or lower control.rate."
-)
+STOPPED = {
+    AxisStatus.EMERGENCY_STOP: "Release the emergency stop; on a WAM's pendant press Shift-Idle, too.",
+    AxisStatus.FAULT: "Read the drive's own fault code and mend its cause; `ident recover ARM` resets it.",
+}
 
 
 @dataclass(frozen=True)
@@ -140,17 +141,15 @@ def identities_check(
     if too_long := long_silence(model, limits, described.watchdog):
         return failed(code, too_long, LONG_SILENCE_REMEDY)
     last = looked.samples[-1]
-    stopped = [
-        f"{name}: {' and '.join(flag.name.lower().replace('_', ' ') for flag in flags if flag.name)}"
-        for name, word in zip(names, last.status, strict=False)
-        if (flags := AxisStatus(word) & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP))
-    ]
+    stopped: dict[str, list[str]] = {}  # axes, by what their drives tell
+    for name, state in zip(names, last.status, strict=False):
+        if flags := AxisStatus(state) & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP):
+            told = " and ".join(flag.name.lower().replace("_", " ") for flag in flags if flag.name)
+            stopped.setdefault(told, []).append(name)
     if stopped:
-        return failed(
-            code,
-            "; ".join(stopped),
-            "Release the emergency stop, or read the drive's fault code, mend its cause and reset it.",
-        )
+        todo = [remedy for flag, remedy in STOPPED.items() if any(AxisStatus(word) & flag for word in last.status)]
+        reason = "; ".join(f"{', '.join(axes)}: {told}" for told, axes in stopped.items())
+        return failed(code, reason, " ".join(todo))
     answers = np.array([sample.valid & np.isfinite(sample.position) for sample in looked.samples])
     nothing = np.zeros(len(names))
     found = [
@@ -176,12 +175,9 @@ def identities_check(
         found.append(measure(what, described.delay_cycles, "", most=delay_of(model.config)))
     # An infinite limit is no finite number, but clips nothing.
     found = [one for one in found if not (one.what.startswith("torque limit") and one.value is None)]
-    return check_from_measures(
-        code,
-        found,
-        "Check power, cables and bus termination of the axes that do not answer; bring limits and rate of driver and "
-        "description into agreement.",
-    )
+    silent = bool((1.0 - answers.mean(axis=0) > LOST).any())
+    agreement = "Bring limits and rate of driver and description into agreement."
+    return check_from_measures(code, found, ANSWERS_REMEDY if silent else agreement)
 
 
 def at_rest_check(
@@ -318,7 +314,7 @@ def noise_check(
 
 def unreachable(error: ArmError) -> Check:
     """Return the failed check of an arm that could not be opened or recorded, with the reason."""
-    remedy = "Check power, cables, and that no other program uses the arm."
+    remedy = UNREACHABLE_REMEDY
     if isinstance(error, PositionUnknown):
         remedy = "Do this; only a person can tell where the arm is."
     elif isinstance(error, AnotherDrive):

@@ -16,6 +16,7 @@ import numpy as np
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.axis_status import AxisStatus
 from drivers.clock import Clock, RealClock
+from ident_service.config.can_bus import WIRE_INTERFACE
 from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
 from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
 from ident_service.excitation.motion_file import Excitation
@@ -63,7 +64,15 @@ from ident_service.preflight.passive_checks import (
     record_idle,
     unreachable,
 )
-from ident_service.preflight.session import Rows, Session, remedy_of, trace_of
+from ident_service.preflight.session import (
+    BROKEN_REMEDY,
+    EMULATED_REMEDY,
+    NO_CABLE,
+    Rows,
+    Session,
+    remedy_of,
+    trace_of,
+)
 from ident_service.preflight.static_checks import (
     configuration_check,
     distance_from_home_text,
@@ -415,12 +424,13 @@ class _Preflight:
             # None about the motion: the path home may begin although one of them failed. The last where all are made.
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
             code = next(left, CODES[-1])
-            remedy = "Check power, cables, bus and the drives' own fault codes."
-            self._passed(failed(code, str(error), remedy))
+            self._passed(failed(code, str(error), BROKEN_REMEDY))
 
     def _passed(self, check: Check, *, of_place: bool = False) -> bool:
         if of_place and check.verdict is Verdict.FAILED and self.away:
             check = replace(check, reason=f"the arm is not at home ({self.away}): `ident home`; {check.reason}")
+        if check.remedy in NO_CABLE and any(bus.interface == WIRE_INTERFACE for bus in self.model.config.can_buses):
+            check = replace(check, remedy=EMULATED_REMEDY)
         self.checks[check.code] = check
         self.tell(check)
         return check.verdict is Verdict.PASSED

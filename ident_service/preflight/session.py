@@ -38,14 +38,30 @@ from ident_service.motion.trajectory import Reference, Setpoint
 from ident_service.preflight.stability import INERTIA, known_drives
 
 _DRIVE = "Read the drive's own fault code and mend its cause; then `ident recover` tells what else is in the way."
+RATE_REMEDY = (
+    "Give the process a core of its own and real-time priority (`ident doctor ARM` says what is missing), stop "
+    "other load, or lower control.rate."
+)
 _LINK = "Check power, cables and bus of the axes named, and the drives' own fault codes."
+ANSWERS_REMEDY = "Check power, cables and bus termination of the axes that do not answer."
+UNREACHABLE_REMEDY = "Check power, cables, and that no other program uses the arm."
+BROKEN_REMEDY = "Check power, cables, bus and the drives' own fault codes."
+NO_CABLE = frozenset({_LINK, ANSWERS_REMEDY, UNREACHABLE_REMEDY, BROKEN_REMEDY})
+"""Remedies that do not apply where drives are a program on this computer."""
+EMULATED_REMEDY = (
+    "No cable leads to these drives, which `ident emulate ARM` runs on this computer: see that it runs. If it does, it "
+    "or this process came too late: stop other load, or see what `ident doctor ARM` says, and check again."
+)
 _ENCODER = "Check the encoder of the joint named, its cable and connectors; free the joint if it is jammed."
 
 _SUPPLY = "Check the limits that the drive keeps by itself, its temperature and its supply."
 
 # By codes of `faults.FAULTS`, also of warnings that went on for too long.
 REMEDIES: dict[str, str] = {
-    "emergency_stop": "Find out why the emergency stop was pressed or its circuit is open, then release it.",
+    "emergency_stop": (
+        "Find out why the emergency stop was pressed or its circuit is open, then release it; on a WAM's pendant "
+        "press Shift-Idle, too."
+    ),
     "drive_fault": _DRIVE,
     "drive_emergency": _DRIVE,
     "drive_restarted": _DRIVE,
@@ -66,6 +82,8 @@ REMEDIES: dict[str, str] = {
     "encoder_jump": _ENCODER,
     "lost_feedback": _LINK,
     "strange_frame": _LINK,
+    "late_cycle": RATE_REMEDY,
+    "late_cycles": RATE_REMEDY,
     "torque_not_applied": _SUPPLY,
     "torque_limited": _SUPPLY,
     "drive_warning": _SUPPLY,

@@ -6,7 +6,6 @@ joint is braked less than asked while all brake.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -24,7 +23,7 @@ from ident_service.model.kinematics import frame_origins
 from sim_backend.build import build_machine
 from sim_backend.canopen_device.drive import CanopenDrive as Drive
 from sim_backend.canopen_device.drive import Tuning
-from sim_backend.canopen_device.personality import personality_of
+from sim_backend.canopen_device.personality import described_personality, personality_of
 from sim_backend.emulator.body import Body, Gears
 from sim_backend.emulator.emulator import Emulator
 from sim_backend.emulator.faults import DriveFault, configured
@@ -102,15 +101,14 @@ def _canopen(config: ArmConfig, driver: CanopenDriver, faults: Sequence[DriveFau
         for number, drive in enumerate(driver.drives)
     )
     tuned = _tuned(body)
-    own = itertools.cycle(emulation.eds or (None,))
-    faces = [
-        Drive(driver.eds.text, drive.node, motor, _identity(drive), tuning=tuning)
-        if sheet is None
-        else Drive(
-            sheet.text, drive.node, motor, like=personality_of(sheet.text, drive, driver.families), tuning=tuning
-        )
-        for drive, motor, sheet, tuning in zip(driver.drives, body.motors, own, tuned, strict=False)
-    ]
+    others = emulation.eds
+    faces = []
+    for number, (drive, motor, tuning) in enumerate(zip(driver.drives, body.motors, tuned, strict=True)):
+        if others:
+            text, own, like = others[number % len(others)].text, {}, personality_of
+        else:
+            text, own, like = driver.sheet_file(number).text, _identity(drive), described_personality
+        faces.append(Drive(text, drive.node, motor, own, like(text, drive, driver.families), tuning))
     at_first = configured(emulation.faults, names, body.plant.period)
     return Emulator(body, faces, [drive.bus for drive in driver.drives], names, (*at_first, *faults))
 

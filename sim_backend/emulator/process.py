@@ -28,7 +28,7 @@ import numpy as np
 from drivers.can.can_frame import Frame
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
-from ident_service.config.can_bus import CanBus
+from ident_service.config.can_bus import WIRE_INTERFACE, CanBus
 from ident_service.errors import DriverError, UsageError
 from sim_backend.can_bus.host import LocalPort
 from sim_backend.can_bus.hub import CanBusServer
@@ -156,9 +156,6 @@ def _frame(message: can.Message) -> Frame:
         message.is_extended_id,
         fd=message.is_fd,
     )
-
-
-WIRE_INTERFACE = "ident_wire"
 
 
 class HostedBuses:

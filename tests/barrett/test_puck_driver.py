@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,13 +15,16 @@ from drivers.barrett.driver import BarrettArm
 from drivers.barrett.protocol import Group, SafetyMode, address_of, get, request_of, torques_of
 from drivers.can.bus_state import BusError
 from drivers.can.can_frame import Frame
+from ident_service.cli import recovery_commands
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError, PositionUnknown
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.ticket import Verdict
+from ident_service.operations.recovery import recover
 from ident_service.preflight.passive_checks import identities_check, record_idle
+from ident_service.preflight.preflight import preflight
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 from sim_backend.emulator.motor import Power
@@ -410,10 +414,25 @@ def test_a_puck_that_does_not_answer_or_is_none_is_named() -> None:
         changed(2, ROLE=2).arm.open()
 
 
+def test_after_an_emergency_stop_each_thing_to_do_is_said_once(tmp_path: Path) -> None:
+    bench = Bench(wam())
+    bench.behind.inject(DriveFault("emergency_stop"))
+    bench.behind.settle(bench.behind.clock.now_ns() + 100_000_000)
+    found = recover(bench.arm._config, tmp_path / "state", bench.arm)
+    assert found.steps[1] == "The emergency stop is pressed, or has been: release it, then press Shift-Idle."
+    told = recovery_commands._text(found)
+    assert told.count("latched by the drive") == told.count("Shift-Idle") == 1
+    ticket = preflight(bench.arm, arm_model(bench.arm._config), None)
+    (check,) = [one for one in ticket.checks if one.code == "identities"]
+    assert (check.reason.count("emergency stop"), check.remedy.count("Shift-Idle")) == (1, 1)
+
+
 def test_an_arm_is_woken_and_zeroed_at_home_by_a_person() -> None:
     bench = Bench(wam(emulation={"zeroed": False}))
     assert all(state == "asleep" for state in bench.behind.emulator.states[:7])
-    with pytest.raises(PositionUnknown, match="ident set-home wam7_pucks"):
+    with pytest.raises(PositionUnknown, match=r"are not awake: .*`ident set-home ARM`, which wakes them"):
+        bench.arm.look().open()
+    with pytest.raises(PositionUnknown, match="ident set-home ARM"):
         bench.arm.open()
     said = bench.arm.zero()
     assert len(said) == 7

@@ -97,7 +97,7 @@ def close(position: np.ndarray, true: np.ndarray) -> None:
 def test_drives_that_were_never_zeroed_are_not_opened_nor_looked_at() -> None:
     bench = Bench()
     for act in (bench.arm.open, bench.arm.look().open):
-        with pytest.raises(PositionUnknown, match=r"drives 1, 2 do not know where.*`ident set-home weightless`"):
+        with pytest.raises(PositionUnknown, match=r"drives 1, 2 do not know where.*`ident set-home ARM`"):
             act()
         bench.behind.link(0).close()  # given back
     assert bench.marks() == [0, 0]

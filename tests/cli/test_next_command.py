@@ -15,9 +15,9 @@ from cli.conftest import Commissioned, Ident, quick_arm
 from helpers.tickets import write_checked_ticket
 
 from ident_service.cli import parser
-from ident_service.cli.next_command import _FOLLOWS, WITHOUT, next_after_error, next_line
+from ident_service.cli.next_command import _FOLLOWS, WITHOUT, next_after_error, next_line, with_arm
 from ident_service.config.load import load_arm
-from ident_service.errors import ArmFault, IdentError, MotionRefused, UsageError
+from ident_service.errors import ArmFault, IdentError, MotionRefused, PositionUnknown, UsageError
 
 TOP = parser()
 
@@ -39,6 +39,11 @@ def test_every_verb_has_a_next_command_or_is_known_to_have_none() -> None:
 RUN = {"id": "r1", "kind": "motion", "arm": "planar2"}
 JOB = {"id": "j1", "kind": "run", "arm": "planar2", "run": "r1", "motion": 1, "state": "done"}
 DUE = {"id": 1, "arm": "planar2"}
+PROBED = {"drivable": True, "silent": "", "can": {"problems": []}, "moves_by_position": False}
+UNLIKE = PROBED | {"drivable": False}
+REFUSED = UNLIKE | {"can": {"problems": [{}]}}
+NOT_ZEROED = {"checks": [{"verdict": "failed", "reason": "ZERO is 0: then `ident set-home ARM`", "remedy": "Do this."}]}
+STALLED = {"checks": [{"verdict": "failed", "reason": "late", "remedy": "see what `ident doctor ARM` says."}]}
 # Words of a verb, its exit code and answer, and the command that follows.
 TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("config check planar2", 0, {}, "simulate planar2"),
@@ -86,7 +91,15 @@ TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
     ("prune --keep 3", 0, {"deleted": False, "recordings": [{}]}, "prune --keep 3 --yes"),
     ("prune --keep 3 --yes", 0, {"deleted": True, "recordings": [{}]}, "runs"),
     ("backup f.zip --state s", 0, {}, "restore f.zip --state restored"),
-    ("emulate wam7_canopen", 0, {}, "bus scan wam7_canopen"),
+    ("preflight wam7_canopen --dry-run", 0, {}, "preflight wam7_canopen"),
+    ("preflight wam7_pucks", 3, {"ticket": NOT_ZEROED}, "set-home wam7_pucks"),
+    ("preflight a.yaml", 3, {"ticket": STALLED}, "doctor a.yaml"),
+    ("bus probe a.yaml --eds f", 0, {"drives": [PROBED]}, "config check a.yaml"),
+    ("bus probe a.yaml", 0, {"drives": [PROBED]}, "preflight a.yaml --dry-run"),
+    ("bus probe a.yaml", 3, {"drives": [PROBED, UNLIKE]}, "config check a.yaml"),
+    ("bus probe a.yaml", 3, {"drives": [REFUSED, UNLIKE]}, "bus report a.yaml"),
+    ("bus probe a.yaml", 3, {"drives": [REFUSED | {"moves_by_position": True}]}, "config check a.yaml"),
+    ("bus probe a.yaml", 3, {"drives": [REFUSED, UNLIKE | {"silent": "no answer"}]}, "bus scan a.yaml"),
 ]
 
 
@@ -103,6 +116,7 @@ ERRORS: list[tuple[str, IdentError, str]] = [
     ("run planar2", MotionRefused("active faults"), "next: ident recover planar2\n"),
     ("run planar2", ArmFault("lease_lost", "x"), "next: ident recover planar2\n"),
     ("run planar2", UsageError("exists"), ""),
+    ("watch my.yaml", PositionUnknown("not zeroed"), "next: ident set-home my.yaml\n"),
     ("reidentify planar2", UsageError("planar2: nothing has been accepted yet"), "next: ident preflight planar2\n"),
 ]
 
@@ -112,6 +126,27 @@ def test_what_refused_or_stopped_a_motion_is_followed_by_what_clears_it(
     words: str, error: IdentError, line: str
 ) -> None:
     assert next_after_error(TOP.parse_args(words.split()), error) == line
+
+
+def test_a_probe_of_files_that_no_command_helps_names_none() -> None:
+    arguments = TOP.parse_args(["bus", "probe", "a.yaml", "--eds", "f"])
+    assert next_line(arguments, 3, {"drives": [REFUSED]}) == ""
+    assert next_line(arguments, 2, {"drives": [UNLIKE | {"can": None}]}) == ""
+
+
+def test_a_run_in_a_folder_of_the_working_directory_is_named_by_its_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").mkdir()
+    arguments = TOP.parse_args(["run", "planar2", "--out", "run"])
+    assert next_line(arguments, 0, {"folder": "run"}) == "next: ident identify run/run.mcap --arm planar2\n"
+
+
+def test_commands_in_a_message_name_the_arm_as_it_was_typed() -> None:
+    arguments, text = TOP.parse_args(["watch", "my arm.yaml"]), "ARM: then `ident set-home ARM`; ARMS, `ident stop`"
+    assert with_arm(arguments, text) == "ARM: then `ident set-home 'my arm.yaml'`; ARMS, `ident stop`"
+    assert with_arm(TOP.parse_args(["runs"]), text) == text
 
 
 @pytest.mark.slow

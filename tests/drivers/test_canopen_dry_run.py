@@ -77,7 +77,9 @@ def test_a_drive_that_would_be_refused_is_told_so(name: str) -> None:
     found = planned(Bench(config), config)
     assert places(found) == []
     assert all("cannot be driven" in one.refused for one in found)
-    assert "REFUSED" in planned_text(config, found)
+    text = planned_text(config, found)
+    assert text.count("REFUSED") == text.count("would be refused, and nothing written") == 2
+    assert "has everything already" not in text
 
 
 def test_no_verb_that_configures_drives_lacks_it() -> None:

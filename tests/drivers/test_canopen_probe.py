@@ -21,9 +21,11 @@ from drivers.canopen.capabilities import family_of, shipped_families
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
 from ident_service.config.arm import ArmConfig
 from ident_service.config.drive_family import family_from
+from ident_service.config.eds import data_sheet
 from ident_service.config.load import load_arm, shipped_arms
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, DriverError, UsageError
+from ident_service.operations.description_check import check_description
 from ident_service.operations.fieldbus import Probe, bus_probe, keep_outcome, probe_document, probe_text
 from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.process import emulate
@@ -95,6 +97,20 @@ def test_drives_without_one_are_refused_in_one_sentence(name: str) -> None:
     refusals = [line for line in text.splitlines() if "REFUSED" in line]
     assert len(refusals) == 2
     assert "torque mode" in refusals[0]
+    assert "highest rate" not in text
+    assert "drive 1, drive 2: another drive is needed" in text.partition("what helps:\n")[2]
+
+
+@needs_sheets
+def test_a_drive_without_torques_that_takes_positions_is_told_how() -> None:
+    text = EDS
+    for index in ("6071", "6087"):
+        text = text.replace(f"[{index}]", f"[{int(index, 16) - 0x1000:04X}]")
+    config = weightless_config()
+    found = bus_probe(config, [TextFile(name="speedy.eds", text=text)])
+    told = reported(config, found)
+    assert "REFUSED" in told
+    assert "what helps:\n  speedy.eds: positions can be streamed: `driver: {streams: position, ...}` at 100" in told
 
 
 def test_a_more_trusted_watchdog_and_further_axes_are_told_of() -> None:
@@ -171,12 +187,35 @@ def test_the_command_judges_files_without_a_bus(tmp_path: Path, capsys: pytest.C
     assert main(["bus", "probe", "wam7_canopen", "--eds", str(eds)]) == DONE
     assert "emulated_drive.eds, node 1: emulated drive: can be driven, predicted" in capsys.readouterr().out
     (tmp_path / "none.eds").write_bytes(b"\xff\xfe no file of ours")
-    assert main(["bus", "probe", "wam7_canopen", "--json", "--eds", str(eds), str(tmp_path / "none.eds")]) == VERDICT_NO
+    assert main(["bus", "probe", "wam7_canopen", "--json", "--eds", str(eds), str(tmp_path / "none.eds")]) == USAGE
     document = json.loads(capsys.readouterr().out)
     assert [one["drivable"] for one in document["drives"]] == [True, False]
     assert "is no EDS" in document["drives"][1]["silent"]
+    assert document["advice"] == ["none.eds: take the EDS or DCF of the drive's maker, undamaged"]
     assert document["highest_rate"] < 1000
     assert main(["bus", "probe", "wam7_canopen", "--eds", "no.eds"]) == USAGE
+
+
+@needs_sheets
+@pytest.mark.parametrize("name", [*CAPABLE, *REFUSED])
+def test_a_file_that_is_cut_off_is_told_to_be_so(name: str) -> None:
+    text, config = sheet(name)["text"], weightless_config()
+    assert data_sheet(text).cut_off == ""
+    for percent in (20, 50, 95):
+        torn = TextFile(name="torn.eds", text=text[: len(text) * percent // 100])
+        told = reported(config, bus_probe(config, [torn]))
+        assert "it seems to end too early: " in told, percent
+        assert ("torn.eds: get the whole file" in told) == ("every drive can be driven" not in told)
+
+
+def test_a_description_whose_file_is_cut_off_is_warned_of(tmp_path: Path) -> None:
+    (tmp_path / "cut.eds").write_text(EDS[: len(EDS) * 3 // 4])
+    (tmp_path / "arm.yaml").write_text(
+        "extends: wam7_canopen\nname: cut\ndriver: {kind: canopen, eds: cut.eds, torque_frames: single}\n"
+        "control: {rate: 500}\n"
+    )
+    (warning,) = check_description(tmp_path / "arm.yaml").warnings
+    assert warning.startswith("cut.eds seems to end too early: of ")
 
 
 def test_an_arm_without_a_bus_is_refused() -> None:

@@ -162,3 +162,17 @@ def test_files_are_for_drives_of_canopen_and_must_be_there(tmp_path: Path) -> No
         with_sheets(config, ["none.eds"])
     with pytest.raises(UsageError, match="not CANopen's"):
         with_sheets(config.model_copy(update={"driver": None}), [str(FILES[0])])
+
+
+def test_drives_are_emulated_by_the_files_that_the_description_names(tmp_path: Path) -> None:
+    """By the common one or by one's own, with the described numbers; `--eds` puts others in their place."""
+    drive = {"rated_torque": 1.0, "max_torque": 2.0, "max_speed": 6000.0, "watchdog": "heartbeat"}
+    own = drive | {"node": 2, "eds": str(SHEETS / E35), "identity": {"serial": 77}}
+    described = {"eds": str(SHEETS / EPOS4), "torque_frames": "single", "drives": [drive | {"node": 1}, own]}
+    config = drives_config(tmp_path, **described)
+    host = host_of(config)
+    assert [host.read(node, 0x1018, 1, "I") for node in (1, 2)] == [0xFB, 0xFF]
+    assert [host.read(node, 0x1018, 4, "I") for node in (1, 2)] == [0, 77]
+    assert host.write(1, 0x6072, 0, "H", 1) == ABSENT  # what the shipped drive has, and this one has not
+    other = host_of(with_sheets(config, [str(SHEETS / E35)]))
+    assert [other.read(node, 0x1018, 1, "I") for node in (1, 2)] == [0xFF, 0xFF]

@@ -192,3 +192,14 @@ def test_a_fault_and_an_interface_are_checked_before_anything_runs(
     with pytest.raises(SystemExit) as wrong:
         main(["emulate", path, "--seconds", "0"])
     assert wrong.value.code == USAGE
+
+
+def test_what_to_type_meanwhile_is_said_at_the_beginning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pucks answer no `bus scan`, and the drives have gone when the command ends."""
+    arm, wire = tmp_path / "my wam.yaml", f"begin-{tmp_path.name}-{os.getpid()}"
+    section = f"driver: {{kind: barrett, bus: {{interface: ident_wire, channel: {wire}}}}}\n"
+    arm.write_text(f"extends: wam7_pucks\nname: mine\n{section}")
+    assert main(["emulate", str(arm), "--seconds", "0.05"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith(f"mine: emulated drives; Ctrl-C ends; in another terminal: `ident set-home '{arm}'`\n")
+    assert "next:" not in said

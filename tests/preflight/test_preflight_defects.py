@@ -14,9 +14,11 @@ from drivers.arm import Sample, Watchdog
 from drivers.axis_status import AxisStatus
 from drivers.clock import VirtualClock
 from ident_service.config.arm import ArmConfig
+from ident_service.config.can_bus import CanBus
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmFault, DriverError
 from ident_service.model.arm_model import arm_model
+from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.faults import FAULTS
 from ident_service.motion.ticket import CODES, Verdict
 from ident_service.preflight.preflight import preflight
@@ -367,6 +369,7 @@ def test_a_drive_that_limits_its_torque_is_named_and_not_the_joint_that_it_drags
         ("bus_off", "bus 0 is off", "power, cables and bus"),
         ("repeated_warnings", "lost_feedback in more than 20 of the last 100 cycles (elbow)", "power, cables and bus"),
         ("repeated_warnings", "torque_rate in more than 20 of the last 100 cycles (elbow)", None),
+        ("late_cycles", "this computer stalled for 100 ms", "`ident doctor ARM`"),
         ("following_error", "elbow: 0.09 rad from where it should be", None),
         ("over_velocity", "elbow: moves at 3 rad/s", None),
     ],
@@ -377,6 +380,17 @@ def test_a_remedy_follows_the_code_where_the_fault_says_what_failed(
     assert set(REMEDIES) <= set(FAULTS)
     found = remedy_of(ArmFault(code, message))
     assert (found is None) if remedy is None else (found is not None and remedy in found)
+
+
+@pytest.mark.parametrize(("interface", "remedy"), [("ident_wire", "`ident emulate ARM`"), ("socketcan", "cables")])
+def test_drives_that_are_a_program_have_no_cables_to_check(interface: str, remedy: str) -> None:
+    shipped = load_arm("wam7_pucks")
+    bus = CanBus(interface=interface, channel="nobody")
+    config = shipped.model_copy(update={"driver": shipped.driver.model_copy(update={"bus": bus})})  # type: ignore[union-attr]
+    ticket = preflight(make_arm(config), arm_model(config), None)
+    (check,) = [one for one in ticket.checks if one.code == "identities"]
+    assert check.verdict is Verdict.FAILED
+    assert remedy in check.remedy
 
 
 def test_a_bus_that_goes_is_a_failed_check() -> None:
