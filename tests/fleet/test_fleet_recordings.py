@@ -18,7 +18,7 @@ from ident_service.recordings.mcap_writer import RecordingWriter
 def test_samples_written_together_are_those_written_one_by_one(arm: str, rate: float, tmp_path: Path) -> None:
     """Every record of the file, chunks and indexes among them; but velocities of a filter differ in last digits."""
     of, count, offset = kind(arm, rate=rate), 450, round(BEGIN * 1e9) + 123_456_789
-    stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+    stamps = of.stamps(count)
     position, velocity, torque = motion(of, 1)(stamps * 1e-9)
     names = of.model.chain.names
     ok, age = np.ones(len(names), dtype=bool), np.zeros(len(names), dtype=np.int64)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from ident_service.recordings.mcap_writer import (
     RecordingWriter,
     stamp_bytes,
 )
+from ident_service.recordings.recording import BLOCK_SAMPLES, Block, assemble
 
 WEEK = 7 * 86_400.0
 BEGIN = 1_767_225_600.0  # 2026-01-01
@@ -53,6 +55,10 @@ class Kind:
     noise: Array
     rate: float = 100.0
     seconds: float = 20.0
+
+    def stamps(self, count: int) -> NDArray[np.int64]:
+        """Return the stamps of a recording of so many samples [ns], shape (samples,)."""
+        return np.rint(np.arange(count) * (1e9 / self.rate)).astype(np.int64)
 
     def changed(self, factors: Mapping[str, float] | None = None, added: Mapping[str, float] | None = None) -> Array:
         """Return the usual arm's parameters with some multiplied and some added to."""
@@ -114,6 +120,45 @@ def motion(of: Kind, seed: int) -> Callable[[Array], tuple[Array, Array, Array]]
     return at
 
 
+def samples(of: Kind, delta: Array, seed: int, seconds: float | None = None) -> tuple[Array, Array, Array]:
+    """Return position, velocity and torque of an arm with these link parameters, shape (samples, joints) each.
+
+    Args:
+        of: kind of arm.
+        delta: link parameters, shape (parameters,).
+        seed: of its motion and noise.
+        seconds: its length; the kind's when None.
+    """
+    count = round((of.seconds if seconds is None else seconds) * of.rate)
+    time, move = np.arange(count) / of.rate, motion(of, seed)
+    position, velocity, _ = move(time)
+    torque, beta = np.empty_like(position), of.base.K @ delta
+    for start in range(0, count, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        H = joint_regressor(of.model.chain, of.model.layout, *move(time[part] + 0.5 / of.rate), of.base.base)
+        torque[part] = np.einsum("jps,p->sj", H, beta)
+    torque += of.noise * np.random.default_rng(seed + 1_000_003).standard_normal(torque.shape)
+    return position, velocity, torque
+
+
+class DrawnRecording:
+    """Recording that is no file: the samples that `write_recording` would write, for campaigns over many fleets."""
+
+    joint_names: tuple[str, ...]
+    torque_held, torn = True, False
+
+    def __init__(self, of: Kind, delta: Array, *, seed: int, seconds: float | None = None) -> None:
+        self.path = Path(f"{seed}.drawn")
+        self.joint_names, self.joints = of.model.chain.names, len(of.model.chain.names)
+        position, _, torque = samples(of, delta, seed, seconds)
+        self.block = Block(of.stamps(len(torque)), position, torque)
+        self.sha256 = hashlib.sha256(position.tobytes() + torque.tobytes()).hexdigest()
+
+    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
+        """Give the samples as a reader does."""
+        return assemble([self.block], samples, self.path, self.joint_names)
+
+
 def write_recording(
     of: Kind,
     path: Path,
@@ -135,19 +180,10 @@ def write_recording(
         metadata: of the record `ident`.
         seconds: its length; the kind's when None.
     """
-    count = round((of.seconds if seconds is None else seconds) * of.rate)
-    time, move = np.arange(count) / of.rate, motion(of, seed)
-    position, velocity, _ = move(time)
-    torque, beta = np.empty_like(position), of.base.K @ delta
-    for start in range(0, count, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        H = joint_regressor(of.model.chain, of.model.layout, *move(time[part] + 0.5 / of.rate), of.base.base)
-        torque[part] = np.einsum("jps,p->sj", H, beta)
-    torque += of.noise * np.random.default_rng(seed + 1_000_003).standard_normal(torque.shape)
+    position, velocity, torque = samples(of, delta, seed, seconds)
     path.parent.mkdir(parents=True, exist_ok=True)
     with RecordingWriter(path, of.model.chain.names, "", round(at * 1e9), metadata=metadata) as writer:
-        stamps = np.rint(np.arange(count) * (1e9 / of.rate)).astype(np.int64)
-        write_samples(writer, round(at * 1e9), stamps, position, velocity, torque)
+        write_samples(writer, round(at * 1e9), of.stamps(len(torque)), position, velocity, torque)
     return path
 
 
