@@ -198,20 +198,23 @@ def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]
     share = member / np.maximum(member.sum(axis=1, keepdims=True), 1)  # the mean over a group, (groups, base)
     floor = (_LEAST * residual) ** 2
     spread = np.median(np.abs(beta - np.median(beta, axis=0)), axis=0) ** 2
-    variances = np.maximum(share @ spread, floor) @ member
+    own = np.maximum(share @ spread, floor) @ member
     if len(arms) == 1:
-        variances[:] = floor  # one arm says nothing of how far arms differ
+        own[:] = floor  # one arm says nothing of how far arms differ
     for _ in range(_ROUNDS if len(arms) > 1 else 0):
-        before, variances = variances, _stepped(*_moments(P, right, variances), variances, share, member, floor)
-        if np.max(np.abs(np.sqrt(variances / before) - 1.0)) < _SETTLED:
+        gained, expected = (part.sum(axis=0) for part in _moments(P, right, own))
+        before, own = own, np.maximum(own * np.sqrt(_ratio(gained, expected)), floor)
+        if np.max(np.abs(np.sqrt(own / before) - 1.0)) < _SETTLED:
             break
-    gained, expected = _moments(P, right, variances)
+    gained, expected = _moments(P, right, own)
+    variances = _drawn_to_group(own, own, expected, share, member)
     # Without each arm by one whole step: an odd arm must not hide in the spread that it makes itself.
-    others = []
+    without = np.tile(variances, (len(arms), 1))
     for arm in range(len(arms) if len(arms) > 2 else 0):
-        parts = np.delete(gained, arm, axis=0), np.delete(expected, arm, axis=0)
-        others.append(_stepped(*parts, variances, share, member, floor, 1.0))
-    without = np.minimum(others, variances) if others else np.tile(variances, (len(arms), 1))
+        others = np.delete(expected, arm, axis=0)
+        rest = own * _ratio(np.delete(gained, arm, axis=0).sum(axis=0), others.sum(axis=0))
+        found = _drawn_to_group(np.maximum(rest, floor), own, others, share, member)
+        without[arm] = np.minimum(found, variances)
     mean, covariance, *_ = _common(P, right, variances)
     return Population(
         arms=arms,
@@ -262,28 +265,28 @@ def _moments(P: Array, right: Array, variances: Array) -> tuple[Array, Array]:
     return off**2, trace
 
 
-def _stepped(
-    gained: Array, expected: Array, variances: Array, share: Array, member: Array, floor: float, power: float = 0.5
-) -> Array:
-    """Return T after one step, shape (base,).
+def _ratio(gained: Array, expected: Array) -> Array:
+    """Return the ratio of two sums; 1 where no arm knows anything."""
+    tiny = np.finfo(float).tiny
+    return np.asarray(np.where(expected > tiny, gained / np.maximum(expected, tiny), 1.0))
+
+
+def _drawn_to_group(own: Array, variances: Array, expected: Array, share: Array, member: Array) -> Array:
+    """Return variances of parameters drawn to those of their groups, the more the fewer arms know them, shape (base,).
 
     Args:
-        gained: (M r)^2 per arm and parameter at T, shape (arms, base).
-        expected: its expectation.
-        variances: T, shape (base,).
+        own: to draw, shape (base,).
+        variances: T at which the expectation is.
+        expected: of (M r)^2, per arm and parameter, shape (arms, base).
         share: that each parameter has in the mean of its group, shape (groups, base).
         member: which parameters each group has, shape (groups, base).
-        floor: least variance.
-        power: of the ratio of the two: a half is sure not to overshoot, one is nearer where they hardly differ.
     """
-    tiny = np.finfo(float).tiny
-    sums = expected.sum(axis=0)
-    own = variances * np.where(sums > tiny, gained.sum(axis=0) / np.maximum(sums, tiny), 1.0) ** power
-    of_group = (share @ own) @ member
-    # Arms that would show a variance as large as the group's: 1 for one that knows the parameter, 0 where it does not.
-    shown = of_group * expected
-    told = np.sum(shown / np.maximum(1.0 + shown - variances * expected, 1e-3), axis=0)
-    return np.asarray(np.maximum((told * own + _GROUP_ARMS * of_group) / (told + _GROUP_ARMS), floor))
+    size = (share @ own) @ member
+    # Arms that would show a variance of the usual size: 1 for one that knows the parameter, 0 where it does not.
+    shown = size * expected
+    told = np.sum(shown / np.maximum(1.0 + shown - variances * expected, 1e-3), axis=0) + np.finfo(float).eps
+    of_group = (share @ (told * own) / (share @ told)) @ member
+    return np.asarray((told * own + _GROUP_ARMS * of_group) / (told + _GROUP_ARMS))
 
 
 def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -> LeastSquares:
