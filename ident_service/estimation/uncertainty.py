@@ -96,6 +96,53 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
     return Uncertainty(covariance, np.where(blind, np.inf, largest), degrees, _noise(clusters, fit))
 
 
+@one_blas_thread()
+def variance_inflation(equations: Equations, fit: LeastSquares) -> float:
+    """Return how many times larger variances are than those of eq. 81, as a mean over all directions; at least 1.
+
+    With white residuals of variance v the scores s_b of a block, in coordinates in which all blocks together have the
+    identity as information and block b has S_b, have E |s_b|^2 = v tr(S_b - S_b^2) (that of HC2). The sum over blocks
+    is one number from blocks times parameters, and so neither biased nor much uncertain where blocks are few; for the
+    deviation of one parameter, `uncertainty` is the careful answer. As there, longer blocks are tried, too.
+
+    Args:
+        equations: in blocks.
+        fit: what solves them.
+    """
+    total = equations.total
+    rows = max(int(total.rows.sum()) - total.base, 1)
+    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / rows
+    seen = [_Whitened.of(cluster, fit) for cluster in equations.clusters]
+    found = [1.0]
+    for count in (1, *_LONGER):
+        if count > 1 and len(seen) < _LEAST_CLUSTERS * count:
+            break
+        blocks = [_Whitened.sum(seen[start : start + count]) for start in range(0, len(seen), count)]
+        expected = sum(float(np.trace(one.share)) - float(np.sum(one.share**2)) for one in blocks)
+        if expected > 0.0 and variance > 0.0:
+            found.append(sum(float(one.score @ one.score) for one in blocks) / (variance * expected))
+    return max(found)
+
+
+def inflated_covariance(equations: Equations, fit: LeastSquares) -> Array:
+    """Return the covariance of eq. 81 times `variance_inflation`, shape (base, base); infinite where unseen.
+
+    Where blocks are few, the ratios of its entries are much surer than those of `Uncertainty.covariance`, which are
+    from the blocks alone; its size is of all directions together. For tests that find the size of each themselves.
+
+    Args:
+        equations: in blocks.
+        fit: what solves them.
+    """
+    total = equations.total
+    rows = max(int(total.rows.sum()) - total.base, 1)
+    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / rows
+    covariance = fit.inverse @ fit.inverse.T * (variance * variance_inflation(equations, fit))
+    unseen = ~np.isfinite(fit.standard_deviations)
+    covariance[unseen, unseen] = np.inf
+    return np.asarray(covariance)
+
+
 def jackknife(
     clusters: Sequence[Sequence[Information]], fit: LeastSquares, along: Array | None = None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:

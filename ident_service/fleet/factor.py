@@ -38,7 +38,7 @@ from ident_service.estimation.least_squares import (
 )
 from ident_service.estimation.plausibility import reasons_in_recording, remarks_on_limits
 from ident_service.estimation.robust_regression import huber, standstill_weights
-from ident_service.estimation.uncertainty import uncertainty
+from ident_service.estimation.uncertainty import inflated_covariance, uncertainty
 from ident_service.fleet.storage import Source, Store, local_copy
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters
@@ -52,7 +52,7 @@ from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid
 
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 STRETCHES: Final = 12  # kept of a recording, as few as the uncertainty of one needs
 FAN_IN: Final = 16  # factors that are merged at once
 AT_ONCE: Final = FAN_IN**2  # factors that one task merges, a whole branch of the tree: what it sends on is large
@@ -441,7 +441,9 @@ def _reduced(recording: Recording, key: str, label: str, described: Described) -
     fit: LeastSquares = (ordinary_least_squares if method == "ols" else weighted_least_squares)(fitted.total)
     if method == "huber":
         fit, fitted, _ = huber([recording], model, base, fit, None, shares)
-    doubt = uncertainty(fitted, fit)
+    doubt, covariance = uncertainty(fitted, fit), inflated_covariance(fitted, fit)
+    blind = ~np.isfinite(doubt.deviations)
+    covariance[blind, blind] = np.inf
     groups = described.groups.values()
     clusters = [Information.sum(blocks) for blocks in fitted.clusters]
     kept = [
@@ -462,7 +464,7 @@ def _reduced(recording: Recording, key: str, label: str, described: Described) -
         rate=seen.rate_hz,
         beta=fit.beta,
         deviations=doubt.deviations,
-        covariances=tuple(doubt.covariance[np.ix_(places, places)] for places in groups),
+        covariances=tuple(covariance[np.ix_(places, places)] for places in groups),
         blocks=len(clusters),
         noise=np.sqrt(gathered.everything.squared_residuals(fit.beta) / rows),
         torque=np.sqrt(gathered.everything.squared_torques() / rows),

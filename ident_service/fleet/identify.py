@@ -7,7 +7,7 @@ the files. A folder of results holds
     fleet.html              the page
     parameters.parquet      arm, recording, parameter, value, deviation, verdict, quality
     problems.json           recordings that were left out, and why
-    arms/ARM/               as `ident identify` writes it, without a report
+    arms/ARM/               as `ident identify` writes it; its report has no plots of samples, but trends
     changes/ARM/            before/, after/ and their comparison.json, .txt and .html, as `ident compare` writes it
 """
 
@@ -33,6 +33,7 @@ from ident_service.errors import UsageError
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.estimation.plausibility import reasons_against
 from ident_service.estimation.uncertainty import Uncertainty, negligible
+from ident_service.fleet.arm_page import ARM_PAGE, ArmShown, arm_page
 from ident_service.fleet.factor import Described, Merged, merge_stored
 from ident_service.fleet.population import (
     ArmFit,
@@ -42,7 +43,6 @@ from ident_service.fleet.population import (
     held_out_errors,
     pooled_fit,
     population,
-    unlike,
     variance_shares,
 )
 from ident_service.fleet.reduction import (
@@ -65,18 +65,16 @@ from ident_service.fleet.results import (
     FleetResult,
     fleet_document,
     fleet_page,
+    shown_of,
     write_table,
 )
 from ident_service.fleet.storage import Store
-from ident_service.fleet.trends import (
-    Change,
-    change_points,
-    dependences,
-    scatter_of,
-)
+from ident_service.fleet.trends import Change, compare_arms
 from ident_service.model.chain import Array
 from ident_service.operations.drift_alarms import verdict_of
 from ident_service.operations.parameter_files import DOCUMENT, compare_files
+from ident_service.results.evidence.file import EVIDENCE, write_evidence
+from ident_service.results.evidence.gathering import evidence_without_samples
 from ident_service.results.manifest import (
     exchange_folders,
     require_place,
@@ -188,11 +186,7 @@ def _analysed(
         HeldOut({arm: one[k][0] for arm, one in errors.items()}, {arm: one[k][1] for arm, one in errors.items()})
         for k in (0, 1)
     )
-    leading = tuple(described.base.names[column] for column in described.base.base)
-    odd = unlike(fits, found, groups, leading)
-    scatter = scatter_of(arms, groups)
-    changes = change_points(arms, fits, groups, scatter)
-    depending = dependences(arms, groups, scatter)
+    compared = compare_arms(arms, fits, found, described)
     step("estimates inside the feasible set", 0.9)
     tell("estimates inside the feasible set, with their proofs")
     files_of: dict[str, Any] = {}
@@ -201,20 +195,21 @@ def _analysed(
         helps = several.helps if len(arms[arm]) > 1 else single.helps
         pooled = pooled_fit(fits[arm], found.other_arms(arm), found.scale) if len(arms) > 1 else None
         names = [(one.name, one.row.sha256) for one in arms[arm]]
-        more = {"arm": arm, "pooled": helps and pooled is not None, "arms": len(arms)}
+        used = helps and pooled is not None
+        held_out = (several.pooled if used else several.alone).get(arm)
+        more = {"arm": arm, "pooled": used, "arms": len(arms), "held_out_percent": held_out}
         leaves = (tree.keys, tree.by_recording)
+        shown = shown_of(arm, reduced, compared, found.common)
         files_of[arm] = submit(
-            *(_arm_files, fits[arm], tree.merged, leaves, names, described, pooled, config, more, store)
+            *(_arm_files, fits[arm], tree.merged, leaves, names, described, pooled, config, more, store, shown)
         )
     splits_of = {
-        arm: _split_files(
-            client, arm, [one for one in changes if one.changed and one.arm == arm], reduced, store, config
-        )
-        for arm in sorted({one.arm for one in changes if one.changed})
+        arm: _split_files(client, arm, [one for one in compared.changed if one.arm == arm], reduced, store, config)
+        for arm in sorted({one.arm for one in compared.changed})
     }
     written = {arm: future.result() for arm, future in files_of.items()}
     splits = {arm: (first.result()[0], second.result()[0]) for arm, (first, second) in splits_of.items()}
-    result = FleetResult(folder, reduced, found, shares, several, single, odd, changes, depending, scatter, {})
+    result = FleetResult(folder, reduced, found, shares, several, single, compared, {})
     summaries = {arm: summary for arm, (_, summary) in written.items()}
     result.document.update(fleet_document(result, summaries, load_arm(request.arm).sha256))
     return result, written, splits
@@ -257,8 +252,9 @@ def _arm_files(
     config: str,
     more: dict[str, Any],
     store: Store,
+    shown: ArmShown | None = None,
 ) -> tuple[Files, dict[str, Any]]:
-    """Return the files of one arm's results, and what the fleet's own say of it.
+    """Return the files of one arm's results, with a page where there is more to show, and what the fleet's say of it.
 
     What does not depend on the other arms is kept in the store by content: the estimate with its proof.
     """
@@ -287,6 +283,9 @@ def _arm_files(
             if file not in (_SUMMARY, PARAMETERS):
                 (place / file).write_bytes(data)
         write_parameters(place / PARAMETERS, json.loads(kept[PARAMETERS]) | {"fleet": fleet})
+        if shown is not None:
+            write_atomically(place / ARM_PAGE, arm_page(place, shown))
+        (place / EVIDENCE).unlink()
         write_manifest(place)
         return {path.name: path.read_bytes() for path in sorted(place.iterdir())}, summary
 
@@ -300,7 +299,11 @@ def _unzipped(content: bytes | None) -> dict[str, bytes] | None:
             found = {name: archive.read(name) for name in archive.namelist()}
     except (zipfile.BadZipFile, OSError, EOFError, zlib.error):
         return None
-    return found if {_SUMMARY, PARAMETERS} <= set(found) and all(Path(name).name == name for name in found) else None
+    return (
+        found
+        if {_SUMMARY, PARAMETERS, EVIDENCE} <= set(found) and all(Path(name).name == name for name in found)
+        else None
+    )
 
 
 def _estimated(
@@ -330,6 +333,8 @@ def _estimated(
     with tempfile.TemporaryDirectory(prefix="ident-fleet-") as name:
         place = Path(name)
         write_results(place, chosen, None, unusable, ArmConfig.model_validate_json(config), torque)
+        digest = hashlib.sha256((place / PARAMETERS).read_bytes()).hexdigest()
+        write_evidence(place / EVIDENCE, evidence_without_samples(chosen, digest))
         content = {path.name: path.read_bytes() for path in sorted(place.iterdir())}
     return content | {_SUMMARY: json.dumps(summary).encode()}
 

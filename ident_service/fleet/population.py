@@ -2,17 +2,18 @@
 
     beta_i = mu + u_i,    u_i ~ N(0, T),    beta_i^ = beta_i + e_i,    e_i ~ N(0, C_i)
 
-with T diagonal: tau_g^2 D_k^2 for the parameters k of group g (friction of a joint, drive inertia of a joint, first
-moments of a link, inertia of a link). D_k is the size of a parameter that makes a torque of 1 N m (root mean square);
-tau_g [N m] then is how far arms differ in the torque of that group. mu is the generalised least-squares estimate, tau_g
-the restricted maximum-likelihood one (Harville 1977), found by the MM iteration of Zhou, Hu, Zhou and Lange (2019).
-Given both, an arm's parameters minimise
+with T diagonal: tau_k^2 D_k^2. D_k is the size of a parameter that makes a torque of 1 N m (root mean square); tau_k
+[N m] then is how far arms differ in that parameter's torque. mu is the generalised least-squares estimate, tau_k the
+restricted maximum-likelihood one (Harville 1977), found by the MM iteration of Zhou, Hu, Zhou and Lange (2019) and
+drawn to the mean of its group (friction of a joint, drive inertia of a joint, first moments of a link, inertia of a
+link) as if two more arms had said that. One tau for a whole group would be that of the parameter which is known best: a
+first moment that is zero in every arm would make all arms alike in the others. Given both, an arm's parameters minimise
 
-    |R_i (beta - beta_i^)|^2 + sum_g |D_g^-1 (beta - mu)_g|^2 / tau_g^2,    R_i^T R_i = C_i^-1
+    |R_i (beta - beta_i^)|^2 + sum_k (beta - mu)_k^2 / (tau_k D_k)^2,    R_i^T R_i = C_i^-1
 
 inside the feasible set: where an arm's own recordings say much they decide, elsewhere the fleet does. C_i^-1 comes from
-the triangles, scaled by one number to the variances from blocks, and what differs from recording to recording is added
-to C_i.
+the triangles, scaled by one number for residuals that are not white, and what differs from recording to recording is
+added to C_i.
 
 Shares of variance between arms, between recordings and noise are moment estimates per parameter (DerSimonian and Laird
 1986, twice). Whether pooling helps is decided on recordings that no estimate has seen.
@@ -25,7 +26,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ident_service.estimation.change_detection import ComparedEstimate, Kind, Motion, Test, difference_test, holm
+from ident_service.estimation.change_detection import (
+    ALPHA,
+    RELEVANT_TORQUE,
+    ComparedEstimate,
+    Kind,
+    Motion,
+    Test,
+    difference_test,
+    holm,
+)
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
 from ident_service.estimation.feasible.problems import constrained_least_squares, feasibility_test
@@ -38,7 +48,14 @@ from ident_service.estimation.least_squares import (
     torque_error,
     weighted_least_squares,
 )
-from ident_service.estimation.uncertainty import Uncertainty, negligible, uncertainty, verdicts, widening
+from ident_service.estimation.uncertainty import (
+    Uncertainty,
+    negligible,
+    uncertainty,
+    variance_inflation,
+    verdicts,
+    widening,
+)
 from ident_service.fleet.factor import Described, Merged, Row
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
@@ -47,6 +64,10 @@ from ident_service.model.likely_bodies import likely_bodies
 
 _ROUNDS = 200
 _SETTLED = 1e-4  # relative change of the largest tau
+_GROUP_ARMS = 2.0  # that the spread of a parameter's group counts as, against what arms say of the parameter itself
+# Deviations above chance, below which recordings of an arm do not differ by more than their noise: what is taken for a
+# difference in one parameter would hide what they tell of its sum with others.
+_SURE = 2.0
 _LEAST = 1e-4  # of the residual; arms that differ by less torque are as good as equal
 _WORTH = 0.99  # of the error of each arm alone; pooling that gains less is left
 
@@ -95,10 +116,8 @@ def arm_fit(merged: Merged, method: str, between: Array | None = None, doubt: Un
     doubt = uncertainty(merged.fitted, fit) if doubt is None else doubt
     degrees = max(int(total.rows.sum()) - total.base, 1)
     variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
-    white = fit.standard_deviations
-    known = np.isfinite(white) & np.isfinite(doubt.deviations) & (white > 0.0)
     # One factor for all: factors of their own would turn the combinations that are known well into others.
-    wider = float(np.median((doubt.deviations[known] / white[known]) ** 2)) if known.any() else 1.0
+    wider = variance_inflation(merged.fitted, fit)
     precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * wider)
     if between is not None:
         precision = _widened(precision, between)
@@ -119,7 +138,7 @@ class Population:
     Attributes:
         arms: names, in the order of what is per arm.
         scale: D, the size of each parameter that makes 1 N m (root mean square), shape (base,).
-        tau: standard deviation between arms of each group's torque [N m or N].
+        tau: standard deviation between arms of the torque of each group's parameters (root mean square) [N m or N].
         mean: base parameters that are common, mu, shape (base,).
         covariance: of them, shape (base, base).
         variances: T, between arms, shape (base,).
@@ -176,32 +195,35 @@ def population(fits: Mapping[str, ArmFit], groups: Mapping[Group, Sequence[int]]
     member = np.zeros((len(groups), len(scale)), dtype=bool)
     for number, places in enumerate(groups.values()):
         member[number, list(places)] = True
+    share = member / np.maximum(member.sum(axis=1, keepdims=True), 1)  # the mean over a group, (groups, base)
     floor = (_LEAST * residual) ** 2
     spread = np.median(np.abs(beta - np.median(beta, axis=0)), axis=0) ** 2
-    tau2 = np.array([max(float(np.mean(spread[one])), floor) for one in member])
+    own = np.maximum(share @ spread, floor) @ member
     if len(arms) == 1:
-        tau2[:] = floor  # one arm says nothing of how far arms differ
+        own[:] = floor  # one arm says nothing of how far arms differ
     for _ in range(_ROUNDS if len(arms) > 1 else 0):
-        gained, expected = _moments(P, right, tau2 @ member, member)
-        seen = expected.sum(axis=0) > np.finfo(float).tiny
-        step = np.sqrt(np.where(seen, gained.sum(axis=0) / np.where(seen, expected.sum(axis=0), 1.0), 1.0))
-        before, tau2 = tau2, np.clip(tau2 * step, floor, None)
-        if np.max(np.abs(np.sqrt(tau2 / before) - 1.0)) < _SETTLED:
+        gained, expected = (part.sum(axis=0) for part in _moments(P, right, own))
+        before, own = own, np.maximum(own * np.sqrt(_ratio(gained, expected)), floor)
+        if np.max(np.abs(np.sqrt(own / before) - 1.0)) < _SETTLED:
             break
-    gained, expected = _moments(P, right, tau2 @ member, member)
-    # Without each arm by one step: an odd arm must not hide in the spread that it makes itself.
-    others = np.maximum(expected.sum(axis=0) - expected, np.finfo(float).tiny)
-    ratio = np.clip((gained.sum(axis=0) - gained) / others, 1e-6, 1.0) if len(arms) > 2 else np.ones_like(gained)
-    variances = tau2 @ member
+    gained, expected = _moments(P, right, own)
+    variances = _drawn_to_group(own, own, expected, share, member)
+    # Without each arm by one whole step: an odd arm must not hide in the spread that it makes itself.
+    without = np.tile(variances, (len(arms), 1))
+    for arm in range(len(arms) if len(arms) > 2 else 0):
+        others = np.delete(expected, arm, axis=0)
+        rest = own * _ratio(np.delete(gained, arm, axis=0).sum(axis=0), others.sum(axis=0))
+        found = _drawn_to_group(np.maximum(rest, floor), own, others, share, member)
+        without[arm] = np.minimum(found, variances)
     mean, covariance, *_ = _common(P, right, variances)
     return Population(
         arms=arms,
         scale=scale,
-        tau={group: float(np.sqrt(value)) for group, value in zip(groups, tau2, strict=True)},
+        tau={group: float(np.sqrt(value)) for group, value in zip(groups, share @ variances, strict=True)},
         mean=mean,
         covariance=covariance,
         variances=variances,
-        without=np.maximum(tau2 * ratio, floor) @ member,
+        without=without,
         precisions=P,
         right=right,
     )
@@ -235,12 +257,36 @@ def _common(P: Array, right: Array, variances: Array) -> tuple[Array, Array, Arr
     return np.asarray(covariance @ weighted.sum(axis=0)), covariance, np.asarray(M), np.asarray(weighted)
 
 
-def _moments(P: Array, right: Array, variances: Array, member: Array) -> tuple[Array, Array]:
-    """Return per arm and group |M r|^2 and its expectation tr(M) - tr(M C_mu M), shape (arms, groups) each."""
+def _moments(P: Array, right: Array, variances: Array) -> tuple[Array, Array]:
+    """Return per arm and parameter (M r)^2 and its expectation, of M - M C_mu M, shape (arms, base) each."""
     mean, covariance, M, weighted = _common(P, right, variances)
     off = weighted - M @ mean
     trace = np.einsum("akk->ak", M) - np.einsum("akj,ajk->ak", M @ covariance, M)
-    return off**2 @ member.T, trace @ member.T
+    return off**2, trace
+
+
+def _ratio(gained: Array, expected: Array) -> Array:
+    """Return the ratio of two sums; 1 where no arm knows anything."""
+    tiny = np.finfo(float).tiny
+    return np.asarray(np.where(expected > tiny, gained / np.maximum(expected, tiny), 1.0))
+
+
+def _drawn_to_group(own: Array, variances: Array, expected: Array, share: Array, member: Array) -> Array:
+    """Return variances of parameters drawn to those of their groups, the more the fewer arms know them, shape (base,).
+
+    Args:
+        own: to draw, shape (base,).
+        variances: T at which the expectation is.
+        expected: of (M r)^2, per arm and parameter, shape (arms, base).
+        share: that each parameter has in the mean of its group, shape (groups, base).
+        member: which parameters each group has, shape (groups, base).
+    """
+    size = (share @ own) @ member
+    # Arms that would show a variance of the usual size: 1 for one that knows the parameter, 0 where it does not.
+    shown = size * expected
+    told = np.sum(shown / np.maximum(1.0 + shown - variances * expected, 1e-3), axis=0) + np.finfo(float).eps
+    of_group = (share @ (told * own) / (share @ told)) @ member
+    return np.asarray((told * own + _GROUP_ARMS * of_group) / (told + _GROUP_ARMS))
 
 
 def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -> LeastSquares:
@@ -377,6 +423,11 @@ class Unlike:
     joint: int
     share: float
 
+    @property
+    def different(self) -> bool:
+        """Return whether the difference is significant and matters."""
+        return self.p < ALPHA and self.share >= RELEVANT_TORQUE
+
 
 @one_blas_thread()
 def unlike(
@@ -467,7 +518,7 @@ def variance_shares(rows: Mapping[str, Sequence[Row]], groups: Mapping[Group, Se
         arms = [pairs for pairs in arms if len(pairs)]
         if not arms:
             continue
-        between = _excess([pairs for pairs in arms if len(pairs) > 1])
+        between = _excess([pairs for pairs in arms if len(pairs) > 1], _SURE)
         means = np.array([_mean(pairs[:, 0], pairs[:, 1] + between) for pairs in arms])
         found[:, k] = _excess([means]), between, np.median(np.concatenate([pairs[:, 1] for pairs in arms]))
     return Shares(*found)
@@ -478,15 +529,22 @@ def _mean(values: Array, variances: Array) -> tuple[float, float]:
     return float(weights @ values / weights.sum()), float(1.0 / weights.sum())
 
 
-def _excess(sets: Sequence[Array]) -> float:
-    """Return the variance of values beyond their own, pooled over sets of (value, variance), by moments; at least 0."""
+def _excess(sets: Sequence[Array], sure: float = 0.0) -> float:
+    """Return the variance of values beyond their own, pooled over sets of (value, variance), by moments; at least 0.
+
+    Args:
+        sets: of values with their variances.
+        sure: deviations that the sum of squares must be above its expectation; else the variance is 0.
+    """
     excess = degrees = 0.0
+    count = 0
     for pairs in sets:
         weights = 1.0 / pairs[:, 1]
         total = weights.sum()
         excess += float(weights @ (pairs[:, 0] - weights @ pairs[:, 0] / total) ** 2) - (len(pairs) - 1)
         degrees += float(total - weights @ weights / total)
-    return max(excess / degrees, 0.0) if degrees > 0.0 else 0.0
+        count += len(pairs) - 1
+    return excess / degrees if degrees > 0.0 and excess > sure * np.sqrt(2.0 * count) else 0.0
 
 
 @dataclass(frozen=True)

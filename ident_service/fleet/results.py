@@ -16,19 +16,23 @@ import pyarrow.parquet as pq
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ident_service import __version__
-from ident_service.estimation.change_detection import ALPHA, RELEVANT_TORQUE
+from ident_service.estimation.change_detection import ALPHA
 from ident_service.estimation.uncertainty import verdicts
+from ident_service.fleet.arm_page import HEIGHT, WIDTH, ArmShown, multiples
+from ident_service.fleet.arm_page import PAGE as PAGE
 from ident_service.fleet.factor import Described
 from ident_service.fleet.population import Group, HeldOut, Population, Shares, Unlike
 from ident_service.fleet.reduction import FleetRequest, Recorded, Reduced
-from ident_service.fleet.trends import Change, Dependence, Scatter, series
+from ident_service.fleet.trends import Change, Compared, series
 from ident_service.model.chain import Array
 from ident_service.operations.drift_alarms import FLEET as FLEET
 
-PAGE, TABLE, PROBLEMS = "fleet.html", "parameters.parquet", "problems.json"
+TABLE, PROBLEMS = "parameters.parquet", "problems.json"
 FORMAT: Final = "ident-fleet"
 _ARMS_DRAWN = 12  # arms whose trends the page shows
 _GROUPS_DRAWN = 6  # of each
+_POINTS = 200  # of a small drawing
+_ALL_LISTED = 500  # recordings, beyond which a page lists those with something to tell
 _OF_TABLE = ("values", "standard_deviations", "verdicts", "negligible")  # of a summary, which the table has
 
 
@@ -43,10 +47,7 @@ class FleetResult:
         shares: where each parameter's variance comes from.
         several: errors on held-out recordings, of arms with several recordings as they are.
         single: the same of one recording of each.
-        odd: differences of arms from the others, every arm and group.
-        changes: most likely change of every arm and group.
-        dependences: on temperature and operating hours.
-        scatter: between recordings of one arm, per group.
+        compared: the tests of each arm against the others, and over time.
         document: the content of `fleet.json`.
     """
 
@@ -56,16 +57,13 @@ class FleetResult:
     shares: Shares
     several: HeldOut
     single: HeldOut
-    odd: list[Unlike]
-    changes: list[Change]
-    dependences: list[Dependence]
-    scatter: Mapping[Group, Scatter]
+    compared: Compared
     document: dict[str, Any]
 
     @property
     def changed(self) -> list[Change]:
         """Return the changes that are significant and matter."""
-        return [one for one in self.changes if one.changed]
+        return self.compared.changed
 
 
 Summaries = Mapping[str, Mapping[str, Any]]
@@ -102,12 +100,12 @@ def fleet_document(
     reduced, found, described = result.reduced, result.found, result.reduced.described
     base = described.base
     unlike_of: dict[str, list[Unlike]] = {arm: [] for arm in summaries}
-    for one in result.odd:
+    for one in result.compared.odd:
         unlike_of[one.arm].append(one)
     arms = {}
     for arm, recordings in reduced.arms.items():
         ranked = sorted(unlike_of[arm], key=lambda one: (one.p, -one.test.statistic))
-        differs = [one for one in ranked if one.p < ALPHA and one.share >= RELEVANT_TORQUE]
+        differs = [one for one in ranked if one.different]
         most = max(ranked, key=lambda one: one.share, default=None)
         arms[arm] = {
             "recordings": len(recordings),
@@ -161,7 +159,7 @@ def fleet_document(
             {
                 "name": group_name(group, described),
                 "deviation_between_arms_torque": value,
-                "recordings_factor": result.scatter[group].factor,
+                "recordings_factor": result.compared.scatter[group].factor,
             }
             for group, value in found.tau.items()
         ],
@@ -195,7 +193,7 @@ def fleet_document(
             }
             for one in sorted(result.changed, key=lambda one: (one.p, -one.statistic))
         ],
-        "tested": {"changes": len(result.changes), "unlike": len(result.odd), "alpha": ALPHA},
+        "tested": {"changes": len(result.compared.changes), "unlike": len(result.compared.odd), "alpha": ALPHA},
         "dependences": [
             {
                 "condition": one.condition,
@@ -206,7 +204,7 @@ def fleet_document(
                 "p": one.p,
                 "recordings": one.recordings,
             }
-            for one in result.dependences
+            for one in result.compared.dependences
         ],
         "software": f"ident-service {__version__}",
     }
@@ -282,10 +280,7 @@ def _of_recording(one: Recorded, summary: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-_WIDTH, _HEIGHT = 260.0, 96.0  # of a small drawing
-
-
-def _drawing(points: Array, common: float, change: Change | None) -> dict[str, Any]:
+def drawing(points: Array, common: float, change: Change | None) -> dict[str, Any]:
     """Return the coordinates of one small multiple: value with interval over time, the fleet's mean, a change."""
     low, high = float((points[:, 1] - points[:, 2]).min()), float((points[:, 1] + points[:, 2]).max())
     low, high = min(low, common), max(high, common)
@@ -293,10 +288,10 @@ def _drawing(points: Array, common: float, change: Change | None) -> dict[str, A
     room = (high - low) or 1.0
 
     def x(at: float) -> float:
-        return round(6.0 + (_WIDTH - 12.0) * ((at - first) / ((last - first) or 1.0)), 1)
+        return round(6.0 + (WIDTH - 12.0) * ((at - first) / ((last - first) or 1.0)), 1)
 
     def y(value: float) -> float:
-        return round(6.0 + (_HEIGHT - 12.0) * (1.0 - (value - low) / room), 1)
+        return round(6.0 + (HEIGHT - 12.0) * (1.0 - (value - low) / room), 1)
 
     return {
         "bars": [(x(at), y(value - half), y(value + half), y(value)) for at, value, half in points.tolist()],
@@ -311,27 +306,52 @@ def _drawing(points: Array, common: float, change: Change | None) -> dict[str, A
     }
 
 
-def _trends(result: FleetResult) -> list[dict[str, Any]]:
-    reduced, described = result.reduced, result.reduced.described
-    groups = described.groups
+def arm_trends(
+    arm: str, reduced: Reduced, compared: Compared, common: Array, most: int | None = None
+) -> list[dict[str, Any]]:
+    """Return the small multiples of one arm: of each group the parameter that moved most, the likeliest change first.
+
+    Args:
+        arm: name.
+        reduced: recordings.
+        compared: the tests over time.
+        common: base parameters that are common [SI], shape (base,).
+        most: number of groups; all when None.
+    """
+    described, groups = reduced.described, reduced.described.groups
     numbers = {group: number for number, group in enumerate(groups)}
+    of_arm = sorted(compared.changes_of(arm), key=lambda one: (one.p, -one.statistic))
+    figures = []
+    for one in of_arm[:most]:
+        index = int(np.argmax(np.abs(one.step) / np.maximum(one.deviations, np.finfo(float).tiny)))
+        place = groups[one.group][index]
+        points = series(reduced.arms[arm], place, numbers[one.group], index, compared.scatter[one.group])
+        thin = points[np.unique(np.linspace(0, len(points) - 1, min(len(points), _POINTS)).round().astype(int))]
+        what = f"{described.base.expressions[place]} [{described.base.units[place] or '-'}]"
+        title = group_name(one.group, described)
+        drawn = drawing(thin, float(common[place]), one if one.changed else None)
+        figures.append({"what": what, "title": title, "p": one.p, "changed": one.changed, **drawn})
+    return figures
+
+
+def shown_of(arm: str, reduced: Reduced, compared: Compared, common: Array) -> ArmShown:
+    """Return what the page of one arm shows besides its own estimate."""
+    rows = []
+    for one in reduced.arms[arm]:
+        row, when = one.row, _when(one.at)[:16].replace("T", " ")
+        rows.append((one.name, when, row.seconds, row.rate, row.error, "; ".join(row.warnings)))
+    told = rows if len(rows) <= _ALL_LISTED else [one for one in rows if one[-1]]
+    return ArmShown(arm, told, arm_trends(arm, reduced, compared, common))
+
+
+def _trends(result: FleetResult) -> list[dict[str, Any]]:
     changed = {one.arm for one in result.changed}
     order = sorted(result.document["ranking"], key=lambda arm: arm not in changed)[:_ARMS_DRAWN]
     drawn = []
     for arm in order:
-        of_arm = sorted((one for one in result.changes if one.arm == arm), key=lambda one: (one.p, -one.statistic))
-        figures = []
-        for one in of_arm[:_GROUPS_DRAWN]:
-            places = groups[one.group]
-            index = int(np.argmax(np.abs(one.step) / np.maximum(one.deviations, np.finfo(float).tiny)))
-            place = places[index]
-            points = series(reduced.arms[arm], place, numbers[one.group], index, result.scatter[one.group])
-            drawing = _drawing(points, float(result.found.common[place]), one if one.changed else None)
-            what = f"{described.base.expressions[place]} [{described.base.units[place] or '-'}]"
-            title = group_name(one.group, described)
-            figures.append({"what": what, "title": title, "p": one.p, "changed": one.changed, **drawing})
+        figures = arm_trends(arm, result.reduced, result.compared, result.found.common, _GROUPS_DRAWN)
         if figures:
-            drawn.append({"arm": arm, "figures": figures, "changed": arm in changed})
+            drawn.append({"arm": arm, "drawn": multiples(arm, figures), "changed": arm in changed})
     return drawn
 
 
@@ -353,7 +373,7 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
         for one in recordings
     ]
     # Of many recordings those that have something to tell; the table has all.
-    told = [one for one in qualities if one["words"]] if len(qualities) > 500 else qualities
+    told = [one for one in qualities if one["words"]] if len(qualities) > _ALL_LISTED else qualities
     return (
         _environment()
         .get_template("fleet.html")
@@ -364,8 +384,6 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
             qualities=told,
             recordings=len(qualities),
             patterns=request.patterns,
-            width=_WIDTH,
-            height=_HEIGHT,
             table=TABLE,
         )
     )

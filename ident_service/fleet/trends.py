@@ -28,8 +28,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from ident_service.estimation.change_detection import ALPHA, Kind, Motion, holm, probability, relevant
-from ident_service.fleet.factor import CONDITIONS
-from ident_service.fleet.population import ArmFit
+from ident_service.fleet.factor import CONDITIONS, Described
+from ident_service.fleet.population import ArmFit, Population, Unlike, unlike
 from ident_service.fleet.reduction import Recorded
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
@@ -321,6 +321,54 @@ def dependences(
                     every.append(Dependence(name, place, slope, deviation, p, total))
     corrected = holm([one.p for one in every])
     return [replace(one, p=p) for one, p in zip(every, corrected, strict=True)]
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Results of the tests over a fleet.
+
+    Attributes:
+        odd: differences of arms from the others, every arm and group.
+        changes: most likely change of every arm and group.
+        dependences: on temperature and operating hours.
+        scatter: between recordings of one arm, per group.
+    """
+
+    odd: list[Unlike]
+    changes: list[Change]
+    dependences: list[Dependence]
+    scatter: Mapping[Group, Scatter]
+
+    @property
+    def changed(self) -> list[Change]:
+        """Return the changes that are significant and matter."""
+        return [one for one in self.changes if one.changed]
+
+    def changes_of(self, arm: str) -> list[Change]:
+        """Return the most likely change of every group of an arm."""
+        return [one for one in self.changes if one.arm == arm]
+
+
+def compare_arms(
+    arms: Mapping[str, Sequence[Recorded]], fits: Mapping[str, ArmFit], found: Population, described: Described
+) -> Compared:
+    """Test every arm of a fleet against the others, and over time.
+
+    Args:
+        arms: recordings of each arm, by time.
+        fits: of each arm alone.
+        found: the common model.
+        described: the arms.
+    """
+    groups = described.groups
+    leading = tuple(described.base.names[column] for column in described.base.base)
+    scatter = scatter_of(arms, groups)
+    return Compared(
+        odd=unlike(fits, found, groups, leading),
+        changes=change_points(arms, fits, groups, scatter),
+        dependences=dependences(arms, groups, scatter),
+        scatter=scatter,
+    )
 
 
 def series(recordings: Sequence[Recorded], place: int, number: int, index: int, scatter: Scatter) -> Array:

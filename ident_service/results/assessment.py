@@ -281,6 +281,12 @@ def _prediction(content: Mapping[str, Any], joints: Sequence[JointAssessment]) -
     if still := [one for one in poor if not one.in_motion]:
         said = f"Off by more than {POOR:g} % of their own torque, near standstill only: {joints_in_words(still)}."
         found.append((1, said))
+    if not content.get("validation") and (held_out := content.get("fleet", {}).get("held_out_percent")) is not None:
+        whole = content["fit"]["relative_error_percent"]
+        said = f"torque error {_percent(held_out)}, {_percent(whole)} on the fitted"
+        if held_out > _SMALL and held_out > MUCH_WORSE * whole:
+            return [*found, (1, f"Predicts recordings held out markedly worse than the fitted ones: {said}.")]
+        return [*found, (0, f"Predicts recordings that were held out from an estimate of the others: {said}.")]
     if not content.get("validation"):
         return [*found, (1, "No motion but the fitted one was predicted; give a second recording with --validate.")]
     if generalises_poorly(content):

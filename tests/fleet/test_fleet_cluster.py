@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -159,6 +160,8 @@ def test_a_fleet_is_identified_and_the_changed_arm_found(fleet: Run, folder: Pat
     for one in answer["parameters"]:
         assert sum(one["variance_percent"].values()) == pytest.approx(100.0)
 
+    _require_pages(out, page)
+
     again, second = fleet(str(folder / "*" / "*.mcap"), out="again")
     assert again == 3
     assert bits(tmp_path / "again") == bits(out)
@@ -168,6 +171,27 @@ def test_a_fleet_is_identified_and_the_changed_arm_found(fleet: Run, folder: Pat
     assert told["factors"] == ARMS * RECORDINGS
     assert told["new"] == []
     assert told["arms"]["arm0"] == {"recordings": RECORDINGS, "reduced": RECORDINGS}
+
+
+def _require_pages(out: Path, page: str) -> None:
+    """Every arm has a page, which the fleet's links, with its recordings and trends; all links lead to files."""
+    for arm in range(ARMS):
+        place = out / "arms" / f"arm{arm}"
+        assert f'href="arms/arm{arm}/report.html"' in page
+        own = (place / "report.html").read_text()
+        assert "http" not in own.replace("http://www.w3.org", "")
+        assert all(f"week{week}.mcap" in own for week in range(RECORDINGS))
+        assert own.count("</svg>") >= 6
+        assert "friction of joint elbow" in own
+        assert "held out" in own
+        assert "--validate" not in own
+        for link in re.findall(r'href="([^"#]+)"', own):
+            assert (place / link).exists(), link
+        manifest = json.loads((place / "manifest.json").read_text())
+        assert "report.html" in json.dumps(manifest)
+        assert not (place / "evidence.json").exists()
+    for link in re.findall(r'href="([^"#]+)"', page):
+        assert (out / link).exists(), link
 
 
 def test_bad_recordings_are_named_and_the_others_go_on(fleet: Run, folder: Path, tmp_path: Path) -> None:

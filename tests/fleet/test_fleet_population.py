@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 from helpers.fleets import Kind, kind, write_recording
 
 from ident_service import __version__
+from ident_service.estimation.least_squares import ordinary_least_squares, torque_error
+from ident_service.estimation.uncertainty import Uncertainty
 from ident_service.fleet import identify
 from ident_service.fleet.factor import Described, Merged, Part, Row, Settled, merge_stored, reduce_recording, settle
 from ident_service.fleet.population import (
@@ -25,6 +28,7 @@ from ident_service.fleet.population import (
     variance_shares,
 )
 from ident_service.fleet.storage import Store, find
+from ident_service.model.information import Information, triangle
 
 ARMS, TOOL = 10, 7
 
@@ -111,6 +115,57 @@ def test_pooled_estimates_are_nearer_to_the_truth(
     alone = [far(fits[arm].fit.beta, arm) for arm in ordinary]
     pooled = [far(pooled_fit(fits[arm], found.other_arms(arm), found.scale).beta, arm) for arm in ordinary]
     assert np.sqrt(np.mean(np.square(pooled))) < np.sqrt(np.mean(np.square(alone)))
+
+
+def test_an_arms_precision_is_neither_too_large_nor_too_small(
+    fleet: dict[str, list[Row]], usual: Kind, truths: list[np.ndarray]
+) -> None:
+    """Also from one recording, whose dozen blocks say little of each parameter's variance by itself."""
+    squares = []
+    for arm, rows in fleet.items():
+        beta = usual.base.K @ truths[int(arm)]
+        for one in rows:
+            fit = arm_fit(merged(one), "wls")
+            off = fit.fit.beta - beta
+            squares.append(off @ fit.precision @ off / len(off))
+    assert 0.5 < np.mean(squares) < 2.5
+    assert max(squares) < 8.0
+
+
+def test_no_recording_is_sure_of_itself_by_chance(
+    fleet: dict[str, list[Row]], usual: Kind, truths: list[np.ndarray]
+) -> None:
+    """Offsets, of which a drive's friction has one, are what few blocks of a short motion are wrong about."""
+    numbers = {group: number for number, group in enumerate(DESCRIBED.groups)}
+    z = []
+    for arm, rows in fleet.items():
+        beta = usual.base.K @ truths[int(arm)]
+        for one in rows:
+            for group, places in DESCRIBED.groups.items():
+                covariance = one.covariances[numbers[group]]
+                off = (one.beta - beta)[list(places)]
+                z.append(off @ np.linalg.solve(covariance, off) / len(off))
+    assert np.quantile(z, 0.99) < 8.0
+    assert max(z) < 10.0
+
+
+def test_a_parameter_that_all_arms_share_does_not_hide_how_they_differ_in_others_of_its_group() -> None:
+    """The first is the same in all arms and known well; the second is known to little less than it differs."""
+    rng, size, arms, spread = np.random.default_rng(4), 3, 40, 0.08
+    rows = rng.standard_normal((400, size))
+    R = triangle(np.column_stack([rows, rows @ np.ones(size) + 0.05 * rng.standard_normal(400)]))
+    total = Information((np.arange(size),), (R,), np.array([400]), size)
+    usual_fit = ordinary_least_squares(total)
+    error, doubt = torque_error(total, usual_fit.beta), np.array([0.004, 0.05, 0.02])
+    nothing = Uncertainty(np.diag(doubt**2), doubt, np.full(size, 50.0))
+    fits = {}
+    for arm in range(arms):
+        beta = 1.0 + np.array([0.0, spread, 0.02]) * rng.standard_normal(size) + doubt * rng.standard_normal(size)
+        fit = replace(usual_fit, beta=beta)
+        fits[str(arm)] = ArmFit(fit, nothing, 12, np.diag(doubt**-2.0), total, error)
+    found = population(fits, {("first moments", 1): (0, 1), ("friction", 1): (2,)})
+    assert 0.6 * spread < found.between[1] < 1.6 * spread
+    assert found.between[0] < 0.5 * spread
 
 
 def test_with_much_data_an_arm_stays_itself(fits: dict[str, ArmFit], found: Population) -> None:

@@ -14,6 +14,7 @@ Memory does not grow with a recording: what is kept of it is an envelope, averag
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -508,7 +509,35 @@ def gather_evidence(
                 postures.add(rows.position)
         traced.append(seen.traced(recording, role))
         times.append(timing(recording))
-    kind = estimate.conditions.kind
+    fitted_inside = f"FBPE-{estimate.method.upper()} {estimate.conditions.kind}"
+    constrained = [one.name for one in estimate.candidates].index(fitted_inside)
+    shown = posed(estimate.model, estimate.delta, postures.rows())
+    own = _evidence(estimate, parameters_sha256, constrained, shown)
+    return replace(
+        own,
+        recordings=tuple(traced),
+        friction=friction.found(),
+        timing=tuple(times),
+        warnings=tuple(warnings),
+    )
+
+
+def evidence_without_samples(estimate: Estimate, parameters_sha256: str) -> Evidence:
+    """Return what a report can show of an estimate whose recordings are gone but for their information.
+
+    That is no trace, spectrum, friction curve or timing; bodies stand in the middle of the joints' ranges.
+
+    Args:
+        estimate: to show.
+        parameters_sha256: of the parameter file that holds the estimate.
+    """
+    limits = [estimate.model.config.joints[name].position for name in estimate.model.chain.names]
+    middle = np.array([[0.0 if ends is None else 0.5 * (ends[0] + ends[1]) for ends in limits]])
+    return _evidence(estimate, parameters_sha256, estimate.chosen, posed(estimate.model, estimate.delta, middle))
+
+
+def _evidence(estimate: Estimate, parameters_sha256: str, constrained: int, shown: PosedArm | None) -> Evidence:
+    """Return what an estimate shows without its recordings; `constrained` is the number of a candidate."""
     estimates = _estimates(estimate)
     offset = len(estimates) - len(estimate.candidates)
     return Evidence(
@@ -517,15 +546,15 @@ def gather_evidence(
         revolute=estimate.model.chain.revolute,
         estimates=estimates,
         unconstrained=offset,
-        constrained=[one.name for one in estimates].index(f"FBPE-{estimate.method.upper()} {kind}"),
+        constrained=offset + constrained,
         chosen=offset + estimate.chosen,
         bounds=bounds_of(estimate.tight, estimate.conditions, estimate.base),
-        recordings=tuple(traced),
-        friction=friction.found(),
+        recordings=(),
+        friction=(),
         conditions=conditions_of(estimate),
-        posed=posed(estimate.model, estimate.delta, postures.rows()),
-        timing=tuple(times),
-        warnings=tuple(warnings),
+        posed=shown,
+        timing=(),
+        warnings=(),
     )
 
 

@@ -600,7 +600,8 @@ def body_figures(evidence: Evidence) -> list[Figure]:
     """Return the arm from the side and from above; none where there are no link parameters."""
     if evidence.posed is None:
         return []
-    return [_bodies_figure(evidence.joints, evidence.posed, name, view) for name, view in _VIEWS]
+    where = "in one posture of the recordings" if evidence.recordings else "in the middle of the joints' ranges"
+    return [_bodies_figure(evidence.joints, evidence.posed, name, view, where) for name, view in _VIEWS]
 
 
 def ellipse(axes: Array, view: tuple[int, int]) -> Array:
@@ -638,7 +639,7 @@ def _shown(posed: PosedArm) -> _Shown:
     return _Shown(drawn, placed, _LARGEST * extent)
 
 
-def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tuple[int, int]) -> Figure:
+def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tuple[int, int], where: str) -> Figure:
     i, j = view
     shown = _shown(posed)
     outlines = [
@@ -686,7 +687,7 @@ def _bodies_figure(joints: tuple[str, ...], posed: PosedArm, name: str, view: tu
         slug=f"bodies-{name}",
         title=f"The arm and the ellipsoids of its links, from {seen}",
         description=_words(joints, posed, shown),
-        caption=f"From {seen}, in one posture of the recordings.",
+        caption=f"From {seen}, {where}.",
         canvas=canvas,
     )
 
