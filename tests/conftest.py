@@ -31,7 +31,9 @@ _ALLOWED = (
     "`make test-foreign` runs it",
 )
 
-settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True)
+# A part of hypothesis' usual hundred examples; `make campaign` has a thousand, wherever a test says no number.
+settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=40)
+settings.register_profile("campaign", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("default")
 
 

@@ -21,7 +21,7 @@ from ident_service.model.base_parameters import base_parameters
 from ident_service.model.regressor import joint_regressor
 
 Array = np.ndarray
-RATE, KP, KD = 500.0, 900.0, 60.0
+RATE, KP, KD = 250.0, 225.0, 30.0
 GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "motors"}
 
 
