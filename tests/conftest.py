@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Generator, Iterator
@@ -35,6 +36,16 @@ _ALLOWED = (
 settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=40)
 settings.register_profile("campaign", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("default")
+
+
+def pytest_collection() -> None:
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Take the collected tests off the garbage collector, which else walks them all and leaves runs lying for long."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)
