@@ -282,6 +282,7 @@ def test_an_existing_run_folder_is_not_touched_by_simulate(place: Path, quick: C
     assert (folder / "mine").read_text() == "keep"
 
 
+@pytest.mark.slow
 def test_identify_replaces_an_earlier_result_and_nothing_else(place: Path, quick: Commissioned, ident: Ident) -> None:
     folder = place / "out"
     folder.mkdir()
@@ -355,6 +356,7 @@ def test_a_broken_urdf_has_a_place(place: Path, ident: Ident, verb: str) -> None
     refused(place, ident, words, 2, f"{arm}:4:1: kinematics: broken.urdf: not a URDF that can be read")
 
 
+@pytest.mark.slow
 def test_a_motion_that_does_not_fit_is_named(place: Path, quick: Commissioned, ident: Ident) -> None:
     motion = place / "tuesday.json"
     motion.write_text((quick.folder / "validation.excitation.json").read_text().replace('"sha256": "', '"sha256": "0'))

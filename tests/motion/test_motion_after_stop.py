@@ -325,6 +325,7 @@ def led(rig: Rig, **leader: Any) -> Leader:
     return controls
 
 
+@pytest.mark.slow
 def test_a_held_arm_is_led_home_and_held_there() -> None:
     rig = Rig(on_a_table())
     assert led(rig).stages == [Homing.GOING, Homing.ENDED]
@@ -345,6 +346,7 @@ def test_the_way_home_of_a_held_arm_can_be_stopped_and_is_held_again() -> None:
     assert rig.arm.stops == [StopKind.TORQUE_OFF]
 
 
+@pytest.mark.slow
 def test_an_arm_that_was_stopped_for_a_lost_lease_is_led_home_and_the_fault_stays() -> None:
     rig = Rig(on_a_table())
     with pytest.raises(ArmFault, match="lease_lost"):
@@ -391,6 +393,7 @@ def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(
     os.close(ours)
 
 
+@pytest.mark.slow
 def test_a_run_ends_where_it_was_supported() -> None:
     rig = Rig(loose("hold"))
     assert rig.run(stop=10**9).state is State.DONE
