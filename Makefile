@@ -95,6 +95,7 @@ bench-fleet: $(READY)
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
 campaign: test-socketcan
 	$(BIN)/pytest -m campaign --timeout 7200
+	$(TESTS) -m "not campaign and not realtime" --hypothesis-profile campaign --timeout 7200
 
 # Slips in the code that guards people, one at a time in a copy of the checkout: each must fail one of its quick tests.
 mutants: $(VENV)/.mutants

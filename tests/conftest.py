@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Generator, Iterator
@@ -31,8 +32,20 @@ _ALLOWED = (
     "`make test-foreign` runs it",
 )
 
-settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True)
+# A part of hypothesis' usual hundred examples; `make campaign` has a thousand, wherever a test says no number.
+settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=40)
+settings.register_profile("campaign", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("default")
+
+
+def pytest_collection() -> None:
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """Take the collected tests off the garbage collector, which else walks them all and leaves runs lying for long."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -199,15 +199,14 @@ def static_base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
 
 def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array, Array]:
     """Return the first independent columns from the left, their independence, and K_d of the others (eq. 32)."""
-    import scipy.linalg  # loads for 0.2 s, and no process that moves an arm needs it
-
     base, independence = _independent_columns(H)
     norms = np.linalg.norm(H, axis=0)
     dependent = np.setdiff1d(np.arange(H.shape[1]), base)
     H_b = H[:, base] / norms[base]
     q, r = np.linalg.qr(H_b)
-    K_d = scipy.linalg.solve_triangular(r, q.T @ H[:, dependent])
-    K_d += scipy.linalg.solve_triangular(r, q.T @ (H[:, dependent] - H_b @ K_d))
+    # r is triangular, but scipy's solver for that takes 0.2 s to load, and every look at a description needs this.
+    K_d = np.linalg.solve(r, q.T @ H[:, dependent])
+    K_d += np.linalg.solve(r, q.T @ (H[:, dependent] - H_b @ K_d))
     K_d /= norms[base][:, None]
     K_d[:, norms[dependent] <= _RANK_TOLERANCE * norms.max()] = 0.0
     return base, independence, _round_digits(K_d)
@@ -228,7 +227,7 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
     Raises:
         ParameterError: no expressions, or ones that do not parse, use foreign names, or depend on each other.
     """
-    import scipy.linalg
+    import scipy.linalg  # loads for 0.2 s, and few tables come without an arm
 
     if not expressions:
         raise ParameterError("no expressions: a table of base parameters has at least one")

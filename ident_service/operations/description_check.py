@@ -18,7 +18,6 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.motion.arm_factory import GROUP
-from ident_service.operations.fieldbus import bus_lines, cut_sheets, require_budget
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
 _NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a mechanism begins with
@@ -83,8 +82,8 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         raise config_error(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         _require_names(arm, model, config, where)
-    budget = require_budget(arm, model.config)
-    warnings = (*cut_sheets(config), *remarks_on_angles(base_parameters(model.chain, model.layout)))
+    budget, cut_off = _bus(arm, config)
+    warnings = (*cut_off, *remarks_on_angles(base_parameters(model.chain, model.layout)))
     if missing := _missing(arm, model):
         checked = CheckedDescription(model, budget, None, None, warnings=warnings)
         # An arm without a driver is identified from recordings, and needs none of them.
@@ -121,6 +120,15 @@ def _missing(arm: str | Path, model: ArmModel) -> tuple[Problem, ...]:
             what = f"joints.{name}: a motion needs {', '.join(lacking)}"
             found.append(located(arm, ("joints", name), f"{what}; `ident new` guesses them from a mechanism"))
     return tuple(found)
+
+
+def _bus(arm: str | Path, config: ArmConfig) -> tuple[Budget | None, tuple[str, ...]]:
+    """Return the budget of the arm's buses, which must fit, and warnings of data sheets; none without drives on CAN."""
+    if not config.can_buses:
+        return None, ()
+    from ident_service.operations.fieldbus import cut_sheets, require_budget  # loads the CAN stack for 0.1 s
+
+    return require_budget(arm, config), tuple(cut_sheets(config))
 
 
 def _require_driver(arm: str | Path, config: ArmConfig) -> None:
@@ -206,7 +214,10 @@ def description_text(arm: str, checked: CheckedDescription) -> str:
         unknown = "; no prior, so no model has it" if model.prior is None else ""
         head += f"payload: {payload.words}{unknown}\n"
     head += "".join(f"WARNING: {line}\n" for line in checked.warnings)
-    head += "" if checked.budget is None else bus_lines(checked.budget)
+    if checked.budget is not None:
+        from ident_service.operations.fieldbus import bus_lines
+
+        head += bus_lines(checked.budget)
     if checked.gains is None:
         return head + "gains: not checked, because limits or gains are missing\n"
     return head + _after_stop_text(checked) + _gains_text(checked.gains)

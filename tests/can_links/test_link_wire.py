@@ -143,6 +143,7 @@ def test_a_socket_file_is_its_owners_alone_and_does_not_outlive_its_wire_in_the_
     assert path.read_text() == "not a socket"
 
 
+@pytest.mark.slow
 def test_a_wire_that_is_killed_is_gone_and_another_one_takes_its_place(name: str) -> None:
     with process("-m", "sim_backend.can_bus", name) as child:
         link = end_of(name)

@@ -161,6 +161,7 @@ def test_the_bus_carries_positions_and_torques_of_each_drive() -> None:
     assert lines["positions"] == 6  # and the torque that the drive measures
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
 @pytest.mark.parametrize("name", ["maxon_epos4_50-5_0170h.eds", "elmo_gold_V002.dcf", "e35.eds"])
 def test_makers_drives_with_that_mode_follow_positions(name: str) -> None:

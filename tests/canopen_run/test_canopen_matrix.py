@@ -28,7 +28,10 @@ OWN = {
     "maxon_epos2_50-5_2126h.eds": {"rated_torque": 0.2, "torque_constant": 0.2},
     "elmo_gold_V002.dcf": {"torque_constant": 0.1},
 }
-pytestmark = pytest.mark.skipif(not FILES, reason="the makers' data sheets are not beside this checkout")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not FILES, reason="the makers' data sheets are not beside this checkout"),
+]
 
 
 def arm_of(name: str) -> dict[str, Any]:
@@ -56,7 +59,6 @@ def test_every_file_is_in_the_matrix() -> None:
 WHOLE = [pytest.param(name, marks=[] if name in OWN else [pytest.mark.campaign]) for name in CAPABLE]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", WHOLE)
 def test_a_drive_with_a_torque_mode_is_commissioned(name: str, tmp_path: Path) -> None:
     arm, state = write(tmp_path, arm_of(name)), tmp_path / "state"

@@ -19,6 +19,8 @@ from ident_service.model.base_parameters import base_parameters
 from ident_service.recordings.open import open_recording
 from sim_backend.emulator.lock_step import LockStepArm
 
+pytestmark = pytest.mark.slow  # whole runs
+
 RATE = 250.0
 SHEETS = Path(__file__).parents[3] / "shared" / "data" / "eds"
 
@@ -47,7 +49,6 @@ def of_makers(name: str) -> dict[str, Any]:
     return tree
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("make", [pytest.param(positions, marks=pytest.mark.campaign), of_makers])
 def test_an_arm_is_checked_moved_and_identified_from_the_torque_that_its_drives_measure(
     make: Any, tmp_path: Path

@@ -35,7 +35,13 @@ def emulated_arm(folder: Path) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [simulated_arm, emulated_arm], ids=["simulated", "emulated"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        pytest.param(simulated_arm, marks=pytest.mark.campaign, id="simulated"),
+        pytest.param(emulated_arm, id="emulated"),
+    ],
+)
 def test_it_is_checked_moved_and_its_drives_parameters_are_found(make: Any, tmp_path: Path) -> None:
     arm, state, run, out = make(tmp_path), tmp_path / "state", tmp_path / "run", tmp_path / "out"
     assert checked(arm, "coupled", state)

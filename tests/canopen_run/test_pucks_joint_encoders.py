@@ -21,6 +21,8 @@ from ident_service.recordings.mcap_reader import McapRecording
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 
+pytestmark = pytest.mark.slow  # whole runs
+
 RATE = 250.0
 SLIPS = 3.0  # s from the first request
 

@@ -24,6 +24,8 @@ from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.trajectory import Setpoint
 from sim_backend.emulator.lock_step import LockStepArm
 
+pytestmark = pytest.mark.slow  # whole runs
+
 SECONDS = 1.2
 SWINGS = np.array([0.3, 0.35, -0.3, 0.3, 0.4, -0.35, 0.5])  # rad
 

@@ -31,6 +31,8 @@ from ident_service.operations.recordings import known_payloads, open_together
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 
+pytestmark = pytest.mark.slow  # whole runs
+
 LOCK_STEP = {"interface": "lock_step", "channel": "constants"}
 RATE, KP, KD = 250.0, 225.0, 30.0
 GIVEN = (0.95, 0.88)  # of the torque that each motor is told

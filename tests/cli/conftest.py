@@ -117,7 +117,7 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Commissioned:
     """The small arm, commissioned by the command; not to be changed."""
 
     def make(folder: Path) -> None:
-        arm = quick_arm(folder)
+        arm = quick_arm(folder, *COARSE)
         out = io.StringIO()
         with contextlib.redirect_stdout(out):
             code = run_main("simulate", arm, "--out", folder / "run")
@@ -151,4 +151,4 @@ def samples(quick: Commissioned) -> Samples:
     stamps, position, torque = (
         np.concatenate([getattr(block, name) for block in blocks]) for name in ("stamp_ns", "position", "torque")
     )
-    return Samples(np.arange(len(stamps)) * 1e-3, position, torque)
+    return Samples((stamps - stamps[0]) * 1e-9, position, torque)

@@ -75,8 +75,8 @@ def test_version(ident: Ident) -> None:
 
 @pytest.fixture
 def short(samples: Samples, tmp_path: Path) -> Path:
-    """A recording of a tenth of the samples, where the folder is of interest and not what is found."""
-    return Samples(samples.time[::10], samples.position[::10], samples.torque[::10]).write(tmp_path / "short.csv")
+    """A recording of half the samples, where the folder is of interest and not what is found."""
+    return Samples(samples.time[::2], samples.position[::2], samples.torque[::2]).write(tmp_path / "short.csv")
 
 
 @pytest.mark.slow

@@ -61,6 +61,7 @@ def test_design_keeps_motion_search_preview_and_drawings(designed: DesignedBefor
         assert ET.fromstring((designed.folder / name).read_text()).tag.endswith("svg")  # noqa: S314
 
 
+@pytest.mark.campaign  # excitation/test_design.py shows it of the function
 def test_a_search_bounded_by_starts_repeats(designed: DesignedBefore, tmp_path: Path, ident: Ident) -> None:
     assert ident("design", designed.arm, *QUICK, "--out", tmp_path / "again").code == 0
     first, second = (read(folder / "motion.json") for folder in (designed.folder, tmp_path / "again"))

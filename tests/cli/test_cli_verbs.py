@@ -284,6 +284,7 @@ def test_gains_that_are_too_high_are_a_no(ident: Ident, tmp_path: Path) -> None:
     assert document["stability"]["joints"][0]["gain_margin"] == pytest.approx(15.56 / 12.0, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_more_delay_in_the_driver_is_more_delay_in_the_check(ident: Ident, tmp_path: Path) -> None:
     late = quick_arm(tmp_path, ("delay_cycles: 1", "delay_cycles: 20"))
     ended = ident("config", "check", late)

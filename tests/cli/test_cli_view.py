@@ -70,6 +70,7 @@ def saved(quick: Commissioned, tmp_path_factory: pytest.TempPathFactory) -> dict
     return columns(path)
 
 
+@pytest.mark.slow
 def test_the_arm_stands_where_its_joints_were_measured(quick: Commissioned, saved: dict[str, dict[str, Any]]) -> None:
     model = arm_model(arm_from_json(quick.folder / "arm.json"))
     blocks = list(open_recording(quick.folder / "validation.mcap", model.chain.names).blocks())

@@ -170,7 +170,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("arm", ["threelink", "table", *(pytest.param(one, marks=LONG) for one in ("ur10", "mjcf"))])
+@pytest.mark.parametrize("arm", ["table", *(pytest.param(one, marks=LONG) for one in ("threelink", "ur10", "mjcf"))])
 def test_urdf_mjcf_and_table_simulate_without_an_edit(
     arm: str, made: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

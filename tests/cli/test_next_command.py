@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cli.conftest import Commissioned, Ident, quick_arm
+from cli.conftest import COARSE, Commissioned, Ident, quick_arm
 from helpers.tickets import write_checked_ticket
 
 from ident_service.cli import parser
@@ -182,7 +182,7 @@ def test_the_named_commands_run_one_after_the_other(
 
 @pytest.mark.slow
 def test_a_motion_is_followed_by_the_identification_of_its_recording(ident: Ident, state: Path, tmp_path: Path) -> None:
-    arm = quick_arm(tmp_path)
+    arm = quick_arm(tmp_path, *COARSE)
     refused = ident("run", arm)
     assert (refused.code, refused.next) == (3, ["preflight", str(arm)])
     state.mkdir(mode=0o700, exist_ok=True)

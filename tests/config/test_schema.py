@@ -43,11 +43,13 @@ def is_number(part: dict[str, Any], schema: dict[str, Any]) -> bool:
     return part.get("type") in ("number", "integer") or any(is_number(one, schema) for one in inside)
 
 
+@pytest.mark.slow
 def test_the_published_files_are_those_of_the_models(schema: dict[str, Any]) -> None:
     assert json.loads(arm_schema_file().read_text()) == schema, RENEW
     assert (ROOT / "docs" / "reference-description.md").read_text() == reference(), RENEW
 
 
+@pytest.mark.slow
 def test_the_command_that_the_page_names_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = [arm_schema_file(), ROOT / "docs" / "reference-description.md"]
     files = [tmp_path / "schema.json", tmp_path / "page.md"]
@@ -75,6 +77,7 @@ def test_every_key_says_what_it_is_in_which_unit_and_what_counts_without_it(sche
     assert without - sections == {("", "extends")}
 
 
+@pytest.mark.slow
 def test_no_link_of_the_reference_is_dead_and_no_heading_stands_twice() -> None:
     lines = reference().splitlines()
     titles = [line.removeprefix("## ") for line in lines if line.startswith("## ")]

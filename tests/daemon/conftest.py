@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager, contextmanager
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 import httpx
@@ -24,6 +24,7 @@ from ident_service.daemon.dependencies import Service
 from ident_service.daemon.settings import Settings
 from ident_service.operations.commissioning import simulate
 from ident_service.registry import jobs as rows
+from ident_service.registry.arms import add_arm
 from ident_service.registry.tokens import add_token
 
 Until = Callable[[dict[str, Any]], bool]
@@ -135,6 +136,12 @@ def daemon(state: Path) -> Iterator[Asked]:
     """A service, asked as its owner, who is an operator."""
     with serving(state) as asked:
         yield asked
+
+
+def known_arm(daemon: Asked, text: str, files: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Add an arm as an upload does, without the process that judges a stranger's description; return its name."""
+    service = daemon.service
+    return add_arm(service.db, service.state, text, files, "owner", replace=True).name
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from daemon.conftest import Asked, checked_before, patient_text, quick_text, serving
+from daemon.conftest import Asked, checked_before, known_arm, patient_text, quick_text, serving
 from daemon.verbs_bench import with_run
 
 from ident_service.daemon.dependencies import Service
@@ -29,11 +29,8 @@ ARM = "quick"
 
 @pytest.fixture
 def arm(daemon: Asked) -> str:
-    """An arm that was uploaded."""
-    answer = daemon.post("/api/v1/arms", {"description": quick_text(ARM)})
-    assert answer.status_code == 201, answer.text
-    assert answer.json()["name"] == ARM
-    return ARM
+    """The small arm, known."""
+    return known_arm(daemon, quick_text(ARM))
 
 
 def run_of(daemon: Asked, kind: str = "simulate") -> str:
@@ -46,9 +43,8 @@ def run_of(daemon: Asked, kind: str = "simulate") -> str:
 @pytest.fixture
 def patient(daemon: Asked) -> str:
     """The same arm with a motion of twenty minutes of its own time, and a ticket for it."""
-    assert daemon.post("/api/v1/arms", {"description": patient_text(ARM), "replace": True}).status_code == 201
     checked_before(daemon.service.state, patient_text(ARM))
-    return ARM
+    return known_arm(daemon, patient_text(ARM))
 
 
 @pytest.mark.timeout(300)
@@ -116,9 +112,10 @@ def test_a_job_whose_arm_is_held_shows_no_progress(state: Path, held: bool) -> N
 
 
 @pytest.mark.timeout(300)
-def test_from_an_upload_to_accepted_parameters_and_back(
-    daemon: Asked, arm: str, state: Path, commissioned: Path
-) -> None:
+def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, state: Path, commissioned: Path) -> None:
+    answer = daemon.post("/api/v1/arms", {"description": quick_text(ARM)})
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["name"] == ARM
     runs = [run_of(daemon), with_run(daemon, state, commissioned)]
     current = state / "arms" / ARM / "current" / "parameters.json"
     assert not current.exists()
@@ -217,7 +214,7 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
     factor = 0.5 if how == "silence" else 15.0
     checked_before(state, patient_text(ARM))
     with serving(state, lease_factor=factor) as daemon:
-        daemon.post("/api/v1/arms", {"description": patient_text(ARM)})
+        known_arm(daemon, patient_text(ARM))
         job = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
         if how != "silence":
             daemon.follow(job["id"], lease=True, until=lambda _: in_use(control_path(state, ARM)))
@@ -254,7 +251,7 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
 def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
     with serving(state) as daemon:
         for name in (ARM, "other"):
-            daemon.post("/api/v1/arms", {"description": quick_text(name)})
+            known_arm(daemon, quick_text(name))
         db = daemon.service.db
         asked = [daemon.begin({"kind": "check", "arm": name}, confirmed=True)["id"] for name in (ARM, ARM, "other")]
         # The registry tells when each began and ended, which somebody who looks now and then may miss.

@@ -126,7 +126,7 @@ def kill_once(state: Path, seed: int) -> str:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("seed", [1, 5, 8])
+@pytest.mark.parametrize("seed", [1, 5, pytest.param(8, marks=pytest.mark.campaign)])
 def test_a_daemon_that_is_killed(state: Path, seed: int) -> None:
     assert kill_once(state, seed)
 

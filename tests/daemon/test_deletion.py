@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon.conftest import Asked, quick_text, serving
+from daemon.conftest import Asked, known_arm, quick_text, serving
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
@@ -30,7 +30,7 @@ FIRST, SECOND, THIRD = (f"2026010{day}T000000Z-quick" for day in (1, 2, 3))
 def filled(daemon: Asked, commissioned: Path) -> Asked:
     """A service with the arm `quick`, two runs and a motion of it."""
     db, state = daemon.service.db, daemon.service.state
-    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    known_arm(daemon, quick_text())
     for run in (FIRST, SECOND):
         shutil.copytree(commissioned, state / "runs" / run)
         index_run(db, state, run)
@@ -202,7 +202,7 @@ def test_a_deletion_that_the_registry_has_no_room_for_changes_nothing(
     filled: Asked, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state = filled.service.state
-    assert filled.post("/api/v1/arms", {"description": quick_text("other")}).status_code == 201
+    known_arm(filled, quick_text("other"))
     described = [path.name for path in (state / "descriptions").iterdir()]
     (state / "arms" / "other").mkdir(parents=True)
 

@@ -66,6 +66,7 @@ def test_every_command_is_understood() -> None:
     assert {words[0] for words in found} >= {"serve", "backup", "restore", "tokens", "runs", "prune", "stop"}
 
 
+@pytest.mark.slow
 def test_every_request_file_and_target_is_there(daemon: Asked) -> None:
     known = [re.sub(r"\{\w+\}", "*", path) for path in daemon.get("/api/v1/openapi.json").json()["paths"]]
     patterns = [re.compile(re.escape(path).replace(r"\*", "[^/]+") + "$") for path in [*known, "/api/v1/openapi.json"]]

@@ -15,7 +15,7 @@ from urllib.parse import quote, urlsplit
 
 import httpx
 import pytest
-from daemon.conftest import URL, Asked, quick_text, serving
+from daemon.conftest import URL, Asked, known_arm, quick_text, serving
 from daemon.served import daemon_process
 from daemon.test_connections import FAR, NEAR, Book
 from daemon.test_uploads import TABLE, announced, sent
@@ -312,7 +312,7 @@ def _watched(client: IdentClient, told: list[str]) -> bool:
 
 def test_an_arm_that_was_deleted_stands_nowhere(daemon: Asked, state: Path) -> None:
     watch = daemon.app.state.watch
-    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    known_arm(daemon, quick_text())
     for name in ("quick", ".quick.deleted"):  # a folder that is being removed is no arm
         (state / "arms" / name).mkdir(parents=True)
 
@@ -364,7 +364,7 @@ def test_a_recording_that_is_deleted_while_it_is_completed_is_unknown(
 
 
 def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    known_arm(daemon, quick_text())
     know, adding = deletion.know_shipped, list[threading.Thread]()
 
     def meanwhile(db: Database) -> None:
@@ -389,7 +389,7 @@ def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkey
 
 
 def test_an_arm_that_is_deleted_while_it_is_read_is_unknown(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    known_arm(daemon, quick_text())
     load = arms.load_arm
 
     def meanwhile(path: Path) -> Any:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon.conftest import Asked, quick_text
+from daemon.conftest import Asked, known_arm, quick_text
 from daemon.served import daemon_process
 from helpers.forks import fork
 
@@ -142,7 +142,7 @@ def test_a_disk_that_is_full_at_the_end_costs_the_upload_and_no_more(
 
 
 def test_a_recording_whose_arm_is_deleted_meanwhile_is_no_run(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert daemon.post("/api/v1/arms", {"description": quick_text()}).status_code == 201
+    known_arm(daemon, quick_text())
     upload = daemon.post("/api/v1/uploads", announced(TABLE, arm="quick")).json()["id"]
     sent(daemon, upload, 0, TABLE)
     whole = uploads.write_manifest

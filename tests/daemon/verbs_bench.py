@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from daemon.conftest import Asked, quick_text
+from daemon.conftest import Asked, known_arm, quick_text
 
 from ident_service.config.load import shipped_arms
 from ident_service.operations.run_archive import import_run
@@ -48,9 +48,9 @@ def unstable_text() -> str:
 
 def with_arms(daemon: Asked) -> None:
     """`quick` and the arm on a bus are known."""
-    for body in ({"description": quick_text()}, on_a_bus()):
-        answer = daemon.post("/api/v1/arms", body)
-        assert answer.status_code == 201, answer.text
+    known_arm(daemon, quick_text())
+    bus = on_a_bus()
+    known_arm(daemon, bus["description"], bus["files"])
 
 
 def with_run(daemon: Asked, state: Path, commissioned: Path) -> str:

@@ -1,6 +1,6 @@
 """Do what a newcomer does: run the commands of documents, as they stand there, in a new folder.
 
-    python tests/documents/walk.py README.md docs/tutorial.md     with this checkout's environment, on a quicker arm
+    python tests/documents/walk.py README.md docs/tutorial.md     with this checkout's environment, on quicker arms
     python tests/documents/walk.py --clean README.md ...          in a clean clone with an environment of its own
 
 A page is a script. Blocks of `sh` and Python are run in their order. A block whose first line is a comment with the
@@ -116,12 +116,19 @@ def quicker(text: str) -> str:
 
 
 def shipped_copy(folder: Path, *, quick: bool) -> Path:
-    """Copy what is shipped, compiled files included, with a quicker `planar2` or as it is; return where it is."""
+    """Copy what is shipped, compiled files included, as it is or with quicker arms; return where it is.
+
+    Quicker are `planar2` and what `ident new` writes, whose rate is halved.
+    """
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package)
-    arm = folder / "configs" / "planar2.yaml"
+    arm, new = folder / "configs" / "planar2.yaml", folder / "ident_service" / "operations" / "new_description.py"
     if quick:
         arm.write_text(quicker(arm.read_text(encoding="utf-8")), encoding="utf-8")
+        text, changed = re.subn(r"(?m)^RATE = 500\.0 ", "RATE = 250.0 ", new.read_text(encoding="utf-8"))
+        if changed != 1:
+            raise ValueError(f"{new.name} has no rate of 500 Hz any more")
+        new.write_text(text, encoding="utf-8")
     return folder
 
 
@@ -198,8 +205,8 @@ def walk(
     Args:
         pages: in the order in which they are read.
         folder: where everything is made.
-        clean: in a clean clone with an environment of its own, instead of this one with a quicker arm.
-        quick: whether `planar2` is a quicker one, and not as it is shipped.
+        clean: in a clean clone with an environment of its own, instead of this one with quicker arms.
+        quick: whether arms are quicker ones, and not as they are shipped.
         quiet: whether the output is kept for the caller, instead of being shown.
 
     Returns:

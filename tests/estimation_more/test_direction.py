@@ -31,6 +31,7 @@ def first_sign(rate: np.ndarray) -> float:
     return float(np.sign(rate[moving[0]])) if len(moving) else 0.0
 
 
+@pytest.mark.slow
 @given(rate=RATES, x0=st.floats(1e-3, 0.1), start=st.none() | st.floats(-1.0, 1.0))
 def test_equals_the_recursion(rate: np.ndarray, x0: float, start: float | None) -> None:
     given_start = None if start is None else np.array([start])

@@ -94,6 +94,7 @@ def test_direction_stands_for_the_sign() -> None:
     )
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**16),

@@ -274,6 +274,7 @@ def test_no_dynamics_are_made_up(tmp_path: Path) -> None:
     assert """<dynamics friction="9" comment='old' damping="8"/>""" in text
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), square=st.booleans())
 def test_random_files_take_other_bodies(seed: int, joints: int, square: bool) -> None:

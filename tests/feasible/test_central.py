@@ -124,6 +124,7 @@ def test_where_data_press_against_the_set_half_of_the_margin_is_left(kind: Feasi
     np.testing.assert_allclose(case.base.K @ centred.delta, held.beta, rtol=0, atol=1e-9 * np.abs(held.beta).max())
 
 
+@pytest.mark.slow
 def test_nothing_presses_where_the_unconstrained_estimate_is_feasible() -> None:
     case = random_case(0, noise=0.0)
     conditions = feasible_set("pseudo_inertia", case.base.names)

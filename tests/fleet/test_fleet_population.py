@@ -89,6 +89,7 @@ def found(fits: dict[str, ArmFit]) -> Population:
     return population(fits, DESCRIBED.groups)
 
 
+@pytest.mark.slow
 def test_the_common_model_is_the_mean_of_the_arms(found: Population, usual: Kind, truths: list[np.ndarray]) -> None:
     mean = np.mean([usual.base.K @ delta for delta in truths], axis=0)
     known = np.sqrt(np.diag(found.covariance)) * found.scale

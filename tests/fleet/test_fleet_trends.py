@@ -94,6 +94,7 @@ def test_a_change_is_found_at_its_date_in_its_group() -> None:
     assert change.p < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scatter", "told", "seeds"), [(0.0, NOISE, 30), (0.05, NOISE, 5), (0.0, 0.5 * NOISE, 5)])
 def test_unchanged_fleets_raise_no_alarm(scatter: float, told: float, seeds: int) -> None:
     """Also where recordings of one arm differ by more than their covariances say."""

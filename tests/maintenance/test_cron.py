@@ -58,6 +58,7 @@ FIELDS = st.tuples(field(0, 59), field(0, 23), field(1, 28), st.just("*"), field
 STARTS = st.datetimes(datetime(1999, 1, 1), datetime(2101, 1, 1))
 
 
+@pytest.mark.slow
 @given(FIELDS, STARTS)
 def test_the_next_instant_is_the_first_minute_that_is_named(words: tuple[str, ...], start: datetime) -> None:
     text, start = " ".join(words), start.replace(tzinfo=UTC)

@@ -28,9 +28,8 @@ def test_an_unchanged_arm_is_due_no_more_and_raises_nothing(
     assert main(["maintenance", ARM, "--what", "gear oil changed", "--state", str(state)]) == 0
     assert "gear oil changed" in capsys.readouterr().out
     assert len(pending(db)) == 1
-    for seed in (11, 12):
-        again = reidentified(state, seed, 1.0, lambda: capsys.readouterr().out)
-        assert (again.code, again.answer["verdict"], again.alarms) == (0, "unchanged", [])
+    again = reidentified(state, 11, 1.0, lambda: capsys.readouterr().out)
+    assert (again.code, again.answer["verdict"], again.alarms) == (0, "unchanged", [])
     assert pending(db) == []
     assert main(["alarm", "list", "--state", str(state)]) == 0
 

@@ -18,6 +18,7 @@ def symbols_of(tape: ExpressionGraph) -> list[Symbol]:
     return [Symbol(tape, at) for at, step in enumerate(tape.steps) if step[0] == "input"]
 
 
+@pytest.mark.slow
 @settings(max_examples=200)
 @given(recipe=recipes(), seed=st.integers(0, 2**16), data=st.data())
 def test_the_pull_is_the_derivative_of_any_program(recipe: Recipe, seed: int, data: st.DataObject) -> None:

@@ -150,6 +150,7 @@ def test_a_planar_two_link_arm_has_the_textbooks_base_parameters() -> None:
     assert (unit["lx2 + 0.5*m2"], unit["fv1"]) == ("kg m", "N m s/rad")
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 6), square=st.booleans(), terms=st.sampled_from([ALL, ()]))
 def test_base_parameters_predict_every_torque_that_link_parameters_do(

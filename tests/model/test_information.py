@@ -60,6 +60,7 @@ def solved(R: Array) -> Array:
     return np.linalg.solve(R[:-1, :-1], R[:-1, -1])
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),

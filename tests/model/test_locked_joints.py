@@ -320,6 +320,7 @@ def test_the_description_says_what_it_means() -> None:
     assert ArmConfig.model_validate_json(part.model_dump_json()) == part
 
 
+@pytest.mark.slow
 def test_an_export_keeps_the_whole_tree() -> None:
     for text, kinematics in (
         (PANDA, {"lock": {"panda_finger_joint1": 0.03}}),
@@ -364,6 +365,7 @@ def test_geometry_is_seen_from_the_base() -> None:
     np.testing.assert_allclose(centers, [[0.01, 0.02, 0.03], [0.19, 0.02, 0.13]], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_joints_of_an_mjcf_can_be_locked() -> None:
     body = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
     text = (

@@ -203,6 +203,7 @@ def no_crash(text: str) -> None:
     assert os.waitpid(child, 0)[1] == 0, text
 
 
+@pytest.mark.slow
 @given(spoiled_urdfs())
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_no_small_urdf_breaks_its_parser(text: str) -> None:

@@ -259,6 +259,10 @@ def built(which: Subject, faults: tuple[Fault | Strike, ...], observer: Callable
     return which.build(strike, observer)
 
 
+class _Unrecorded(Exception):
+    """An arm without brakes is lowered, and its samples are recorded no more."""
+
+
 def play(
     which: Subject,
     state: State,
@@ -267,11 +271,29 @@ def play(
     speed: float = 1.0,
     *,
     finish: bool = False,
+    lowers: bool = True,
 ) -> Outcome:
-    """One run on a new arm, with what the script of a state does, recorded if a path is given."""
+    """One run on a new arm, with what the script of a state does.
+
+    Args:
+        which: the arm.
+        state: of the script.
+        faults: that strike.
+        path: of a recording; none is made without.
+        speed: of the run.
+        finish: whether it is finished early.
+        lowers: whether an arm without brakes is followed until it rests, and not only while it is recorded.
+    """
     truth: list[Truth] = []
     arm = built(which, faults, truth.append)
     story, latch, fault = Story(), ActiveFaults(), None
+
+    def recorded(cycle: int) -> None:
+        if story.samples and cycle > story.samples[-1]["cycle"] + 50:
+            raise _Unrecorded
+
+    if not lowers:
+        arm.before_exchange = recorded
     options: dict[str, Any] = {"latch": latch, "hold_seconds": HOLD, "speed": speed}
     script = Script(arm, which, state, speed, finish=finish)
     try:
@@ -286,6 +308,8 @@ def play(
             finally:
                 moments = list(truth)
                 arm.left_alone()
+    except _Unrecorded:
+        pass
     except ArmFault as error:
         fault = error
     return Outcome(story, arm, moments, latch, fault)
@@ -303,9 +327,11 @@ def script_of(state: State) -> State:
 
 @cache
 def _windows(name: str, state: State, speed: float, finish: bool) -> dict[str, tuple[int, int]]:
-    healthy = play(subject(name), state, (), None, speed, finish=finish)
+    healthy = play(subject(name), state, (), None, speed, finish=finish, lowers=False)
     assert healthy.fault is None
-    first, told = healthy.story.samples[0], [event for event in healthy.story.events if event[1] == 20]
+    # A run that is left before the arm rests tells that as a fault.
+    told = [event for event in healthy.story.events if event[1] == 20 and event[2] != "faulted"]
+    first = healthy.story.samples[0]
     # Enabling may take time that has no cycles.
     period = subject(name).period
     since = [max(-1, round((stamp - first["stamp_ns"]) * 1e-9 / period)) for stamp, _, _ in told]

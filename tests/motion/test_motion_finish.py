@@ -24,6 +24,8 @@ from ident_service.motion.state_machine import State
 from ident_service.motion.trajectory import Reference, rest
 from sim_backend.arm import Truth
 
+pytestmark = pytest.mark.slow  # whole runs
+
 Array = np.ndarray
 WHOLE = ["checked", "armed", "approaching", "exciting", "returning", "done"]
 
@@ -98,7 +100,6 @@ def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], hea
     assert bench.arm.cycle < whole.arm.cycle
 
 
-@pytest.mark.slow
 @settings(max_examples=20, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(cycle=st.integers(1, 2600), speed=st.sampled_from([1.0, 0.6]), pause=st.integers(-400, 400))
 def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pause: int) -> None:
@@ -120,7 +121,6 @@ def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pa
         arm.close()
 
 
-@pytest.mark.slow
 def test_the_way_back_is_as_slow_as_the_run(make: Callable[..., Bench]) -> None:
     bench = make()
     assert played(bench, Hands(finished=3000), speed=0.4).finished_at is not None
@@ -150,7 +150,6 @@ def test_a_run_is_finished_while_it_pauses_and_while_it_goes_on_again(make: Call
         ended_where_it_began(bench)
 
 
-@pytest.mark.slow
 def test_the_way_back_of_a_finished_run_can_be_paused(make: Callable[..., Bench]) -> None:
     free, bench = make(), make()
     played(free, Hands(finished=MIDWAY))
@@ -171,7 +170,6 @@ def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench],
     assert bench.arm.cycle == whole.arm.cycle
 
 
-@pytest.mark.slow
 def test_one_way_is_not_finished_early(make: Callable[..., Bench]) -> None:
     ways = []
     away = {"joints": {name: joint | {"home": 0.6} for name, joint in JOINTS.items()}}

@@ -41,8 +41,13 @@ def slow(which: Subject, joint: int, speed: float, first: int) -> list[Fault]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)  # 15 s of computing, which a machine with much else to do takes its time for
-@pytest.mark.parametrize(("arm", "joints"), [("bench", 2), ("wam", 7)])
-@pytest.mark.parametrize("speed", [1.0, 0.2])
+@pytest.mark.parametrize(
+    ("arm", "joints", "speed"),
+    [
+        *(("bench", 2, 1.0), ("bench", 2, 0.2), ("wam", 7, 1.0)),
+        pytest.param("wam", 7, 0.2, marks=pytest.mark.campaign),
+    ],
+)
 def test_slowly_begun_freezes_of_all_joints_are_found(arm: str, joints: int, speed: float) -> None:
     """All are harmless; not found are only those of which nothing comes before the motion ends."""
     which = subject(arm)
@@ -116,7 +121,7 @@ def sticky_wam(times: float) -> Subject:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("times", [1.0, 1.4])
+@pytest.mark.parametrize("times", [pytest.param(1.0, marks=pytest.mark.campaign), 1.4])
 def test_a_slow_joint_that_sticks_is_not_taken_for_a_frozen_one(times: float) -> None:
     """Dry friction of more than the guess, at a twentieth of the speed, on the way there and far into the motion."""
     sticks_and_is_not_taken_for_frozen(sticky_bench(times), 0.05, 0.05, stop=1100)
@@ -129,7 +134,7 @@ def test_a_slow_joint_that_sticks_is_not_taken_for_a_frozen_one_in_a_whole_run(t
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("speed", [1.0, 0.2])
+@pytest.mark.parametrize("speed", [1.0, pytest.param(0.2, marks=pytest.mark.campaign)])
 def test_the_large_arm_with_a_quarter_more_friction_is_not_taken_for_frozen(speed: float) -> None:
     sticks_and_is_not_taken_for_frozen(sticky_wam(1.25), speed, 0.02)
 

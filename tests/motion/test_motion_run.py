@@ -81,6 +81,7 @@ def test_an_arm_that_has_nowhere_to_go_is_done_at_once(make: Callable[..., Bench
     assert (report.peak_following_error < 1e-3).all()
 
 
+@pytest.mark.slow
 def test_two_runs_are_the_same_to_the_last_bit(make: Callable[..., Bench], healthy: Healthy) -> None:
     one, other = healthy, make()
     other.run()
@@ -88,6 +89,7 @@ def test_two_runs_are_the_same_to_the_last_bit(make: Callable[..., Bench], healt
         np.testing.assert_array_equal(one.story.column(name), other.story.column(name))
 
 
+@pytest.mark.slow
 def test_enabling_may_take_its_time(make: Callable[..., Bench]) -> None:
     bench = make()
     clock = bench.arm.clock

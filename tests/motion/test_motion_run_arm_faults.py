@@ -15,6 +15,8 @@ from ident_service.motion.safety_monitor import FROZEN_CYCLES, JUMP
 from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
+pytestmark = pytest.mark.slow  # whole runs
+
 Array = np.ndarray
 
 

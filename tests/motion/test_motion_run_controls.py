@@ -21,6 +21,8 @@ from ident_service.motion.sequencer import Paused
 from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
+pytestmark = pytest.mark.slow  # whole runs
+
 Array = np.ndarray
 
 
@@ -72,7 +74,6 @@ def no_step_anywhere(bench: Bench) -> None:
     assert (np.abs(np.diff(velocity, axis=0)) <= LIMITS.acceleration * PERIOD * 1.001).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("cycle", [200, MIDWAY, 1900])
 def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None:
     bench = make()
@@ -89,7 +90,6 @@ def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None
     assert (np.abs(bench.truth[-1].position - HOME) < 0.25 * LIMITS.following_error).all()
 
 
-@pytest.mark.slow
 def test_the_whole_motion_is_made_in_spite_of_pauses(make: Callable[..., Bench], healthy: Healthy) -> None:
     bench = make()
     # Short enough that the second one strikes on the way back from the first.
@@ -109,7 +109,6 @@ def test_a_pause_wanted_for_a_moment_is_a_pause(make: Callable[..., Bench]) -> N
     assert bench.story.states.count("paused") == 1
 
 
-@pytest.mark.slow
 def test_a_rehearsal_goes_on_as_slowly_as_it_went(make: Callable[..., Bench]) -> None:
     bench = make()
     assert played(bench, Hands(((3000, 3500),)), speed=0.4).state is State.DONE
@@ -250,7 +249,6 @@ def test_an_arm_that_is_pushed_while_it_is_held_is_left_to_its_drives(make: Call
     assert bench.story.states[-2:] == ["stopped", "faulted"]
 
 
-@pytest.mark.slow
 def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> None:
     bench, latch = make(Fault(700, FaultKind.LOAD_ATTACHED, None, None, 3.0)), ActiveFaults()
     with pytest.raises(ArmFault, match="following_lost: ") as caught:

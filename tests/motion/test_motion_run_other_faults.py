@@ -19,6 +19,8 @@ from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
+pytestmark = pytest.mark.slow  # whole runs
+
 Array = np.ndarray
 
 

@@ -43,6 +43,7 @@ def test_no_run_begins_while_the_arm_moves(make: Callable[..., Bench]) -> None:
     _refused(bench, "moving")
 
 
+@pytest.mark.slow
 def test_a_crawl_within_encoder_noise_is_rest(make: Callable[..., Bench]) -> None:
     bench = make()
     bench.arm.shown = lambda sample: replace(sample, position=sample.position + 1e-5 * (sample.cycle % 2))

@@ -14,6 +14,7 @@ def pytest_configure() -> None:
         deadline=None,
         derandomize=True,
         database=None,
+        max_examples=100,
         phases=(Phase.explicit, Phase.generate),
     )
     settings.load_profile("mutants")

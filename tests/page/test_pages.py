@@ -14,7 +14,7 @@ from urllib.parse import urlencode
 
 import numpy as np
 import pytest
-from daemon.conftest import URL, Asked, quick_text, serving
+from daemon.conftest import URL, Asked, known_arm, quick_text, serving
 from daemon.conftest import commissioned as commissioned
 from fastapi.routing import APIRoute
 
@@ -42,8 +42,7 @@ def daemon(state: Path, commissioned: Path) -> Iterator[Asked]:
     """A service with one of everything, hostile words wherever words may stand."""
     with serving(state) as asked:
         evil = quick_text(ARM).replace("planar arm of two links, gravity in its plane", repr(EVIL.replace("'", "")))
-        answer = asked.post("/api/v1/arms", {"description": evil})
-        assert answer.status_code == 201, answer.text
+        known_arm(asked, evil)
         db = asked.service.db
         import_run(db, state, commissioned, "test")
         answer = asked.post(f"/api/v1/arms/{ARM}/acceptances", {"run": commissioned.name, "note": EVIL})
