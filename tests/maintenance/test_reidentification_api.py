@@ -15,6 +15,7 @@ from daemon.served import daemon_process, url_of
 from maintenance.conftest import ARM, description
 
 from ident_service.cli import main
+from ident_service.registry.state_folder import fault_file
 
 pytestmark = pytest.mark.slow
 
@@ -153,6 +154,10 @@ def test_the_command_drives_a_daemon(accepted: str, state: Path, capsys: pytest.
         assert ident("due", "dismiss", "3", "--note", "the same belt")[0] == 0
         assert ident("alarm", "list")[:2] == (0, "no open alarms\n")
         assert ident("alarm", "ack", "1", "--note", "x")[0] == 2
+        # An arm that a person must look at first is not told as one that has changed, which is exit code 3.
+        fault_file(state, ARM).latch("lease_lost", "nobody was there")
+        code, out, err = ident("reidentify", ARM, "--confirm", ARM)
+        assert (code, "lease_lost" in out + err) == (5, True)
 
 
 @pytest.mark.timeout(300)
