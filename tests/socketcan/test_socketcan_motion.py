@@ -146,7 +146,7 @@ def emulated(arm: Path, ready: str, ended: str = "the arm is at rest") -> Iterat
 
 @contextmanager
 def no_garbage_collection() -> Iterator[None]:
-    """Keep the collector off, as the motion process does; over what pytest has loaded it takes 40 ms and more."""
+    """Keep the collector off, as the motion process does: over what pytest loads it takes 40 ms, and more there."""
     gc.collect()
     gc.freeze()
     gc.disable()
