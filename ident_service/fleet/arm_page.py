@@ -38,7 +38,7 @@ WIDTH, HEIGHT = 260.0, 96.0  # of a small drawing
 
 @dataclass(frozen=True)
 class ArmShown:
-    """What the page of one arm shows besides the arm's own estimate.
+    """Content of one arm's page besides the arm's own estimate.
 
     Attributes:
         name: of the arm.

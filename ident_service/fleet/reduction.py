@@ -16,6 +16,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+import dask
 from distributed import Client, KilledWorker, LocalCluster, as_completed
 
 from ident_service import __version__
@@ -173,16 +174,18 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
             yield client
         return
     count = request.workers or os.cpu_count() or 1
-    # Numbers as text: a name that Dask does not know as bytes is the caller's mistake.
+    # Dask would pause a worker at 80 % of its memory until that falls, which nothing makes it do: this call would wait
+    # for ever. At 95 % it is started anew. Numbers as text: what Dask does not know as bytes is the caller's mistake.
     try:
-        cluster = LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            memory_limit=request.memory,
-            host="127.0.0.1",
-            dashboard_address="127.0.0.1:0",
-            silence_logs=50,
-        )
+        with dask.config.set({"distributed.worker.memory.pause": False}):
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                memory_limit=request.memory,
+                host="127.0.0.1",
+                dashboard_address="127.0.0.1:0",
+                silence_logs=50,
+            )
     except ValueError as error:
         raise UsageError(f"--memory {request.memory}: {error}") from None
     with cluster, Client(cluster, set_as_default=False) as client:

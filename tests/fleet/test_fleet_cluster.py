@@ -179,7 +179,7 @@ def _require_pages(out: Path, page: str) -> None:
         place = out / "arms" / f"arm{arm}"
         assert f'href="arms/arm{arm}/report.html"' in page
         own = (place / "report.html").read_text()
-        assert "http" not in own.replace("http://www.w3.org", "")
+        assert "://" not in own.replace("http://www.w3.org", "")
         assert all(f"week{week}.mcap" in own for week in range(RECORDINGS))
         assert own.count("</svg>") >= 6
         assert "friction of joint elbow" in own

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import fsspec
+import psutil
 import pytest
-from distributed import LocalCluster
+from distributed import LocalCluster, get_worker
 from fsspec.implementations.memory import MemoryFileSystem
 from helpers.fleets import BEGIN, WEEK, kind, write_recording
 
@@ -93,6 +96,22 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pyt
         reduction.connected(request, lambda _: None),
     ):
         pass
+
+
+def _fill(share: float) -> None:
+    """Hold so much of this worker's memory limit from now on."""
+    worker = get_worker()
+    limit, own = worker.memory_manager.memory_limit, psutil.Process().memory_info().rss
+    worker.held = b"x" * max(int(share * limit) - own, 0)
+
+
+def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
+    """Above 80 % Dask would pause it, and the command waited for ever."""
+    request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), workers=1, memory="400MiB")
+    with reduction.connected(request, lambda _: None) as client:
+        client.submit(_fill, 0.87).result(timeout=60)
+        time.sleep(1.0)  # in which its memory is looked at
+        assert client.submit(os.getpid, pure=False).result(timeout=20) in client.run(os.getpid).values()
 
 
 def test_a_missing_extra_is_named(
