@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_bench import PRIOR, bench_config, bench_limits, bench_model
 
@@ -54,6 +54,7 @@ def independent_model() -> pin.Model:
 INDEPENDENT = independent_model()
 
 
+@settings(max_examples=100)
 @given(VECTORS, VECTORS, VECTORS, VECTORS, VECTORS)
 def test_the_law_is_equation_76(q: Array, moved: Array, q_r: Array, dq_r: Array, ddq_r: Array) -> None:
     control = controller(q)
@@ -69,6 +70,7 @@ def test_the_law_is_equation_76(q: Array, moved: Array, q_r: Array, dq_r: Array,
     np.testing.assert_allclose(control.correction, expected - without_errors, rtol=1e-7, atol=1e-6)
 
 
+@settings(max_examples=100)
 @given(VECTORS)
 def test_at_rest_on_the_reference_only_gravity_is_held(q: Array) -> None:
     torque = controller(q).torque(q, ALL, rest(q))
@@ -155,6 +157,7 @@ def friction(share: float = 0.8) -> FrictionFeedforward:
     return FrictionFeedforward(expected, share, MODEL.chain, LIMITS)
 
 
+@settings(max_examples=100)
 @given(VECTORS, VECTORS, VECTORS, VECTORS)
 def test_friction_is_fed_forward_for_the_velocity_of_the_reference_alone(
     q: Array, moved: Array, q_r: Array, dq_r: Array
@@ -170,6 +173,7 @@ def test_friction_is_fed_forward_for_the_velocity_of_the_reference_alone(
     np.testing.assert_allclose(control.feedforward, expected, atol=1e-9)
 
 
+@settings(max_examples=100)
 @given(st.floats(-3.0, 3.0), st.floats(-0.1, 0.1))
 def test_friction_fed_forward_has_no_step_where_the_reference_turns_round(speed: float, more: float) -> None:
     slope = 0.8 * (np.array([0.5, 0.2]) / (0.02 * LIMITS.velocity) + np.array([0.3, 0.1]))
@@ -227,6 +231,7 @@ def coupled(**changes: Any) -> ArmModel:
 COUPLING = np.array([[1.0, -0.5], [1.0, 0.5]])
 
 
+@settings(max_examples=100)
 @given(VECTORS, VECTORS)
 def test_drives_that_move_both_joints_add_their_inertia_to_both(q: Array, wanted: Array) -> None:
     model = coupled()
@@ -244,6 +249,7 @@ def test_drives_that_move_both_joints_add_their_inertia_to_both(q: Array, wanted
     np.testing.assert_allclose(both.mass_matrix(q), links.mass_matrix(q) + drives, atol=1e-12)
 
 
+@settings(max_examples=100)
 @given(VECTORS)
 def test_friction_of_drives_that_move_both_joints_is_fed_forward_for_their_velocities(pace: Array) -> None:
     expected = ExpectedFriction(np.array([0.5, 0.2]), np.array([0.3, 0.1]), np.array([0.05, -0.02]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from guard_bench import HOME, LIMITS, NAMES, OFF, PERIOD, STILL, WINDOW, Bench, is_fault, unit
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -254,6 +254,7 @@ def anything() -> st.SearchStrategy[float]:
     return st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
+@settings(max_examples=100)
 @given(arrays(float, 2, elements=anything()))
 def test_whatever_is_wanted_what_leaves_is_finite_and_limited(wanted: Array) -> None:
     kept = wanted.copy()
@@ -267,6 +268,7 @@ def test_whatever_is_wanted_what_leaves_is_finite_and_limited(wanted: Array) -> 
         np.testing.assert_array_equal(leaves, 0.0)
 
 
+@settings(max_examples=100)
 @given(
     arrays(float, 2, elements=anything()),
     arrays(float, 2, elements=anything()),

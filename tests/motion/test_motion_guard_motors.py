@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from guard_bench import HOME, LIMITS, NAMES, PERIOD, is_fault
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from motion_bench import bench_config
@@ -44,6 +44,7 @@ def test_motors_are_weaker_together_than_joints_alone() -> None:
     assert (np.abs(motors(np.array([20.0, 0.0]))) < MOST).all()
 
 
+@settings(max_examples=100)
 @given(WANTED)
 def test_the_first_torque_is_scaled_as_a_whole(wanted: Array) -> None:
     leaves, fault = guard().torque(wanted)
@@ -55,6 +56,7 @@ def test_the_first_torque_is_scaled_as_a_whole(wanted: Array) -> None:
         assert fault.code == "torque_saturated"
 
 
+@settings(max_examples=100)
 @given(st.lists(WANTED, min_size=2, max_size=30))
 def test_whatever_is_wanted_in_turn_no_motor_and_no_joint_gets_more_and_none_jumps(wanted: list[Array]) -> None:
     one, before = guard(), None

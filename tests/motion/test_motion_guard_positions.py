@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from guard_bench import HOME, LIMITS, NAMES, PERIOD, QUICK, STILL, WARN, Bench, is_fault, unit
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -28,6 +28,7 @@ def test_a_position_within_reach_leaves_as_it_is() -> None:
     np.testing.assert_array_equal(leaves, wanted)
 
 
+@settings(max_examples=100)
 @given(arrays(float, 2, elements=st.floats(-1.7, 1.7)))
 def test_no_position_is_a_step_that_a_joint_may_not_make(wanted: Array) -> None:
     guard, before = bench().guard, HOME

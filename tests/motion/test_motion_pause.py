@@ -48,6 +48,7 @@ def test_pause_and_resume_keep_to_all_limits_and_have_no_step(seed: int, share: 
     keeps_to(limits, resumed, 5e-6, 600)
 
 
+@settings(max_examples=100)
 @given(SHARES)
 def test_the_motion_goes_on_where_it_was_left(share: float) -> None:
     left = share * MOTION.duration

@@ -42,6 +42,7 @@ FORCED = 0.5 * LIMITS.acceleration**2 / LIMITS.jerk
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+@settings(max_examples=100)
 @given(setpoints(LIMITS))
 def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
     reference = stop(start, _unlimited(LIMITS))
@@ -62,6 +63,7 @@ def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
 
 
 @pytest.mark.slow
+@settings(max_examples=100)
 @given(st.floats(0.0, 1.0))
 def test_a_stop_out_of_an_excitation_passes_no_velocity_limit(share: float) -> None:
     exciting = PathReference(bench_excitation().path)
@@ -72,6 +74,7 @@ def test_a_stop_out_of_an_excitation_passes_no_velocity_limit(share: float) -> N
     assert (position <= LIMITS.upper).all()
 
 
+@settings(max_examples=100)
 @given(setpoints(LIMITS, 5.0))
 def test_a_stop_exists_even_from_beyond_the_limits(start: Setpoint) -> None:
     end = stop(start, LIMITS).at(100.0)
@@ -106,6 +109,7 @@ def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reach
     close(reference.at(reference.duration + 1e3), end)
 
 
+@settings(max_examples=100)
 @given(SEEDS)
 def test_a_stop_that_can_only_just_stay_inside_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -117,6 +121,7 @@ def test_a_stop_that_can_only_just_stay_inside_does(seed: int) -> None:
     assert (highest <= limits.upper + 2e-7).all()
 
 
+@settings(max_examples=100)
 @given(SEEDS)
 def test_the_quickest_stop_overshoots_a_turning_point_by_less_than_its_bound(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -139,6 +144,7 @@ def test_the_bound_of_the_overshoot_is_reached() -> None:
     np.testing.assert_allclose(stop_overshoot(LIMITS), [8.0**3 / 24 / 80.0**2, 15.0**3 / 24 / 150.0**2])
 
 
+@settings(max_examples=100)
 @given(setpoints(LIMITS, 1.5))
 def test_a_stop_that_cannot_stay_inside_leaves_by_no_more_than_the_quickest(start: Setpoint) -> None:
     def leaves(limits: MotionLimits) -> Array:
@@ -150,6 +156,7 @@ def test_a_stop_that_cannot_stay_inside_leaves_by_no_more_than_the_quickest(star
         assert (leaves(within) <= leaves(_unlimited(within)) + 1e-12).all()
 
 
+@settings(max_examples=100)
 @given(setpoints(LIMITS, 1.5))
 def test_the_quickest_stop_is_the_one_that_ruckig_finds(start: Setpoint) -> None:
     wide = _unlimited(LIMITS)
@@ -182,6 +189,7 @@ def test_a_stop_exists_from_far_beyond_the_limits(size: float, signs: tuple[floa
 
 
 @pytest.mark.slow
+@settings(max_examples=100)
 @given(setpoints(LIMITS, 3.0))
 def test_an_acceleration_beyond_its_limit_is_led_back_first(start: Setpoint) -> None:
     reference = stop(start, LIMITS)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from motion_bench import bench_limits
 from reachable import (
     close,
@@ -24,6 +24,7 @@ LIMITS = bench_limits()
 
 
 @pytest.mark.slow
+@settings(max_examples=100)
 @given(setpoints(LIMITS), setpoints(LIMITS))
 def test_a_way_keeps_to_every_limit_or_is_refused(start: Setpoint, end: Setpoint) -> None:
     try:
@@ -41,6 +42,7 @@ def test_a_way_keeps_to_every_limit_or_is_refused(start: Setpoint, end: Setpoint
     assert (np.abs(velocity) <= np.maximum(LIMITS.velocity, rising) * (1 + 1e-6)).all()
 
 
+@settings(max_examples=100)
 @given(setpoints(LIMITS, 0.3), setpoints(LIMITS, 0.3))
 def test_between_gentle_states_a_way_exists(start: Setpoint, end: Setpoint) -> None:
     _, _, velocity, _ = sampled(plan_trajectory(start, end, LIMITS))
@@ -57,6 +59,7 @@ def test_a_joint_that_ends_as_it_begins_goes_round_while_another_moves() -> None
 
 
 @pytest.mark.slow
+@settings(max_examples=100)
 @given(setpoints(LIMITS), setpoints(LIMITS))
 def test_the_extent_of_a_way_is_where_it_goes(start: Setpoint, end: Setpoint) -> None:
     wide = 100.0 * np.ones(2)
