@@ -18,8 +18,8 @@ from ident_service.cli import main
 from ident_service.client import IdentClient
 from ident_service.errors import IdentError
 from ident_service.registry.database import Database
-from ident_service.registry.tokens import add_token
 from ident_service.registry.state_folder import fault_file
+from ident_service.registry.tokens import add_token
 
 pytestmark = pytest.mark.slow
 
