@@ -74,9 +74,10 @@ def spent() -> float:
     return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
-def whole(folder: Path, place: Path, store: str, workers: int) -> tuple[float, float, Any]:
+def whole(folder: Path, place: Path, store: str, workers: int, arms: int) -> tuple[float, float, Any]:
     """Identify the fleet; seconds of the clock and of processors, the workers' among them, and the result."""
-    request = FleetRequest(ARM, (f"{folder}/*/*.mcap",), store, workers=workers)
+    patterns = tuple(f"{folder}/arm{arm:02}/*.mcap" for arm in range(arms))
+    request = FleetRequest(ARM, patterns, store, workers=workers)
     begin, before = time.perf_counter(), spent()
     result = identify_fleet(request, place, _tell(begin))
     return time.perf_counter() - begin, spent() - before, result
@@ -160,13 +161,13 @@ def measure(folder: Path, place: Path, arms: int) -> Iterator[Row]:
     total = arms * EACH
     label = f"{total} recordings of {SECONDS:g} s, 7 joints, {arms} arms"
     yield Row("load of the machine before", os.getloadavg()[0], "")
-    two, of_two, result = whole(folder, place / "out2", str(place / "store2"), 2)
+    two, of_two, result = whole(folder, place / "out2", str(place / "store2"), 2, arms)
     yield Row(f"{label}: two processes", result.reduced.computed / two, "1/s", ">= 2.5")
     yield Row("CPU of all processes: two of them", of_two, "s")
-    again, of_again, store = _again(folder, place, total)
+    again, of_again, store = _again(folder, place, arms)
     yield Row("second call with 5 % new recordings, of the first", 100.0 * again / two, "%", "<= 10")
     yield Row("CPU of the second call, of the first", 100.0 * of_again / of_two, "%")
-    one, of_one, _ = whole(folder, place / "out1", str(place / "store1"), 1)
+    one, of_one, _ = whole(folder, place / "out1", str(place / "store1"), 1, arms)
     yield Row(f"{label}: one process", total / one, "1/s")
     yield Row("two processes over one", one / two, "", ">= 1.8")
     yield Row("CPU of all processes: one of them", of_one, "s")
@@ -182,7 +183,7 @@ def measure(folder: Path, place: Path, arms: int) -> Iterator[Row]:
     yield Row("load of the machine after", os.getloadavg()[0], "")
 
 
-def _again(folder: Path, place: Path, total: int) -> tuple[float, float, str]:
+def _again(folder: Path, place: Path, arms: int) -> tuple[float, float, str]:
     """Return seconds and CPU seconds of a call in whose store one recording in twenty is missing, and the store."""
     store = place / "store3"
     shutil.copytree(place / "store2", store)
@@ -191,9 +192,9 @@ def _again(folder: Path, place: Path, total: int) -> tuple[float, float, str]:
     for path in rows[::step]:
         (store / "factors" / f"{path.stem}.npz").unlink()
         path.unlink()
-    seconds, processors, result = whole(folder, place / "out3", str(store), 2)
+    seconds, processors, result = whole(folder, place / "out3", str(store), 2, arms)
     if (computed := result.reduced.computed) != len(rows[::step]):
-        raise ValueError(f"{computed} of {total} computed")
+        raise ValueError(f"{computed} of {arms * EACH} computed")
     return seconds, processors, str(store)
 
 

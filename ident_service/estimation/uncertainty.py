@@ -58,12 +58,15 @@ class Uncertainty:
         degrees: degrees of freedom of those deviations before they were widened, shape (base,).
         noise: variances [SI^2] by what differs between repetitions of the motion, shape (base,); None where most of the
             motion is not repeated, so that noise and error of the model cannot be told apart.
+        inflation: by how much variances are larger than those of eq. 81, the mean over all directions of the largest
+            of several lengths of the blocks; at least 1. One number, which few blocks do not spoil.
     """
 
     covariance: Array
     deviations: Array
     degrees: Array
     noise: Array | None = None
+    inflation: float = 1.0
 
 
 @one_blas_thread()
@@ -93,26 +96,40 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
         found = np.sqrt(np.diag(other)) * widening(fewer)
         degrees = np.where(found > largest, fewer, degrees)
         largest = np.maximum(largest, found)
-    return Uncertainty(covariance, np.where(blind, np.inf, largest), degrees, _noise(clusters, fit))
+    inflation = _inflation(seen, _white_variance(equations, fit))
+    return Uncertainty(covariance, np.where(blind, np.inf, largest), degrees, _noise(clusters, fit), inflation)
 
 
-@one_blas_thread()
-def variance_inflation(equations: Equations, fit: LeastSquares) -> float:
-    """Return how many times larger variances are than those of eq. 81, as a mean over all directions; at least 1.
+def inflated_covariance(equations: Equations, fit: LeastSquares, doubt: Uncertainty) -> Array:
+    """Return the covariance of eq. 81 times `Uncertainty.inflation`, shape (base, base); infinite where unseen.
 
-    With white residuals of variance v the scores s_b of a block, in coordinates in which all blocks together have the
-    identity as information and block b has S_b, have E |s_b|^2 = v tr(S_b - S_b^2) (that of HC2). The sum over blocks
-    is one number from blocks times parameters, and so neither biased nor much uncertain where blocks are few; for the
-    deviation of one parameter, `uncertainty` is the careful answer. As there, longer blocks are tried, too.
+    Where blocks are few, the ratios of its entries are much surer than those of `Uncertainty.covariance`, which are
+    from the blocks alone; its size is of all directions together. For tests that find the size of each themselves.
 
     Args:
         equations: in blocks.
         fit: what solves them.
+        doubt: of that.
     """
+    covariance = fit.inverse @ fit.inverse.T * (_white_variance(equations, fit) * doubt.inflation)
+    unseen = ~np.isfinite(doubt.deviations)
+    covariance[unseen, unseen] = np.inf
+    return np.asarray(covariance)
+
+
+def _white_variance(equations: Equations, fit: LeastSquares) -> float:
     total = equations.total
-    rows = max(int(total.rows.sum()) - total.base, 1)
-    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / rows
-    seen = [_Whitened.of(cluster, fit) for cluster in equations.clusters]
+    degrees = max(int(total.rows.sum()) - total.base, 1)
+    return (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
+
+
+def _inflation(seen: Sequence[_Whitened], variance: float) -> float:
+    """Return `Uncertainty.inflation`.
+
+    With white residuals of variance v the scores s_b of a block, in coordinates in which all blocks together have the
+    identity as information and block b has S_b, have E |s_b|^2 = v tr(S_b - S_b^2) (that of HC2). The sum over blocks
+    is one number from blocks times parameters, and so neither biased nor much uncertain where blocks are few.
+    """
     found = [1.0]
     for count in (1, *_LONGER):
         if count > 1 and len(seen) < _LEAST_CLUSTERS * count:
@@ -122,25 +139,6 @@ def variance_inflation(equations: Equations, fit: LeastSquares) -> float:
         if expected > 0.0 and variance > 0.0:
             found.append(sum(float(one.score @ one.score) for one in blocks) / (variance * expected))
     return max(found)
-
-
-def inflated_covariance(equations: Equations, fit: LeastSquares) -> Array:
-    """Return the covariance of eq. 81 times `variance_inflation`, shape (base, base); infinite where unseen.
-
-    Where blocks are few, the ratios of its entries are much surer than those of `Uncertainty.covariance`, which are
-    from the blocks alone; its size is of all directions together. For tests that find the size of each themselves.
-
-    Args:
-        equations: in blocks.
-        fit: what solves them.
-    """
-    total = equations.total
-    rows = max(int(total.rows.sum()) - total.base, 1)
-    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / rows
-    covariance = fit.inverse @ fit.inverse.T * (variance * variance_inflation(equations, fit))
-    unseen = ~np.isfinite(fit.standard_deviations)
-    covariance[unseen, unseen] = np.inf
-    return np.asarray(covariance)
 
 
 def jackknife(

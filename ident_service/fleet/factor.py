@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import io
+import itertools
 import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
@@ -62,6 +63,7 @@ AT_ONCE: Final = FAN_IN**2  # factors that one task merges, a whole branch of th
 MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge beyond, so that memory does not grow with recordings
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
+_TRIMMED_EVERY: Final = 16  # tasks
 _PILOTS: Final = 3  # recordings that settle choices
 # Raised for what is in a recording; a file of random bytes can make a reader raise any of these.
 _UNUSABLE: Final = (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError)
@@ -302,17 +304,19 @@ class Settled:
 
 
 def _trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Give free memory back to the system after a task, where the C library can: 5 ms for half of what a worker has.
+    """Give free memory back to the system after some tasks, where the C library can: half of what a worker has.
 
     Else a worker that has long finished looks as if it needed more than it may have, and Dask gives it nothing to do.
+    After each task it would take a tenth of a second, for the next one needs the memory again.
     """
+    done = itertools.count(1)
 
     @wraps(task)
     def run(*given: _Given.args, **named: _Given.kwargs) -> _Found:
         try:
             return task(*given, **named)
         finally:
-            if (trim := _malloc_trim()) is not None:
+            if next(done) % _TRIMMED_EVERY == 0 and (trim := _malloc_trim()) is not None:
                 trim(0)
 
     return run
@@ -326,7 +330,6 @@ def _malloc_trim() -> Any:
         return None
 
 
-@_trimmed
 def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:
     """Return the description with every choice as a number, as recordings of one arm decide them together.
 
@@ -471,9 +474,8 @@ def _reduced(recording: Recording, key: str, label: str, described: Described) -
     fit: LeastSquares = (ordinary_least_squares if method == "ols" else weighted_least_squares)(fitted.total)
     if method == "huber":
         fit, fitted, _ = huber([recording], model, base, fit, None, shares)
-    doubt, covariance = uncertainty(fitted, fit), inflated_covariance(fitted, fit)
-    blind = ~np.isfinite(doubt.deviations)
-    covariance[blind, blind] = np.inf
+    doubt = uncertainty(fitted, fit)
+    covariance = inflated_covariance(fitted, fit, doubt)
     groups = described.groups.values()
     clusters = [Information.sum(blocks) for blocks in fitted.clusters]
     kept = [

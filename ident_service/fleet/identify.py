@@ -232,7 +232,8 @@ def _kept_fit(merged: Merged, leaves: Leaves, described: Described, store: Store
     if content is not None:
         try:
             with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                return arm_fit(merged, method, between, Uncertainty(**archive))
+                doubt = Uncertainty(**{**archive, "inflation": float(archive["inflation"])})
+                return arm_fit(merged, method, between, doubt)
         except (ValueError, TypeError, KeyError, OSError, EOFError, zipfile.BadZipFile):
             pass  # damaged, or another version's: made again
     found = arm_fit(merged, method, between)

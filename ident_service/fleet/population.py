@@ -52,7 +52,6 @@ from ident_service.estimation.uncertainty import (
     Uncertainty,
     negligible,
     uncertainty,
-    variance_inflation,
     verdicts,
     widening,
 )
@@ -117,8 +116,7 @@ def arm_fit(merged: Merged, method: str, between: Array | None = None, doubt: Un
     degrees = max(int(total.rows.sum()) - total.base, 1)
     variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
     # One factor for all: factors of their own would turn the combinations that are known well into others.
-    wider = variance_inflation(merged.fitted, fit)
-    precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * wider)
+    precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
     if between is not None:
         precision = _widened(precision, between)
     everything = merged.everything
