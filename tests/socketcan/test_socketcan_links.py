@@ -16,6 +16,7 @@ from drivers.can.can_link import Link, open_links
 from ident_service.errors import DriverError
 
 Open = Callable[..., Link]
+pytestmark = pytest.mark.timeout(900)  # of the guest's time, which goes on while it waits for a file of the host
 
 
 @pytest.fixture(params=["raw", "socketcan"])
