@@ -80,7 +80,8 @@ def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **de
         except (IdentError, OSError) as refusal:
             print_to_person(f"ident: done, but not entered in the audit trail: {error}; {refusal}\n")
         else:
-            print_to_person(f"ident: done, but not entered in the audit trail yet; its line follows: {error}\n")
+            why = str(error).partition(";")[0]  # what follows is advice for an act that was not done
+            print_to_person(f"ident: done; its line in the audit trail is written later ({why})\n")
 
 
 def add(verbs: VerbList) -> None:

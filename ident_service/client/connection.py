@@ -60,7 +60,8 @@ class Connection:
 
         Args:
             url: of the daemon: scheme, host and port.
-            token: that authenticates the caller; None for a stop on the daemon's own machine.
+            token: that authenticates the caller, white space around it left out; None for a stop on the daemon's own
+                machine.
             patience: how long to wait for an answer [s].
 
         Raises:
@@ -76,9 +77,7 @@ class Connection:
         if parts.scheme == "http" and host not in ("127.0.0.1", "::1", "localhost"):
             raise UsageError(f"{url}: a token is sent to other machines over https only")
         self.url = url.rstrip("/")
-        if token is not None and not token.strip():
-            raise UsageError(f"{url}: the token is empty; give what `ident tokens add` has printed, or None for a stop")
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        headers = {} if token is None else {"Authorization": f"Bearer {_plain(token, url)}"}
         secure = parts.scheme == "https"
         # Without TLS no certificate is checked; an empty context is quicker to make.
         verify = ssl.create_default_context() if secure else ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -87,7 +86,7 @@ class Connection:
                 base_url=self.url, headers=headers, timeout=patience, verify=verify, trust_env=False
             )
         except (ValueError, httpx.HTTPError, httpx.InvalidURL) as error:
-            raise UsageError(f"{url}: cannot be asked with this token: {error}") from None
+            raise UsageError(f"{url}: cannot be asked: {error}") from None
 
     def get(self, path: str) -> Any:
         """Send GET for a path and return the answer; raises as `ask`."""
@@ -225,6 +224,16 @@ class Connection:
         if status >= 400:
             raise _error(self.url, status, document)
         return document
+
+
+def _plain(token: str, url: str) -> str:
+    """Return a token without white space around it; no message repeats it."""
+    plain = token.strip()
+    if not plain:
+        raise UsageError(f"{url}: the token is empty; give what `ident tokens add` has printed, or None for a stop")
+    if not plain.isascii() or not plain.isprintable() or " " in plain:
+        raise UsageError(f"{url}: the token has characters that no token has; give what `ident tokens add` has printed")
+    return plain
 
 
 def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = ()) -> IdentError:

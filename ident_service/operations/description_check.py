@@ -16,6 +16,7 @@ from ident_service.config.quantities import ParameterTable, did_you_mean
 from ident_service.errors import ConfigError, ModelError, MotionRefused, ParameterError, Problem
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters, remarks_on_angles
+from ident_service.model.collision import CollisionModel
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.motion.arm_factory import GROUP
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
@@ -102,6 +103,11 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         objections.append(
             located(arm, ("kinematics",), f"kinematics: computed torque needs a model of the links; {remedy}")
         )
+    if config.driver is not None:
+        try:
+            CollisionModel(model)
+        except ModelError as error:
+            objections.append(located(arm, ("kinematics",), f"kinematics: {error}"))
     gains = stability(model, limits, delay_of(model.config))
     for words in gains.objections():
         joint = words.partition(":")[0]

@@ -259,6 +259,23 @@ def test_what_cannot_move_is_never_called_good(
     assert not any(line.endswith("good") for line in told)
 
 
+def test_a_mesh_that_no_clearance_can_be_computed_from_is_told_before_preflight(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arms = Path(__file__).resolve().parents[2] / "configs"
+    urdf = (
+        (arms / "threelink.urdf")
+        .read_text()
+        .replace('<cylinder radius="0.08" length="0.1"/>', "<mesh filename='a.stl'/>")
+    )
+    (folder / "threelink.urdf").write_text(urdf)
+    code, told = answer((arms / "threelink.yaml").read_text(), folder, capsys)
+    assert code == 3
+    assert told[0].endswith("CANNOT MOVE")
+    assert "threelink.urdf: link 'base': its collision geometry is a mesh" in told[1]
+    assert "give capsules for 'base' under geometry" in told[1]
+
+
 def test_an_arm_without_a_driver_is_told_what_a_motion_would_need(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
