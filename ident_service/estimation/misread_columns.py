@@ -29,10 +29,11 @@ from ident_service.recordings.resampling import grid
 SUSPECTED_FROM, CONCERNED_FROM = 10.0, 5.0  # percent of a joint's torque: to search at all, and to try a joint
 NO_ERROR = 1.0  # percent of a joint's torque; smaller errors count as this one
 BETTER = 3.0  # by which the product of the joints' errors must shrink; real arms with right columns reach 1.7
-NONE_WORSE = 1.3  # by which the error of no joint may grow
+NONE_WORSE = 2.0  # by which the error of no joint may grow; that of one whose torque is noise may
+EXPLAINED = 10.0  # percent of all torques in motion that the right reading leaves at most; wrong geometry leaves more
 _LONGEST = 60.0  # s of all recordings together that are fitted
 _ROWS = 1000  # that are fitted, about
-_TRIED = 6  # readings that are fitted under the conditions; without them, too, the right one is among the best
+_TRIED = 6  # readings besides signs of torques that are fitted under the conditions, the best without them
 
 _Which = Literal["torque", "position", "both"]
 
@@ -43,19 +44,31 @@ class Reading:
 
     Attributes:
         which: columns that it is about.
-        joints: one whose sign is negated, or two that are exchanged.
+        joints: one whose sign is negated, two that are exchanged, or all.
+        all_negated: whether it is about all, with the other sign.
     """
 
     which: _Which
     joints: tuple[int, ...]
+    all_negated: bool = False
+
+    @property
+    def negates(self) -> bool:
+        """Return whether signs are negated; else columns are exchanged."""
+        return self.all_negated or len(self.joints) == 1
+
+    @property
+    def of_torque_signs(self) -> bool:
+        """Return whether it is about signs of torques alone, which needs no other regressor."""
+        return self.which == "torque" and self.negates
 
     def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
         """Return positions, velocities or torques, shape (samples, joints), as they are read."""
         if self.which not in (what, "both"):
             return columns
         read = columns.copy()
-        if len(self.joints) == 1:
-            read[:, self.joints[0]] *= -1.0
+        if self.negates:
+            read[:, self.joints] *= -1.0
         else:
             read[:, self.joints] = columns[:, self.joints[::-1]]
         return read
@@ -89,6 +102,12 @@ class MisreadColumns:
         )
         whole, then = self.before.relative_percent, self.after.relative_percent
         errors = f"the torque error in motion is {whole:.1f} %, and {then:.2g} % with"
+        if self.reading.all_negated:
+            return (
+                "the torques of all joints seem to have the wrong sign, or gravity to point the other way:"
+                f" {errors} the other sign ({each}): correct them where they are recorded, give the columns the factor"
+                " -1 (recording.columns), or correct gravity in the description"
+            )
         if len(named) == 1:
             if self.reading.which == "both":
                 return (
@@ -130,7 +149,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     found: list[tuple[float, Reading, Information]] = []
     at_positions: dict[tuple[int, ...], _Equations | _EstimatesEquations] = {(): as_read}
     for reading in _readings(estimate, np.flatnonzero(own > CONCERNED_FROM)):
-        if not recordings and (reading.which != "torque" or len(reading.joints) > 1):
+        if not recordings and not reading.of_torque_signs:
             continue
         moved = () if reading.which == "torque" else reading.joints
         if moved not in at_positions:
@@ -139,12 +158,15 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
         free = torque_error(information, ordinary_least_squares(information, weights).beta)
         found.append((float(_gains(before, free).sum()), reading, information))
     best, most = None, float(np.log(BETTER))
-    for without_conditions, reading, information in sorted(found, key=lambda one: -one[0])[:_TRIED]:
+    # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and of others the best.
+    signs = [one for one in found if one[1].of_torque_signs]
+    others = sorted((one for one in found if not one[1].of_torque_signs), key=lambda one: -one[0])[:_TRIED]
+    for without_conditions, reading, information in (*signs, *others):
         if without_conditions < most:  # conditions only add to the error
-            break
+            continue
         after = _constrained_error(estimate, information, weights)
         gains = _gains(before, after)
-        if gains.sum() >= most and gains.min() >= -np.log(NONE_WORSE):
+        if gains.sum() >= most and gains.min() >= -np.log(NONE_WORSE) and after.relative_percent < EXPLAINED:
             best, most = MisreadColumns(reading, before, after), float(gains.sum())
     return best
 
@@ -152,6 +174,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
 def _readings(estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]:
     kinds: tuple[_Which, ...] = ("torque", "position", "both")
     turns = estimate.model.chain.revolute
+    yield Reading("torque", tuple(range(len(turns))), all_negated=True)
     for which in kinds:
         for joint in joints.tolist():
             yield Reading(which, (joint,))

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import JointTerm
+from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
-from ident_service.estimation.least_squares import TorqueError
+from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
 from ident_service.estimation.misread_columns import misread_columns
 from ident_service.estimation.uncertainty import jackknife, widening
 from ident_service.model.arm_model import ArmModel
@@ -26,6 +27,8 @@ MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and
 CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
 WRONG_SIGN = 8.0  # standard deviations by which friction must be negative
 CONSTRAINED_WORSE_WITH_SIGN, PERHAPS_WRONG_SIGN = 1.3, 4.0  # error factor and deviations, only together
+MIRRORED_FROM, MIRRORED_WORSE = 20.0, 1.4  # percent and error factor, to try a negated torque
+MIRRORED = 1.3  # factor by which the error must shrink with the torque negated
 ENOUGH_MOTION, UNKNOWN_OF_LITTLE_MOTION = 10.0, 0.2  # s, and share of the base parameters
 _OUTSIDE = 0.1  # share of a joint's range by which a description's limits may be off
 _NOISE = 1e-3  # share of a joint's range that encoder noise at a limit may reach
@@ -47,11 +50,10 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
         recordings: that it was fitted to, to find columns that were misread; without them only wrong signs of torques
             are found.
     """
-    own = estimate.candidates[estimate.chosen]
     misread = misread_columns(estimate, recordings)
     if misread is not None:
         return (misread.sentence(estimate.model.chain.names),)
-    return (*_errors(own), *_compare_with_unconstrained(estimate))
+    return (*_errors(estimate.candidates[estimate.chosen]), *_compare_with_unconstrained(estimate))
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
@@ -167,11 +169,34 @@ def _compare_with_unconstrained(estimate: Estimate) -> Iterator[str]:
             f"the torque, or the position, may have the wrong sign at {which}: without constraints, the friction of"
             f" {name} drives it ({torque:.3g} +- {deviation:.2g} at its usual speed)" + (f"; {words}" if much else "")
         )
+    elif mirrored := _mirrored(estimate) if held else "":
+        yield f"{mirrored}; {words}"
     elif much:
         yield (
             f"{words}: gravity, signs, order or units of the columns, or the description's bodies, contradict the"
             " recording"
         )
+
+
+def _mirrored(estimate: Estimate) -> str:
+    """Return the name of a joint whose torques fit the feasible set better with the other sign; else empty."""
+    free, own = (estimate.candidates[place].moving.joint_relative_percent for place in (0, estimate.chosen))
+    information, weights = estimate.information, estimate.fit.weights
+    for joint, name in enumerate(estimate.model.chain.names):
+        if own[joint] < max(MIRRORED_FROM, MIRRORED_WORSE * free[joint]):
+            continue
+        signs = np.ones(information.joints)
+        signs[joint] = -1.0
+        fit = ordinary_least_squares(information.with_torques_times(signs), weights)
+        beta = constrained_least_squares(fit, estimate.base, estimate.conditions).beta
+        turned = torque_error(estimate.prepared.equations.moving.with_torques_times(signs), beta)
+        error = turned.joint_relative_percent[joint]
+        if MIRRORED * error < own[joint] and error < MIRRORED_WORSE * free[joint]:
+            return (
+                f"the torque, or the position, may have the wrong sign at {name}: its torque error is"
+                f" {own[joint]:.0f} %, and {error:.0f} % with the torque negated"
+            )
+    return ""
 
 
 def _driving_friction(estimate: Estimate, deviations: float) -> list[tuple[str, float, float]]:

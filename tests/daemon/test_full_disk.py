@@ -221,7 +221,7 @@ def test_a_stop_that_the_registry_does_not_take_is_entered_later(
         before = time.time()
         assert main(["stop", "--state", str(state)]) == 0
         after = time.time()
-        assert "follows" in capsys.readouterr().err
+        assert "is written later" in capsys.readouterr().err
         assert "stop" not in [line["what"] for line in audit_log(daemon.service.db)]
         other.execute("ROLLBACK")
         until = time.monotonic() + 30.0

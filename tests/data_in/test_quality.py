@@ -65,7 +65,7 @@ def test_saturation(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [joint.saturated for joint in known.joints] == [pytest.approx(at_limit), 0.0, 0.0]
     assert quality(recording, PLAIN, np.array([8.1, 9.0, 3.0])).joints[0].saturated == 0.0
     text = "\n".join(known.warnings())
-    assert f"joint j0: torque saturated in {100 * at_limit:.2g} %" in text
+    assert f"joint j0: torque saturated in {100 * at_limit:.3g} %" in text
     assert "j1" not in text
     assert "joint j2: torque is always 3" in text
     with pytest.raises(UsageError, match=r"torque_limit\.shape=\(2,\)"):

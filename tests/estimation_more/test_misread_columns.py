@@ -58,6 +58,16 @@ def test_the_wrong_columns_are_named(which: str, joints: tuple[int, ...]) -> Non
     assert "recording.columns" in reason
 
 
+def test_torques_that_are_all_negated_are_named_as_such() -> None:
+    recording = replace(elbowed()[1], torque=-elbowed()[1].torque)
+    estimate = identified(recording)
+    for recordings in ([recording], []):
+        found = misread_columns(estimate, recordings)
+        assert found is not None
+        assert found.reading == Reading("torque", (0, 1), all_negated=True)
+    assert "the torques of all joints" in reasons_against(estimate, [recording])[0]
+
+
 def test_the_sign_of_a_torque_is_found_without_the_recordings() -> None:
     estimate = identified(misread(Reading("torque", (1,))))
     found = misread_columns(estimate, [])

@@ -172,8 +172,8 @@ WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
     "degrees": (degrees, {}, "lwr_0_joint is recorded from -56.73 to 56.73 rad, .* degrees"),
     "q and tau": (swapped, {}, "lwr_1_joint is recorded from -38.05"),
     "two joints": (two_joints, {}, "the torques of lwr_1_joint and lwr_2_joint seem to be exchanged"),
-    "sign": (negated, {}, "the torque, or the position, may have the wrong sign at lwr_0_joint"),
-    "one sign": (one_negated, {}, "the torque of lwr_5_joint seems to have the wrong sign"),
+    "sign": (negated, {}, "the torques of all joints seem to have the wrong sign"),
+    "one sign": (one_negated, {}, "the torque, or the position, may have the wrong sign at lwr_5_joint"),
     "thousand": (thousandfold, {}, "the torque of lwr_1_joint reaches 3.936e.04, 224 times its limit of 176"),
     "spike": (
         spike,
@@ -219,11 +219,11 @@ def test_the_command_says_no_where_people_look(tmp_path: Path, capsys: pytest.Ca
     words = written(tmp_path, negated, {"identification": {"method": "wls"}})
     assert main(words) == 3
     said = capsys.readouterr().out
-    assert said.startswith("DO NOT USE these parameters:\n  - the torque, or the position, may have the wrong sign")
+    assert said.startswith("DO NOT USE these parameters:\n  - the torques of all joints seem to have the wrong sign")
     assert (tmp_path / "out" / "report.txt").read_text().startswith("DO NOT USE")
     page = (tmp_path / "out" / "report.html").read_text()
     assert ">Do not use: " in page
-    assert "<li>the torque, or the position, may have the wrong sign" in page
+    assert "<li>the torques of all joints seem to have the wrong sign" in page
     content = json.loads((tmp_path / "out" / "parameters.json").read_text())
     assert "wrong sign" in content["unusable"][0]
     assert main([*words, "--json"]) == 3
