@@ -100,12 +100,13 @@ def multiples(arm: str, figures: Sequence[Mapping[str, Any]]) -> Markup:
     """Return the small drawings of one arm as HTML; nothing where there are none."""
     if not figures:
         return Markup("")
-    drawn = _environment().get_template("multiples.html").render(arm=arm, figures=figures, width=WIDTH, height=HEIGHT)
+    drawn = environment().get_template("multiples.html").render(arm=arm, figures=figures, width=WIDTH, height=HEIGHT)
     return Markup(drawn)  # noqa: S704 - autoescaped
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Return the environment of the templates of fleets."""
     return Environment(
         loader=PackageLoader(str(__package__)),
         autoescape=True,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
@@ -13,12 +12,11 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from ident_service import __version__
 from ident_service.estimation.change_detection import ALPHA
 from ident_service.estimation.uncertainty import verdicts
-from ident_service.fleet.arm_page import HEIGHT, WIDTH, ArmShown, multiples
+from ident_service.fleet.arm_page import HEIGHT, WIDTH, ArmShown, environment, multiples
 from ident_service.fleet.arm_page import PAGE as PAGE
 from ident_service.fleet.factor import Described
 from ident_service.fleet.population import Group, HeldOut, Population, Shares, Unlike
@@ -375,7 +373,7 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
     # Of many recordings those that have something to tell; the table has all.
     told = [one for one in qualities if one["words"]] if len(qualities) > _ALL_LISTED else qualities
     return (
-        _environment()
+        environment()
         .get_template("fleet.html")
         .render(
             document=document,
@@ -393,14 +391,3 @@ def _report_beside(url: str) -> str | None:
     """Return the address of the report in a local recording's folder, as ident leaves it there; None without one."""
     page = Path(url).with_name("report.html")
     return page.absolute().as_uri() if "://" not in url and page.is_file() else None
-
-
-@cache
-def _environment() -> Environment:
-    return Environment(
-        loader=PackageLoader(str(__package__)),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
