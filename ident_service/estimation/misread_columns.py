@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.config.arm import ArmConfig
 from ident_service.estimation.equations import Rows, equation_rows
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate
@@ -31,7 +32,7 @@ NO_ERROR = 1.0  # percent of a joint's torque; smaller errors count as this one
 BETTER = 3.0  # by which the product of the joints' errors must shrink; real arms with right columns reach 1.7
 NONE_WORSE = 2.0  # by which the error of no joint may grow; that of one whose torque is noise may
 EXPLAINED = 10.0  # percent of all torques in motion that the right reading leaves at most; wrong geometry leaves more
-_LONGEST = 60.0  # s of all recordings together that are fitted
+_LONGEST = 60.0  # s of recordings that are fitted, and of one of them at most
 _ROWS = 1000  # that are fitted, about
 _TRIED = 6  # readings besides signs of torques that are fitted under the conditions, the best without them
 
@@ -143,7 +144,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     rms = estimate.candidates[estimate.chosen].moving.joint_rms
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     weights /= np.exp(np.mean(np.log(weights)))
-    parts = _parts(recordings)
+    parts = _parts(recordings, estimate.model.config)
     as_read = _Equations(estimate, parts, None) if recordings else _EstimatesEquations(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
     found: list[tuple[float, Reading, Information]] = []
@@ -248,13 +249,23 @@ def _thinned(rows: Rows, step: float) -> Rows:
     return Rows(H_b=H_b, **of)
 
 
-def _parts(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the same number of seconds of each recording."""
-    seconds = _LONGEST / max(len(recordings), 1)
-    return [
-        RangeRecording(one, start := one.start if isinstance(one, RangeRecording) else 0.0, start + seconds)
-        for one in recordings
-    ]
+def _parts(recordings: Sequence[Recording], config: ArmConfig) -> list[Recording]:
+    """Return recordings until a minute is full, and of a longer one its first minute: shares could be too short.
+
+    Those that are trimmed, or averaged over periods, are whole: of a minute too little could be left.
+    """
+    found: list[Recording] = []
+    seconds = 0.0
+    uncut = config.identification.period is not None or any(config.recording.trim)
+    for one in recordings:
+        stamps = grid(one, config.recording)
+        start = one.start if isinstance(one, RangeRecording) else 0.0
+        whole = (stamps.last_ns - stamps.first_ns) * 1e-9 <= _LONGEST
+        found.append(one if whole or uncut else RangeRecording(one, start, start + _LONGEST))
+        seconds += min((stamps.last_ns - stamps.first_ns) * 1e-9, _LONGEST)
+        if seconds >= _LONGEST:
+            break
+    return found
 
 
 class _Rearranged:

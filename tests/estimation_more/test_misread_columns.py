@@ -93,6 +93,15 @@ def test_a_torque_of_noise_is_no_misread_column() -> None:
     assert misread_columns(estimate, [poor]) is None
 
 
+def test_many_short_recordings_are_not_cut_to_nothing() -> None:
+    wrong = misread(Reading("torque", (1,)))
+    parts = [RangeRecording(wrong, begin, begin + 3.0) for begin in np.arange(56) * 0.3]
+    estimate = identified(wrong)
+    found = misread_columns(estimate, parts)
+    assert found is not None
+    assert found.reading == Reading("torque", (1,))
+
+
 def test_a_range_of_a_recording_is_read_within_its_range() -> None:
     wrong = misread(Reading("torque", (1,)))
     position = wrong.position.copy()
