@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import ArmConfig
+from ident_service.errors import SolverError
 from ident_service.estimation.equations import Rows, equation_rows
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate
@@ -165,7 +166,10 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     for without_conditions, reading, information in (*signs, *others):
         if without_conditions < most:  # conditions only add to the error
             continue
-        after = _constrained_error(estimate, information, weights)
+        try:
+            after = _constrained_error(estimate, information, weights)
+        except SolverError:  # it explains nothing, and must not end what has been identified
+            continue
         gains = _gains(before, after)
         if gains.sum() >= most and gains.min() >= -np.log(NONE_WORSE) and after.relative_percent < EXPLAINED:
             best, most = MisreadColumns(reading, before, after), float(gains.sum())

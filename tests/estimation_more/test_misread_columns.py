@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from estimation.synthetic import SampledRecording, recorded, waves
 
 from ident_service.config.load import load_arm
+from ident_service.errors import SolverError
+from ident_service.estimation import misread_columns as misread_module
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.misread_columns import Reading, misread_columns
 from ident_service.estimation.plausibility import reasons_against
@@ -91,6 +94,23 @@ def test_a_torque_of_noise_is_no_misread_column() -> None:
     estimate = identified(poor)
     assert estimate.candidates[estimate.chosen].moving.joint_relative_percent[1] > 50.0
     assert misread_columns(estimate, [poor]) is None
+
+
+def test_a_reading_that_no_solver_can_fit_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = misread(Reading("torque", (1,)))
+    estimate = identified(recording)
+    solve = misread_module.constrained_least_squares
+    calls = []
+
+    def fails_but_for_the_columns_as_they_are(*given: Any) -> Any:
+        calls.append(given)
+        if len(calls) > 1:
+            raise SolverError("stopped without an optimum")
+        return solve(*given)
+
+    monkeypatch.setattr(misread_module, "constrained_least_squares", fails_but_for_the_columns_as_they_are)
+    assert misread_columns(estimate, [recording]) is None
+    assert len(calls) > 1
 
 
 def test_many_short_recordings_are_not_cut_to_nothing() -> None:
