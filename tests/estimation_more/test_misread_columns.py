@@ -105,7 +105,7 @@ def test_a_reading_that_no_solver_can_fit_ends_nothing(monkeypatch: pytest.Monke
     def fails_but_for_the_columns_as_they_are(*given: Any) -> Any:
         calls.append(given)
         if len(calls) > 1:
-            raise SolverError("stopped without an optimum")
+            raise SolverError("estimating", "stopped without an optimum")
         return solve(*given)
 
     monkeypatch.setattr(misread_module, "constrained_least_squares", fails_but_for_the_columns_as_they_are)
