@@ -184,7 +184,7 @@ def test_acts_at_a_terminal_are_entered_under_a_name(
             mover._memory[16] = 0
             assert main(["stop", "--state", str(state)]) == 0
             assert mover.stop
-    assert "not entered in the audit trail yet" in capsys.readouterr().err
+    assert "its line in the audit trail is written later" in capsys.readouterr().err
     assert main(["stop", "--state", str(state)]) == 0  # nobody moves: what was wanted is so
     assert "no arm is moving" in capsys.readouterr().out
     fault_file(state, "planar2").latch("late_cycle", "a cycle was late")
