@@ -11,7 +11,6 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
-from fastapi.routing import APIRoute
 
 from ident_service import __version__
 from ident_service.daemon.authentication import Authenticator
@@ -139,7 +138,6 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         docs_url=None,  # these pages load scripts from other machines
         redoc_url=None,
         lifespan=lifespan,
-        generate_unique_id_function=_operation,
     )
     app.state.service = service
     app.state.live = LiveRuns()
@@ -149,7 +147,8 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         db, settings.state, lambda row: jobs.job_answer_document(service, row).model_dump(mode="json")
     )
     for router in ROUTERS:
-        app.include_router(router)
+        # `include_router` would make all models of the routes again, at the first request and in the event loop.
+        app.router.routes.extend(router.routes)
     describe(app)
     install_error_handlers(app)
     book = Connections() if connections is None else connections
@@ -179,8 +178,3 @@ def _webhook(settings: Settings, db: Database) -> Webhook | None:
     if settings.webhook is None or settings.webhook_secret is None:
         return None
     return Webhook(db, settings.webhook, read_secret(settings.webhook_secret))
-
-
-def _operation(route: APIRoute) -> str:
-    """Return the function's name as the operation id of a route, for generated clients."""
-    return route.name

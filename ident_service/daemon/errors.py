@@ -11,9 +11,10 @@ from typing import Any, Final
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 
-from ident_service.daemon.responses import Failure
+from ident_service.daemon.responses import FAILURE_SCHEMA
 from ident_service.errors import (
     AlreadyThere,
     ArmError,
@@ -69,17 +70,18 @@ ANYWAY: Final = "; `?anyway=true` deletes it all the same"
 
 
 def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return the `responses` of a route: its own failure statuses, besides those that any route may have."""
-    every = {400, 401, 403, 413, 421, 422, 429, 503, 507, *statuses}
-    return {status: {"model": Failure, "description": _WORDS[status]} for status in sorted(every)}
+    """Return the `responses` of a route: its own failure statuses, besides those that any route may have.
+
+    They refer to `Failure`; with that as their model, FastAPI would make a validator of each status of each route.
+    """
+    every = sorted({400, 401, 403, 413, 421, 422, 429, 503, 507, *statuses})
+    content = {"application/json": {"schema": {"$ref": FAILURE_SCHEMA}}}
+    return {status: {"description": _WORDS[status], "content": content} for status in every}
 
 
-def failures_of_files(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Return the failure `responses` of a route whose successful answers are not JSON."""
-    content = {"application/json": {"schema": {"$ref": "#/components/schemas/Failure"}}}
-    return {
-        status: {"description": said["description"], "content": content} for status, said in failures(*statuses).items()
-    }
+def operation_id(route: APIRoute) -> str:
+    """Return the function's name as the operation id of a route, for generated clients."""
+    return route.name
 
 
 def status_of(error: IdentError) -> int:

@@ -8,6 +8,8 @@ from typing import Any, Final
 
 from fastapi import FastAPI, Response
 
+from ident_service.daemon.responses import FAILURE_SCHEMA, Failure
+
 _CONFIRM: Final = {"name": "wam7_sim", "challenge": "bGV0IGl0IG1vdmU"}
 _YAML: Final = "extends: planar2\nname: bench\ncontrol: {rate: 500}\n"
 _RUN: Final = "20261101T080000Z-wam7_sim-3fa9c1"
@@ -102,6 +104,9 @@ def describe(app: FastAPI) -> None:
 
 
 def _complete(document: dict[str, Any]) -> None:
+    failure = Failure.model_json_schema(ref_template="#/components/schemas/{model}")
+    schemas = document["components"]["schemas"] | failure.pop("$defs") | {"Failure": failure}
+    document["components"]["schemas"] = dict(sorted(schemas.items()))
     for item in document["paths"].values():
         for operation in item.values():
             # The first sentence of the function's docstring says what is done; its name is only an id.
@@ -115,6 +120,6 @@ def _complete(document: dict[str, Any]) -> None:
                 body["examples"] = {title: {"value": value} for title, value in given.items()}
             for status, answer in operation["responses"].items():
                 content = answer.get("content", {}).get("application/json", {})
-                if content.get("schema") == {"$ref": "#/components/schemas/Failure"}:
+                if content.get("schema") == {"$ref": FAILURE_SCHEMA}:
                     kind, message = FAILURES[int(status)]
                     content["example"] = {"error": {"kind": kind, "message": message}}

@@ -45,6 +45,10 @@ class Failure(BaseModel):
     error: Mistake
 
 
+FAILURE_SCHEMA: Final = "#/components/schemas/Failure"
+"""Its place in the OpenAPI description."""
+
+
 class ArmLine(BaseModel):
     """One arm in the list of arms."""
 

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
+from ident_service.daemon.app import ROUTERS
 from ident_service.daemon.openapi import EXAMPLES
 from ident_service.daemon.request_guard import MOST_BODY
 
@@ -40,6 +41,11 @@ def test_every_answer_has_a_type_and_every_failure_the_one_shape(daemon: Asked) 
                     assert content["application/json"]["schema"] not in ({}, None), (method, path, status)
     assert len(set(names)) == len(names) > 25
     assert "HTTPValidationError" not in json.dumps(document["paths"])
+
+
+def test_routes_are_made_once_and_not_again_at_the_first_request(daemon: Asked) -> None:
+    served = {id(route) for route in daemon.app.routes}
+    assert all(id(route) in served for router in ROUTERS for route in router.routes)
 
 
 @pytest.mark.slow

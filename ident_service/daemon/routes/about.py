@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from ident_service import __version__
 from ident_service.daemon.authentication import SESSION_SECONDS, Throttled
 from ident_service.daemon.dependencies import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
-from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.responses import PAGES, AuditLine, BeforeNumber, HealthAnswer, Most, Page, WhoAnswer
 from ident_service.errors import IdentError
 from ident_service.operations.drift_alarms import alarms
@@ -20,7 +20,7 @@ from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import fault_file
 
-router = APIRouter(tags=["service"], responses=failures())
+router = APIRouter(tags=["service"], responses=failures(), generate_unique_id_function=operation_id)
 AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines
 
 
@@ -41,7 +41,7 @@ def healthz(service: Serving, response: Response) -> HealthAnswer:
     return HealthAnswer(healthy=healthy, version=__version__)
 
 
-@router.get("/metrics", response_class=PlainTextResponse, responses=failures_of_files())
+@router.get("/metrics", response_class=PlainTextResponse, responses=failures())
 def metrics(service: Serving, _: Viewer) -> PlainTextResponse:
     """Return the metrics of the service in Prometheus' text format."""
     rows = service.db.rows("SELECT kind, state, COUNT(*) AS number FROM jobs GROUP BY kind, state")

@@ -13,10 +13,10 @@ from fastapi import APIRouter, Path
 from pydantic import BaseModel
 
 from ident_service.daemon.dependencies import Operator, Serving
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.registry.tokens import revoke_token, tokens
 
-router = APIRouter(prefix="/api/v1", tags=["tokens"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["tokens"], responses=failures(404), generate_unique_id_function=operation_id)
 TokenName = Annotated[str, Path(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
 
 

@@ -12,7 +12,7 @@ from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_BYTES
 from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.responses import (
     PAGES,
@@ -39,7 +39,7 @@ from ident_service.registry.database import note
 from ident_service.registry.runs import run_folder
 from ident_service.registry.state_folder import control_path, fault_file
 
-router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404), generate_unique_id_function=operation_id)
 Text = Annotated[str, Field(max_length=known.MOST_BYTES)]
 Note = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
 

@@ -9,13 +9,13 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from ident_service.daemon.dependencies import Operator, Serving
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, Id
 from ident_service.daemon.responses import DeletionAnswer, DependentAnswer
 from ident_service.errors import Dependent
 from ident_service.operations import deletion
 
-router = APIRouter(prefix="/api/v1", responses=failures(404, 409))
+router = APIRouter(prefix="/api/v1", responses=failures(404, 409), generate_unique_id_function=operation_id)
 Anyway = Annotated[bool, Query(description="although something refers to it; 409 names what, and what becomes of it")]
 
 

@@ -16,14 +16,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.config.load import load_arm
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName
 from ident_service.daemon.routes.arms import Description
 from ident_service.errors import UsageError
 from ident_service.operations.description_process import describe_apart, judge_apart
 from ident_service.registry.arms import known_arm, uploaded
 
-router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404), generate_unique_id_function=operation_id)
 
 
 class DescriptionAnswer(BaseModel):

@@ -13,21 +13,21 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
 from ident_service.daemon.dependencies import Service, Serving, Viewer, WhileAuthorized
-from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.live import LiveRuns
 from ident_service.daemon.live_stream import RECORDED
 from ident_service.daemon.news import EventPoller, ViewerEvent, ViewerPosition
 from ident_service.registry import jobs as rows
 from ident_service.registry.runs import RUNS
 
-router = APIRouter(prefix="/api/v1", tags=["events"], responses=failures())
+router = APIRouter(prefix="/api/v1", tags=["events"], responses=failures(), generate_unique_id_function=operation_id)
 _LOOK = 0.1  # s between news
 _STATE = 0.5  # s between queries for runs that are being recorded
 _BREATH = 10.0  # s without news, after which a comment shows that the connection is up
 _AGAIN = 1000  # ms after which a browser reconnects
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
-    **failures_of_files(),
+    **failures(),
 }
 LastEvent = Annotated[
     int | None,

@@ -9,14 +9,16 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from ident_service.daemon.dependencies import Serving, Viewer
-from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import FileName, Id
 from ident_service.registry import runs
 
-router = APIRouter(prefix="/api/v1", tags=["exports"], responses=failures(404))
+router = APIRouter(
+    prefix="/api/v1", tags=["exports"], responses=failures(404), generate_unique_id_function=operation_id
+)
 _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
-    **failures_of_files(404),
+    **failures(404),
 }
 
 

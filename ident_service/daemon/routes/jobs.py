@@ -18,7 +18,7 @@ from fastapi.responses import PlainTextResponse, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Viewer, WhileAuthorized
-from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import held_until, said, untold
 from ident_service.daemon.jobs.requests import MOVES, ArmName, Asked, Id
@@ -40,7 +40,9 @@ from ident_service.registry.database import Row
 from ident_service.registry.state_folder import arm_folder
 from ident_service.registry.tokens import Access
 
-router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404, 409))
+router = APIRouter(
+    prefix="/api/v1", tags=["jobs"], responses=failures(404, 409), generate_unique_id_function=operation_id
+)
 MOST_LOG: Final = 2**20
 NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 _EVENTS = 0.2  # s between looks at a job that is watched
@@ -50,7 +52,7 @@ _KNOWN: Final = 0.5  # s for the registry to say whether an arm that nobody move
 _STOPS = ThreadPoolExecutor(4, thread_name_prefix="stop")
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
-    **failures_of_files(404, 409),
+    **failures(404, 409),
 }
 _REPLAYED: Final[dict[str, Any]] = {
     "Idempotent-Replayed": {
@@ -166,7 +168,7 @@ def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
     return job_answer_document(service, rows.known_job(service.db, job))
 
 
-@router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures_of_files(404, 409))
+@router.get("/jobs/{job}/log", response_class=PlainTextResponse, responses=failures(404, 409))
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
     """Return the end of the log of a job."""
     row = rows.known_job(service.db, job)

@@ -9,15 +9,15 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
 from ident_service.daemon.dependencies import Serving, Viewer, WhileAuthorized
-from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import Id
 from ident_service.daemon.live_stream import live_events
 from ident_service.registry import jobs as rows
 
-router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["jobs"], responses=failures(404), generate_unique_id_function=operation_id)
 _STREAM: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/event-stream": {}}, "description": "Events."},
-    **failures_of_files(404),
+    **failures(404),
 }
 
 

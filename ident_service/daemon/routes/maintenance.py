@@ -10,7 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.daemon.dependencies import LeaseKeeper, Operator, Service, Serving, Viewer
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, Id
 from ident_service.daemon.maintenance.reidentification import (
     ReidentificationRequest,
@@ -122,7 +122,9 @@ class AlarmAnswer(BaseModel):
     how: str
 
 
-router = APIRouter(prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409))
+router = APIRouter(
+    prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409), generate_unique_id_function=operation_id
+)
 Number = Annotated[int, Path(ge=1, lt=2**62)]
 Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
 

@@ -8,12 +8,12 @@ from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.daemon.dependencies import Operator, Serving
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.routes.jobs import without_paths
 from ident_service.operations import run_archive
 from ident_service.registry.runs import rebuild_runs
 
-router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures())
+router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(), generate_unique_id_function=operation_id)
 
 
 class Pruning(BaseModel):

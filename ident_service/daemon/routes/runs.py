@@ -9,7 +9,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
-from ident_service.daemon.errors import failures, failures_of_files
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.responses import (
     PAGES,
@@ -27,11 +27,11 @@ from ident_service.registry import runs
 from ident_service.registry.database import Row
 from ident_service.registry.runs import REPORTS
 
-router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404))
+router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404), generate_unique_id_function=operation_id)
 _REPORT = "report.html"
 _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
-    **failures_of_files(404),
+    **failures(404),
 }
 # Content security policy of the report: its inline style and script run in a sandbox and can reach nothing.
 _POLICY = (
@@ -40,7 +40,7 @@ _POLICY = (
 )
 _PAGE: dict[int | str, dict[str, Any]] = {
     200: {"content": {"text/html": {}}, "description": "The report."},
-    **failures_of_files(404),
+    **failures(404),
 }
 
 

@@ -11,11 +11,13 @@ from starlette.requests import ClientDisconnect
 
 from ident_service.daemon import uploads
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.errors import IdentError
 
-router = APIRouter(prefix="/api/v1", tags=["uploads"], responses=failures(404))
+router = APIRouter(
+    prefix="/api/v1", tags=["uploads"], responses=failures(404), generate_unique_id_function=operation_id
+)
 _PIECE: Final[dict[str, Any]] = {
     "requestBody": {
         "required": True,

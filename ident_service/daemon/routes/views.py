@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from ident_service.config.load import arm_from_json, load_recording_format
 from ident_service.daemon.dependencies import Serving, Viewer
-from ident_service.daemon.errors import failures
+from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.live import ARM
 from ident_service.errors import UnknownId, UsageError
@@ -25,7 +25,9 @@ from ident_service.registry import arms as known
 from ident_service.registry import motions, runs
 from ident_service.results.manifest import file_sha256
 
-router = APIRouter(prefix="/api/v1", tags=["views"], responses=failures(404, 409))
+router = APIRouter(
+    prefix="/api/v1", tags=["views"], responses=failures(404, 409), generate_unique_id_function=operation_id
+)
 _KEPT: Final = 16
 _MOST_BYTES: Final = 256 * 2**20  # of a recording: half a minute of reading
 OWN: Final = "own"
