@@ -146,8 +146,11 @@ def read_source(path: Path, convention: str | None = None) -> Source:
         raise UsageError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from None
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        line = 1 + error.object[: error.start].count(b"\n")
+        raise UsageError(f"{path}:{line}: not UTF-8 text; save the file in that encoding") from None
     suffix = path.suffix.lower()
     if suffix in (".csv", ".yaml", ".yml"):
         table, limits = (_csv_table if suffix == ".csv" else _yaml_table)(path, text, convention)

@@ -98,7 +98,9 @@ def _new_document(source: Path, name: str) -> dict[str, Any]:
         files = {one.name: one.read_text(encoding="utf-8") for one in sorted(place.iterdir()) if one != path}
         named = {file: text for file, text in files.items() if file == source.name}
         return {"description": path.read_text(encoding="utf-8"), "files": named, "guessed": list(guessed)}
-    except (IdentError, OSError, UnicodeError) as error:
+    except UnicodeDecodeError:
+        return {"error": f"{source.name}: not UTF-8 text; save the file in that encoding"}
+    except (IdentError, OSError) as error:
         return {"error": str(error).replace(f"{place}/", "").replace(f"{source.parent}/", "")}
 
 

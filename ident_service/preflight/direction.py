@@ -26,12 +26,11 @@ from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, measures
 from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
 from ident_service.preflight.delay import CALM, FREQUENCY, Delay, delay_measures, dither
-from ident_service.preflight.session import BAND, Rows, Session, Trace
+from ident_service.preflight.session import BAND, CREEP, Rows, Session, Trace
 from ident_service.preflight.stability import INERTIA, drive_matrix, known_drives
 
 AMPLITUDES = (0.04, -0.04, 0.02, -0.02)  # rad or m, the first that is free
 SPEED, ACCELERATION = 0.2, 1.2  # rad/s and rad/s^2, or m: at one metre 0.2 m/s, below the 0.25 of ISO 10218
-_WHOLE = 0.02  # rad/s or m/s, at which the loop compensates all of the friction that it has learned
 DWELL, _SETTLED = 0.25, 0.1  # s at each end, and of it what displacements are measured in
 LEARNING = (6.0, 3.0)  # 1/s, in turn: dry friction is learned at this rate, and taken as known the last time
 FOLLOWS = (0.8, 1.25)  # measured against commanded displacement
@@ -113,8 +112,8 @@ def strokes(session: Session, model: ArmModel, limits: MotionLimits, only: int |
     collision = CollisionModel(model)
     own = np.diag(session.mass)
     friction = expected_friction(model, limits, model.config.design.friction_guess).at_joints(model.chain).coulomb
-    # The torque against friction rises while the joint sets off, from none to all of it at the speed `_WHOLE`.
-    calm = CALM * np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * _WHOLE
+    # The torque against friction rises while the joint sets off, from none to all of it at the speed `CREEP`.
+    calm = CALM * np.minimum(TORQUE_RATE, TORQUE_RATE_SHARE * limits.torque) * CREEP
     acceleration = np.minimum(np.minimum(limits.acceleration, ACCELERATION), 0.5 * BAND * limits.torque / own)
     slow = replace(
         limits,

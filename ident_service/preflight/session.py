@@ -113,7 +113,7 @@ def remedy_of(fault: ArmFault) -> str | None:
 FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motions that prove directions
 FASTEST = 1.0  # rad/s or m/s: where the guard stops; motions here are slower by far
 BAND = 0.25  # of the torque limit, beside the model's gravity torque and expected friction
-_CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
+CREEP = 0.02  # rad/s or m/s, below which friction is not compensated, so that nothing hunts at rest
 MISSING = 2  # cycles in a row without its position, after which a joint's drive may have left on purpose
 RELEASE = 0.5  # s over which torque is led to zero
 MOVED_CODE = "moved_before_enabled"
@@ -298,7 +298,7 @@ class Session:
             wanted = self._safe_torque(sample, setpoint, np.zeros(len(self.home), dtype=bool))
             if shaking is not None:
                 # On its way only: a joint that sticks would look like one whose encoder does.
-                moving = np.clip(np.abs(setpoint.velocity) / (2.0 * _CREEP), 0.0, 1.0)
+                moving = np.clip(np.abs(setpoint.velocity) / (2.0 * CREEP), 0.0, 1.0)
                 wanted = wanted + moving * shaking[0] * np.sin(2.0 * np.pi * shaking[1] * elapsed)
             if self.gives_positions:
                 self._target = self._passed(setpoint.position)
@@ -406,10 +406,10 @@ class Session:
         Friction is the drives': one that moves several joints lags by what all of them do, and pushes all of them.
         """
         rate = self._coupling @ setpoint.velocity
-        direction = np.where(np.abs(rate) > _CREEP, np.sign(rate), 0.0)
+        direction = np.where(np.abs(rate) > CREEP, np.sign(rate), 0.0)
         lag = self._coupling @ (setpoint.position - self._control.position) * direction
         self._friction = np.clip(self._friction + learning * self.period * self._stiffness * lag, 0.0, self._most)
-        return np.asarray(self._coupling.T @ (self._friction * np.clip(rate / _CREEP, -1.0, 1.0)))
+        return np.asarray(self._coupling.T @ (self._friction * np.clip(rate / CREEP, -1.0, 1.0)))
 
     def _passed(self, wanted: Vector) -> Vector:
         """Return the position that the guard lets pass [rad or m], shape (joints,)."""

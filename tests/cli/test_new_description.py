@@ -396,6 +396,7 @@ def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
     ("text", "code", "words"),
     [
         ("no xml", 2, "not a URDF that can be read"),
+        ('<robot\nname="é"/>', 2, "x.urdf:2: not UTF-8 text; save the file in that encoding"),
         ('<robot name="x"><link name="a"/></robot>', 2, "no movable joint"),
         ('<robot name="x"><link name="a"/><link name="b"/></robot>', 2, "2 links hang on no joint"),
     ],
@@ -403,7 +404,7 @@ def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
 def test_a_file_that_holds_no_arm_leaves_nothing(
     text: str, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "x.urdf").write_text(text)
+    (tmp_path / "x.urdf").write_text(text, encoding="latin-1")
     assert main(["new", str(tmp_path / "x.urdf"), "--out", str(tmp_path / "new" / "x.yaml")]) == code
     assert words in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["x.urdf"]
