@@ -20,6 +20,8 @@ _Report = TypeVar("_Report", pytest.TestReport, pytest.CollectReport)
 _CI = os.environ.get("CI") == "true"
 # Small matrices on several BLAS threads are slow, and very slow on a busy machine; child processes inherit this.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Arrow's own pool reserves a gibibyte, which a test that locks this process' memory would fill.
+os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
 os.environ.pop("PYTHONUNBUFFERED", None)  # it hides what a buffer does when the command ends
 threadpool_limits(limits=1, user_api="blas")
 _SHARED = Path(__file__).resolve().parents[2] / "shared"
