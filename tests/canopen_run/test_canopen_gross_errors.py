@@ -53,6 +53,7 @@ def checked(told: ArmConfig, real: ArmConfig, *faults: str) -> dict[str, Check]:
     return {check.code: check for check in ticket.checks}
 
 
+@pytest.mark.campaign
 def test_a_sound_wam_passes_with_every_watchdog_proven_twice() -> None:
     checks = checked(wam(), wam())
     assert [check.reason for check in checks.values() if check.verdict is Verdict.FAILED] == []

@@ -48,8 +48,9 @@ def of_makers(tree: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["drives", pytest.param("makers", marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("name", ["drives", "makers"])
 def test_arms_have_the_same_parameters_within_their_standard_deviations(name: str, tmp_path: Path) -> None:
     if name == "makers" and not SHEETS.is_dir():
         pytest.skip("the makers' data sheets are not beside this checkout")

@@ -39,7 +39,7 @@ def emulated_arm(folder: Path) -> Path:
     "make",
     [
         pytest.param(simulated_arm, marks=pytest.mark.campaign, id="simulated"),
-        pytest.param(emulated_arm, id="emulated"),
+        pytest.param(emulated_arm, marks=pytest.mark.campaign, id="emulated"),
     ],
 )
 def test_it_is_checked_moved_and_its_drives_parameters_are_found(make: Any, tmp_path: Path) -> None:

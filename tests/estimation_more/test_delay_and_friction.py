@@ -312,8 +312,9 @@ def test_the_rate_and_other_options_come_back_untouched() -> None:
     assert model.config.identification is before
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.parametrize("noise", [pytest.param(NOISE, marks=pytest.mark.campaign), 0.3])
+@pytest.mark.parametrize("noise", [NOISE, 0.3])
 def test_deviations_of_friction_hold_where_its_shape_was_fitted(noise: float) -> None:
     model, base, delta = rubbing(FIT)
     conditions = feasible_set("pseudo_inertia", base.names, model.config)

@@ -38,7 +38,9 @@ def coarse(arm: ArmConfig) -> ArmConfig:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["planar2", "threelink", pytest.param("sixaxis", marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "name", ["planar2", *(pytest.param(arm, marks=pytest.mark.campaign) for arm in ("threelink", "sixaxis"))]
+)
 def test_a_small_arm_runs_its_designed_motion(name: str, tmp_path: Path) -> None:
     arm = coarse(load_arm(name))
     motion = design_motion(arm_model(arm), quick(harmonics=3), budget=ONE_START).excitation

@@ -118,7 +118,7 @@ def test_noise_is_the_simulated_driver_s_else_a_hundredth_of_the_torque() -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.campaign), 1])
 def test_a_motion_designed_with_earlier_information_teaches_more_of_the_rest(seed: int) -> None:
     # Half of the parameters are known already, a thousand times better than one motion will tell.
     model, design = MODEL, quick(criterion="a_optimal")

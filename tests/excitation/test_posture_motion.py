@@ -47,6 +47,7 @@ def test_a_few_postures_in_a_tiny_workspace_teach_all_static_parameters_and_ever
     assert np.isfinite(deviations).all()
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_description_can_ask_for_postures() -> None:
     design = quick(motion="postures", postures=4, way=1.0, dwell=0.1)

@@ -71,6 +71,7 @@ def test_for_likely_link_values_no_parameter_moves_by_more_than_a_hundredth_of_i
     assert moved.max() > 0.0
 
 
+@pytest.mark.campaign
 def test_the_entropic_prior_of_the_kuka_is_no_worse(identified: Identified) -> None:
     case = CASES[0]
     plain, pulled = (identified(case.arm, prior) for prior in ("none", "entropic"))

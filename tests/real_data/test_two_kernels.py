@@ -61,8 +61,14 @@ def two_kernels() -> list[str]:
     return known[-2:]
 
 
+NIGHT = ("tx40",)  # beside two real arms and that of the demo
+
+
 @pytest.mark.usefixtures("shared")
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.arm)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, id=case.arm, marks=pytest.mark.campaign if case.arm in NIGHT else ()) for case in CASES],
+)
 def test_a_real_arm_has_the_same_parameters_on_two_processors(case: Any) -> None:
     assert_same(case.arm)
 
