@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.certificate_verifier import (
@@ -35,7 +35,6 @@ def gram(factor: Matrix) -> Matrix:
     return [[sum((a * b for a, b in zip(x, y, strict=True)), Fraction(0)) for y in factor] for x in factor]
 
 
-@settings(max_examples=100)
 @given(matrices(4, 2))
 def test_a_gram_matrix_of_low_rank_is_semidefinite_and_not_definite(factor: Matrix) -> None:
     assert is_positive_semidefinite(gram(factor))
@@ -43,7 +42,6 @@ def test_a_gram_matrix_of_low_rank_is_semidefinite_and_not_definite(factor: Matr
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
 @given(matrices(4, 3), st.fractions(min_value=Fraction(1, 10**12), max_value=1))
 def test_a_gram_matrix_with_the_least_lift_is_definite_and_with_the_least_drop_is_nothing(
     factor: Matrix, lift: Fraction
@@ -59,7 +57,6 @@ def test_a_gram_matrix_with_the_least_lift_is_definite_and_with_the_least_drop_i
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
 @given(matrices(3, 3), st.lists(small, min_size=3, max_size=3))
 def test_a_negative_direction_is_found(factor: Matrix, direction: list[Fraction]) -> None:
     matrix = [[factor[min(i, j)][max(i, j)] for j in range(3)] for i in range(3)]
@@ -78,7 +75,6 @@ def test_a_zero_pivot_needs_a_zero_row() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
 @given(matrices(3, 5), st.lists(small, min_size=5, max_size=5), st.lists(small, min_size=5, max_size=5))
 def test_repaired_values_solve_the_equations_exactly(
     matrix: Matrix, solution: list[Fraction], start: list[Fraction]
@@ -95,7 +91,6 @@ def test_equations_that_contradict_each_other_are_not_repaired() -> None:
     assert repair([{"a": one}, {"a": one}], [one, 2 * one], {"a": one}, lambda _: 1.0) is None
 
 
-@settings(max_examples=100)
 @given(st.fractions() | st.floats(allow_nan=False, allow_infinity=False).map(lambda x: Fraction(repr(x))))
 def test_numbers_are_written_and_read_without_loss(value: Fraction) -> None:
     assert rational(rational_text(value)) == value
