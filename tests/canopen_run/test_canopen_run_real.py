@@ -159,6 +159,7 @@ def stood_where_it_ended(bench: Bench, folder: Path) -> None:
     assert np.abs(kept - last).max() < 0.05
 
 
+@pytest.mark.campaign
 def test_drives_in_another_process_that_are_given_positions_are_checked_and_moved(tmp_path: Path) -> None:
     """Preflight withholds what their watchdogs watch, too; what they measure identifies the arm."""
     bench = Bench(tmp_path, "given_positions", 100.0, streams="position")

@@ -68,11 +68,13 @@ def test_a_search_bounded_by_starts_repeats(designed: DesignedBefore, tmp_path: 
     assert {key: first[key] for key in "ab"} == {key: second[key] for key in "ab"}
 
 
+@pytest.mark.campaign
 def test_another_seed_finds_another_motion(designed: DesignedBefore, tmp_path: Path, ident: Ident) -> None:
     assert ident("design", designed.arm, *QUICK, "--seed", 5, "--out", tmp_path / "other").code == 0
     assert read(designed.folder / "motion.json")["a"] != read(tmp_path / "other" / "motion.json")["a"]
 
 
+@pytest.mark.campaign
 def test_design_goes_on_from_an_earlier_search(designed: DesignedBefore, tmp_path: Path, ident: Ident) -> None:
     ended = ident(
         "design",
@@ -195,6 +197,7 @@ def test_home_in_collision_is_refused_with_the_pair(tmp_path: Path, ident: Ident
     assert "elbow - obstacle post" in ended.err
 
 
+@pytest.mark.campaign
 def test_postures_are_designed_too(designed: DesignedBefore, tmp_path: Path, ident: Ident) -> None:
     ended = ident("design", designed.arm, *QUICK, "--motion", "postures", "--postures", 4, "--out", tmp_path / "slow")
     assert ended.code == 0
@@ -202,6 +205,7 @@ def test_postures_are_designed_too(designed: DesignedBefore, tmp_path: Path, ide
     assert (motion["kind"], len(motion["points"])) == ("postures", 7)
 
 
+@pytest.mark.campaign
 def test_chosen_parameters_gain_most_from_a_design_for_them(
     designed: DesignedBefore, tmp_path: Path, ident: Ident
 ) -> None:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers.tickets import write_checked_ticket
 
 from drivers.canopen.replay import read_session
 from ident_service.cli import DONE, FAILED, USAGE, main
-from ident_service.config.load import shipped_arms
+from ident_service.config.load import load_arm, shipped_arms
 
 
 @pytest.fixture
@@ -23,6 +24,7 @@ def drives_arm(tmp_path: Path) -> Path:
         "extends": str(shipped),
         "name": "drives2",
         "gravity": [0.0, 0.0, -9.81],
+        "control": {"rate": 250},
         "motions": {"identification": motion, "validation": dict(motion)},
         "transmission": {"ratios": [40.0, 20.0], "drive_terms": "joints"},
         "driver": {
@@ -61,7 +63,6 @@ def test_it_is_refused_where_nothing_moves_or_no_frames_are(tmp_path: Path, caps
     assert main(["recover", "planar2", "--can-log", *state]) == USAGE
     assert "--can-log is for --leave-limit" in capsys.readouterr().err
     # The simulated arm has no fieldbus: said by the motion process, before it is opened.
-    assert main(["check", "planar2", "--confirm", "planar2", *state]) == DONE
-    capsys.readouterr()
+    write_checked_ticket(load_arm("planar2"), tmp_path / "state")
     assert main(["run", "planar2", "--can-log", "--out", str(tmp_path / "run"), *state]) == FAILED
     assert "no fieldbus whose frames could be logged" in capsys.readouterr().err
