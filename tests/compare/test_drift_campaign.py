@@ -41,6 +41,7 @@ def drier_elbow(pair: Pair) -> bool:
     return [finding.what for finding in findings(pair)] == ["friction of joint elbow"]
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_an_unchanged_and_a_drier_arm_after_another_motion(commissioned: Path, tmp_path: Path) -> None:
     accepted = read_side(commissioned / "accepted")

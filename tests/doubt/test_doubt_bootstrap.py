@@ -79,6 +79,7 @@ def test_it_is_calibrated_where_noise_is_coloured_and_a_bound_binds() -> None:
     assert np.all(share < 1.01)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_run_holds_what_neighbours_have_in_common() -> None:
     # Columns hardly move while the noise remembers four blocks: single blocks promise too much, runs much less so.

@@ -40,8 +40,9 @@ def refined(
     return fit, np.sqrt(np.diag(block_covariance(gathered, fit))), result
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [False, pytest.param(True, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("given", [False, True])
 def test_least_squares_is_biased_in_a_noisy_loop_and_instruments_are_not(given: bool) -> None:
     model, truth = pendulum_model()
     beta = base_parameters(model.chain, model.layout).K @ truth

@@ -79,6 +79,7 @@ def test_a_run_ends_early_with_what_it_is_for(
     assert content["feasibility"]["feasible"]
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(

@@ -44,7 +44,7 @@ def noted(kill: Kill, outcome: Outcome) -> Outcome:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kill", [kills(1, 9, 0.5)[index] for index in (0, 1, 2, 4, 6, 8)], ids=str)
+@pytest.mark.parametrize("kill", [kills(1, 9, 0.5)[index] for index in (1, 2, 6)], ids=str)
 def test_some_kills(kill: Kill, virtual: Lane, capsys: pytest.CaptureFixture[str]) -> None:
     outcome = noted(kill, virtual.kill(kill, capsys))
     assert outcome.status is None or outcome.status.came_to_rest

@@ -242,6 +242,7 @@ def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tm
     assert not (tmp_path / "again").exists()
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_motions_ticket_is_one_for_the_way_home(ident: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     assert ident("check", "--confirm", "planar2")[0] == 0

@@ -152,6 +152,7 @@ def test_a_parent_that_hangs_loses_its_lease(started: Started, tmp_path: Path) -
     assert set(faults.latched()) == {"lease_lost"}
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_rehearsal_is_the_same_way_at_a_fifth_of_the_speed(virtual_arm: Path, tmp_path: Path) -> None:
     words = ["--out", str(tmp_path / "run"), *checked(virtual_arm, tmp_path / "state")]
