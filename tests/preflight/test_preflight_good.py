@@ -131,7 +131,7 @@ def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act(monkeypatch: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["planar2", "sixaxis"])
+@pytest.mark.parametrize("name", ["planar2", pytest.param("sixaxis", marks=pytest.mark.campaign)])
 def test_a_shipped_arm_with_geometry_and_noise_passes(name: str) -> None:
     """Gears as dry as the six-axis arm's change the torque fastest, where a test motion sets off."""
     model = arm_model(load_arm(name))
@@ -157,6 +157,7 @@ def test_a_period_without_a_cycle_is_filled_in_and_the_torque_before_it_acted_on
     np.testing.assert_array_equal(whole.torque[:, 1], -10.0 * np.arange(8))
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_the_shipped_wam_may_move_after_the_check_of_the_readme(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
