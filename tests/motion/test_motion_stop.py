@@ -209,7 +209,7 @@ def test_a_stop_from_what_is_no_number_is_no_number_and_raises_nothing(which: st
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(SEEDS)
 def test_the_extent_of_the_stops_is_that_of_every_single_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
