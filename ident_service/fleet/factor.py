@@ -56,7 +56,7 @@ from ident_service.recordings.resampling import grid
 
 _Given = ParamSpec("_Given")
 _Found = TypeVar("_Found")
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 STRETCHES: Final = 12  # kept of a recording, as few as the uncertainty of one needs
 FAN_IN: Final = 16  # factors that are merged at once
 AT_ONCE: Final = FAN_IN**2  # factors that one task merges, a whole branch of the tree: what it sends on is large
@@ -303,7 +303,7 @@ class Settled:
     pilots: tuple[str, ...]
 
 
-def _trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
+def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
     """Give free memory back to the system after some tasks, where the C library can: half of what a worker has.
 
     Else a worker that has long finished looks as if it needed more than it may have, and Dask gives it nothing to do.
@@ -378,7 +378,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
     return Settled(settled.model_dump_json(), tuple(pilots))
 
 
-@_trimmed
+@trimmed
 @one_blas_thread()
 def reduce_recording(part: Part, described: Described, store: Store, version: str, again: bool = False) -> Outcome:
     """Reduce a recording, or a piece of one, to a factor in the store, unless it is there.
@@ -587,7 +587,7 @@ def unpacked(content: bytes, described: Described) -> Merged:
     return Merged(parts[0], parts[1], tuple(parts[2:]), samples)
 
 
-@_trimmed
+@trimmed
 @one_blas_thread()
 def merge_stored(keys: Sequence[str], described: Described, store: Store, whole: bool) -> Merged | tuple[str, ...]:
     """Merge stored factors in the order given, in a tree of `FAN_IN` neighbours each.

@@ -93,6 +93,23 @@ class ArmFit:
     total: Information
     error: TorqueError
 
+    @classmethod
+    def of(cls, fit: LeastSquares, doubt: Uncertainty, clusters: int, total: Information, error: TorqueError) -> ArmFit:
+        """Return the estimate with its precision where nothing differs from recording to recording."""
+        degrees = max(int(total.rows.sum()) - total.base, 1)
+        variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
+        # One factor for all: factors of their own would turn the combinations that are known well into others.
+        precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
+        return cls(fit, doubt, clusters, precision, total, error)
+
+    def weighed(self, between: Array) -> ArmFit:
+        """Return the estimate as less sure by what differs from recording to recording.
+
+        Args:
+            between: variance of the arm's mean by that [SI^2], shape (base,).
+        """
+        return replace(self, precision=_widened(self.precision, between))
+
     @property
     def right(self) -> Array:
         """Return the precision times the estimate, shape (base,)."""
@@ -100,27 +117,20 @@ class ArmFit:
 
 
 @one_blas_thread()
-def arm_fit(merged: Merged, method: str, between: Array | None = None, doubt: Uncertainty | None = None) -> ArmFit:
+def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit:
     """Estimate one arm from merged factors.
 
     Args:
         merged: its information.
         method: `ols` gives all joints the same weight.
-        between: variance of the arm's mean by what differs from recording to recording [SI^2], shape (base,); None
-            where recordings are the clusters, whose covariance has it already.
-        doubt: its uncertainty, which takes most of the time, where it is known; estimated if None.
+        between: as of `ArmFit.weighed`; None where recordings are the clusters, whose covariance has it already.
     """
-    total = merged.fitted.total
+    fitted = merged.fitted
+    total = fitted.total
     fit = ordinary_least_squares(total) if method == "ols" else weighted_least_squares(total)
-    doubt = uncertainty(merged.fitted, fit) if doubt is None else doubt
-    degrees = max(int(total.rows.sum()) - total.base, 1)
-    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
-    # One factor for all: factors of their own would turn the combinations that are known well into others.
-    precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
-    if between is not None:
-        precision = _widened(precision, between)
-    everything = merged.everything
-    return ArmFit(fit, doubt, len(merged.clusters), precision, total, torque_error(everything, fit.beta))
+    error = torque_error(merged.everything, fit.beta)
+    found = ArmFit.of(fit, uncertainty(fitted, fit), len(merged.clusters), total, error)
+    return found if between is None else found.weighed(between)
 
 
 def _widened(precision: Array, variances: Array) -> Array:
@@ -591,9 +601,11 @@ def held_out_errors(
         scale: D, shape (base,).
         described: the arm.
     """
-    everything = unseen.everything
-    errors = [
-        torque_error(everything, constrained(fit, described)).relative_percent
-        for fit in (alone.fit, pooled_fit(alone, prior, scale))
-    ]
-    return errors[0], errors[1]
+    alone_fit, pooled = alone.fit, pooled_fit(alone, prior, scale)
+    return error_on(unseen, alone_fit, described), error_on(unseen, pooled, described)
+
+
+@one_blas_thread()
+def error_on(unseen: Merged, fit: LeastSquares, described: Described) -> float:
+    """Return the torque error of an estimate, inside the feasible set, on recordings that it has not seen [percent]."""
+    return torque_error(unseen.everything, constrained(fit, described)).relative_percent
