@@ -64,6 +64,10 @@ MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge beyond, so that memory 
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
 _TRIMMED_EVERY: Final = 16  # tasks
+# Of glibc's malloc.h, and what they are set to: free memory that is kept, and size from which memory is mapped.
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
+_KEPT_BYTES, _MAPPED_BYTES = 256 << 20, 32 << 20
 _PILOTS: Final = 3  # recordings that settle choices
 # Raised for what is in a recording; a file of random bytes can make a reader raise any of these.
 _UNUSABLE: Final = (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError)
@@ -304,19 +308,21 @@ class Settled:
 
 
 def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Give free memory back to the system after some tasks, where the C library can: half of what a worker has.
+    """Let the C library, where it can, keep what a task frees for the next one, and give it back after some tasks.
 
-    Else a worker that has long finished looks as if it needed more than it may have, and Dask gives it nothing to do.
-    After each task it would take a tenth of a second, for the next one needs the memory again.
+    Dask's workers give everything back at once, so that a sixth of a task's time would go into having the same pages
+    again. If nothing was ever given back, a worker that has long finished would look as if it needed more than it may
+    have, and Dask would give it nothing to do.
     """
     done = itertools.count(1)
 
     @wraps(task)
     def run(*given: _Given.args, **named: _Given.kwargs) -> _Found:
+        trim = _malloc_trim()
         try:
             return task(*given, **named)
         finally:
-            if next(done) % _TRIMMED_EVERY == 0 and (trim := _malloc_trim()) is not None:
+            if next(done) % _TRIMMED_EVERY == 0 and trim is not None:
                 trim(0)
 
     return run
@@ -324,10 +330,15 @@ def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
 
 @cache
 def _malloc_trim() -> Any:
+    """Have freed memory kept; return what gives it back, None where the C library is another."""
     try:
-        return ctypes.CDLL(None).malloc_trim
+        library = ctypes.CDLL(None)
+        trim = library.malloc_trim
+        library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+        library.mallopt(_M_MMAP_THRESHOLD, _MAPPED_BYTES)
     except (AttributeError, OSError, TypeError):  # no glibc
         return None
+    return trim
 
 
 def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:

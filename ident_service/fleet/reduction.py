@@ -155,9 +155,10 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
         return
     count = request.workers or os.cpu_count() or 1
     # Dask would pause a worker at 80 % of its memory until that falls, which nothing makes it do: this call would wait
-    # for ever. At 95 % it is started anew. Numbers as text: what Dask does not know as bytes is the caller's mistake.
-    try:
-        with dask.config.set({"distributed.worker.memory.pause": False}):
+    # for ever. At 95 % it is started anew. What a worker's threads do is not looked at a hundred times a second.
+    settings = {"distributed.worker.memory.pause": False, "distributed.worker.profile.enabled": False}
+    try:  # numbers as text: what Dask does not know as bytes is the caller's mistake
+        with dask.config.set(settings):
             cluster = LocalCluster(
                 n_workers=count,
                 threads_per_worker=1,
