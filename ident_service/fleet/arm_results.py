@@ -36,7 +36,16 @@ from ident_service.fleet.factor import (
     trimmed,
     unpacked,
 )
-from ident_service.fleet.population import ArmFit, arm_estimate, arm_fit, error_on, pooled_fit
+from ident_service.fleet.population import (
+    ArmFit,
+    Group,
+    Population,
+    arm_estimate,
+    arm_fit,
+    error_on,
+    pooled_fit,
+    population,
+)
 from ident_service.fleet.storage import Store
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
@@ -210,24 +219,33 @@ def fits_told(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tuple[
     return (fits.fit, fits.trained) if isinstance(fits, ArmFits) else fits
 
 
+def population_of(
+    told: Mapping[str, tuple[ArmFit, ArmFit]], number: int, groups: Mapping[Group, Sequence[int]]
+) -> Population:
+    """Return the common model of what `fits_told` gives of the arms: of all recordings (0), or fewer (1)."""
+    return population({arm: fits[number] for arm, fits in told.items()}, groups)
+
+
 @one_blas_thread()
 def errors_held_out(
-    fits: ArmFits, prior: tuple[Array, Array, Array], scale: Array, described: Described
+    fits: ArmFits, arm: str, told: Population, described: Described
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the torque errors on recordings held out [percent], alone and drawn to the other arms.
 
     Args:
         fits: of an arm with recordings held out.
-        prior: mean, its covariance and T of the other arms, in units of `scale`.
-        scale: D, shape (base,).
+        arm: its name.
+        told: common model of what is not held out.
         described: the arm.
 
     Returns:
         The two of `trained` and the two of `single`.
     """
-    held = fits.held
+    held, prior = fits.held, told.other_arms(arm)
     assert held is not None  # noqa: S101 - as said above
-    several, single = (error_on(held, pooled_fit(one, prior, scale), described) for one in (fits.trained, fits.single))
+    several, single = (
+        error_on(held, pooled_fit(one, prior, told.scale), described) for one in (fits.trained, fits.single)
+    )
     return (fits.alone[0], several), (fits.alone[1], single)
 
 
@@ -309,7 +327,7 @@ def arm_files(
     fits: ArmFits,
     recordings: Sequence[tuple[str, str]],
     described: Described,
-    pooled: LeastSquares | None,
+    found: Population,
     config: str,
     more: dict[str, Any],
     store: Store,
@@ -321,7 +339,7 @@ def arm_files(
         fits: of the arm.
         recordings: name and hash of each.
         described: the arm, with numbers for all that could be chosen.
-        pooled: its estimate drawn to the other arms'; None where there are none.
+        found: common model of all arms.
         config: the description as it was read, as JSON.
         more: what the fleet says of it: `arm`, `pooled`, `arms`, `held_out_percent`.
         store: of the factors.
@@ -332,6 +350,7 @@ def arm_files(
     def information() -> Merged:
         return Branches(leaves, described, store).merged if fits.merged is None else fits.merged
 
+    pooled = pooled_fit(fits.fit, found.other_arms(more["arm"]), found.scale) if more["arms"] > 1 else None
     of = (leaves.keys, leaves.by_recording)
     return _files(fits.fit, information, of, recordings, described, pooled, config, more, store, shown)
 

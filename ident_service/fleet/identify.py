@@ -23,8 +23,17 @@ from distributed import Client, Future, KilledWorker
 
 from ident_service.config.load import load_arm
 from ident_service.errors import StorageError, Unavailable, UsageError
-from ident_service.fleet.arm_results import Files, Leaves, arm_files, arm_fits, errors_held_out, fits_told, side_files
-from ident_service.fleet.population import ArmFit, HeldOut, pooled_fit, population, variance_shares
+from ident_service.fleet.arm_results import (
+    Files,
+    Leaves,
+    arm_files,
+    arm_fits,
+    errors_held_out,
+    fits_told,
+    population_of,
+    side_files,
+)
+from ident_service.fleet.population import ArmFit, HeldOut, variance_shares
 from ident_service.fleet.reduction import (
     REDUCED,
     FleetRequest,
@@ -119,14 +128,15 @@ def _require_file_name(arm: str) -> None:
 
 def _fitted(
     client: Client, reduced: Reduced, leaves: Mapping[str, Leaves], between: Array, store: Store, tell: Tell
-) -> tuple[dict[str, Future], dict[str, tuple[ArmFit, ArmFit]]]:
-    """Return futures of each arm's fits, and those that the fleet needs: of all recordings, and without those held out.
+) -> tuple[dict[str, Future], dict[str, Future], dict[str, ArmFit]]:
+    """Return futures of each arm's fits, of those that the fleet needs, and each arm's fit to all recordings.
 
     Factors that are damaged in the store are computed again, once.
     """
     described = reduced.described
     fitting: dict[str, Future] = {}
-    told: dict[str, tuple[ArmFit, ArmFit]] = {}
+    telling: dict[str, Future] = {}
+    fits: dict[str, ArmFit] = {}
     waiting, mended = list(leaves), False
     while waiting:
         for arm in waiting:
@@ -135,17 +145,17 @@ def _fitted(
                 merged_on_workers(client, of, described, store, whole=whole) for of in (keys[:count], keys[count:])
             ]
             fitting[arm] = client.submit(arm_fits, leaves[arm], described, store, between, *trees, pure=False)
-        asked = {arm: client.submit(fits_told, fitting[arm], pure=False) for arm in waiting}
+            telling[arm] = client.submit(fits_told, fitting[arm], pure=False)
         lost: dict[str, tuple[str, ...]] = {}
-        for arm, future in asked.items():
+        for arm in waiting:
             try:
-                found = future.result()
+                found = telling[arm].result()
             except KilledWorker:
                 raise Unavailable(f"{arm}: merging it ended every worker; give workers more with --memory") from None
             if isinstance(found[0], str):
                 lost[arm] = found
             else:
-                told[arm] = found
+                fits[arm] = found[0]
         damaged = {key for found in lost.values() for key in found}
         if damaged and mended:
             shown = ", ".join(sorted(damaged)[:3])
@@ -154,7 +164,7 @@ def _fitted(
             tell(f"{len(damaged)} factors are damaged in the store and are computed again")
             reduce_again(client, reduced, damaged, store)
         waiting, mended = list(lost), True
-    return fitting, told
+    return fitting, telling, fits
 
 
 def _analysed(
@@ -167,15 +177,14 @@ def _analysed(
     tell(f"{len(arms)} arms: each alone, and all together")
     store = Store(absolute_url(request.store))
     leaves = {arm: Leaves.of(reduced.keys_of(recordings)) for arm, recordings in arms.items()}
-    fitting, fits_of = _fitted(client, reduced, leaves, shares.recordings, store, tell)
-    fits = {arm: fit for arm, (fit, _) in fits_of.items()}
-    found = population(fits, groups)
-    told = population({arm: trained for arm, (_, trained) in fits_of.items()}, groups)
+    fitting, telling, fits = _fitted(client, reduced, leaves, shares.recordings, store, tell)
+    finding, told = (client.submit(population_of, telling, number, groups, pure=False) for number in (0, 1))
     judging = {
-        arm: client.submit(errors_held_out, fitting[arm], told.other_arms(arm), told.scale, described, pure=False)
+        arm: client.submit(errors_held_out, fitting[arm], arm, told, described, pure=False)
         for arm, of in leaves.items()
         if of.count < len(of.keys)
     }
+    found = finding.result()
     compared = compare_arms(arms, fits, found, described)
     errors = {arm: future.result() for arm, future in judging.items()}
     several, single = (
@@ -188,14 +197,13 @@ def _analysed(
     config = load_arm(request.arm).model_dump_json()
     for arm, recordings in arms.items():
         helps = several.helps if len(recordings) > 1 else single.helps
-        pooled = pooled_fit(fits[arm], found.other_arms(arm), found.scale) if len(arms) > 1 else None
         names = [(one.name, one.row.sha256) for one in recordings]
-        used = helps and pooled is not None
+        used = helps and len(arms) > 1
         held_out = (several.pooled if used else several.alone).get(arm)
         more = {"arm": arm, "pooled": used, "arms": len(arms), "held_out_percent": held_out}
         shown = shown_of(arm, reduced, compared, found.common)
         files_of[arm] = client.submit(
-            *(arm_files, fitting[arm], names, described, pooled, config, more, store, shown), pure=False
+            *(arm_files, fitting[arm], names, described, finding, config, more, store, shown), pure=False
         )
     splits_of = {
         arm: _split_files(client, arm, [one for one in compared.changed if one.arm == arm], reduced, store, config)

@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from ident_service.estimation.change_detection import (
     ALPHA,
@@ -62,6 +63,7 @@ from ident_service.model.information import Information
 from ident_service.model.likely_bodies import likely_bodies
 
 _ROUNDS = 200
+_REGULAR = 1e-5  # least entry on the diagonal of a Cholesky factor, of the largest, of a matrix that is not singular
 _SETTLED = 1e-4  # relative change of the largest tau
 _GROUP_ARMS = 2.0  # that the spread of a parameter's group counts as, against what arms say of the parameter itself
 # Deviations above chance, below which recordings of an arm do not differ by more than their noise: what is taken for a
@@ -252,15 +254,35 @@ def _torque_scale(fits: Mapping[str, ArmFit]) -> tuple[Array, float]:
 
 
 def _inverse(matrix: Array) -> Array:
+    """Return the inverse of a positive semidefinite matrix; the pseudo-inverse where it is singular."""
+    L, failed = dpotrf(matrix, lower=True)
+    if not failed and np.diag(L).min() > _REGULAR * np.diag(L).max():
+        return _inverse_of(L)
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-12, hermitian=True))
 
 
+def _inverse_of(L: Array) -> Array:
+    """Return the inverse of L L^T, L lower triangular."""
+    half, _ = dpotri(L, lower=True)  # the lower half; above are zeros
+    inverse = half + half.T
+    np.fill_diagonal(inverse, np.diag(half))
+    return np.asarray(inverse)
+
+
 def _common(P: Array, right: Array, variances: Array) -> tuple[Array, Array, Array, Array]:
-    """Return mu, its covariance, and of every arm M_i = (C_i + T)^-1 and M_i beta_i."""
-    shrinking = np.eye(P.shape[1]) + P * variances
-    M = np.linalg.solve(shrinking, P)
+    """Return mu, its covariance, and of every arm M_i = (C_i + T)^-1 and M_i beta_i.
+
+    With s the square root of T, M = P - P s (1 + s P s)^-1 s P, where P may be singular, and s may be zero.
+    """
+    s = np.sqrt(variances)
+    felt = s[:, None] * P  # s P
+    inner = felt * s
+    inner[:, np.arange(len(s)), np.arange(len(s))] += 1.0
+    inverses = np.array([_inverse_of(dpotrf(one, lower=True)[0]) for one in inner])
+    shrunk = np.swapaxes(felt, 1, 2) @ inverses  # P s (1 + s P s)^-1
+    M = P - shrunk @ felt
     M = 0.5 * (M + np.swapaxes(M, 1, 2))
-    weighted = np.linalg.solve(shrinking, right[:, :, None])[:, :, 0]
+    weighted = right - (shrunk @ (s * right)[:, :, None])[:, :, 0]
     covariance = _inverse(M.sum(axis=0))
     return np.asarray(covariance @ weighted.sum(axis=0)), covariance, np.asarray(M), np.asarray(weighted)
 

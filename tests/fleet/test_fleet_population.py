@@ -249,11 +249,9 @@ def test_what_follows_from_an_arms_factors_is_made_once(
     def made(arms: int, pooled: bool = False) -> tuple[ArmFits, Any, dict[str, bytes], dict[str, Any]]:
         fits = arm_results.arm_fits(leaves, DESCRIBED, store, between)
         assert isinstance(fits, ArmFits)
-        prior = found.other_arms("3")
-        errors = arm_results.errors_held_out(fits, prior, found.scale, DESCRIBED)
+        errors = arm_results.errors_held_out(fits, "3", found, DESCRIBED)
         more = {"arm": "3", "pooled": pooled, "arms": arms, "held_out_percent": None}
-        drawn = pooled_fit(fits.fit, prior, found.scale)
-        return fits, errors, *arm_results.arm_files(fits, names, DESCRIBED, drawn, config, more, store, shown)
+        return fits, errors, *arm_results.arm_files(fits, names, DESCRIBED, found, config, more, store, shown)
 
     first, errors, files, summary = made(10)
     assert first.merged is not None
