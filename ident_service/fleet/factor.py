@@ -318,14 +318,20 @@ def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
 
     @wraps(task)
     def run(*given: _Given.args, **named: _Given.kwargs) -> _Found:
-        trim = _malloc_trim()
+        _malloc_trim()
         try:
             return task(*given, **named)
         finally:
-            if next(done) % _TRIMMED_EVERY == 0 and trim is not None:
-                trim(0)
+            if next(done) % _TRIMMED_EVERY == 0:
+                give_back()
 
     return run
+
+
+def give_back() -> None:
+    """Give memory that this process does not use back to the system."""
+    if (trim := _malloc_trim()) is not None:
+        trim(0)
 
 
 @cache

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any, Final, TypeVar
 
 import dask
@@ -34,6 +35,7 @@ from ident_service.fleet.factor import (
     Problem,
     Row,
     Settled,
+    give_back,
     merge,
     merge_stored,
     reduce_recording,
@@ -54,6 +56,7 @@ PIECE_BYTES: Final = 256 * 2**20  # of a file, beyond which it is cut into piece
 MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
 _ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
 _CONNECT_S: Final = 10.0
+_LOOKED_AFTER_S = 3.0  # between looks at workers that Dask may have paused
 _WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
 _LOOKED_UP: Final = 64  # recordings that one task looks up in the store
 _PILOTS_TRIED, _ARMS_TRIED = 20, 5  # recordings of an arm that choices may be settled with, and arms
@@ -151,7 +154,8 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
             ) from None
         with client:
             _require_workers(client, request.scheduler, tell)
-            yield client
+            with _paused_workers_told(client, tell):
+                yield client
         return
     count = request.workers or os.cpu_count() or 1
     # Dask would pause a worker at 80 % of its memory until that falls, which nothing makes it do: this call would wait
@@ -172,6 +176,43 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
     with cluster, Client(cluster, set_as_default=False) as client:
         tell(f"{count} workers of {request.memory} each on this machine, dashboard {cluster.dashboard_link}")
         yield client
+
+
+@contextmanager
+def _paused_workers_told(client: Client, tell: Tell) -> Iterator[None]:
+    """Look after workers that Dask has paused near their memory limit, as it does with those that we did not start.
+
+    Such a worker goes on where it needs less, so it is told to give back what it does not use. One that stays paused is
+    named: a command whose workers are all paused waits until somebody starts another.
+    """
+    over, named = Event(), set[str]()
+
+    def look() -> None:
+        before: set[str] = set()
+        while not over.wait(_LOOKED_AFTER_S):
+            try:
+                workers = client.scheduler_info(n_workers=-1)["workers"]
+                paused = {address for address, of in workers.items() if of.get("status") == "paused"}
+                if paused:
+                    client.run(give_back, workers=list(paused), on_error="ignore")
+            except (OSError, TimeoutError, ValueError):
+                continue  # the call that waits for the scheduler says so
+            for address in sorted(paused & before - named):
+                named.add(address)
+                limit = f"{(workers[address].get('memory_limit') or 0) / 2**20:.0f} MiB"
+                tell(
+                    f"{address} is paused by Dask near its limit of {limit} and gets nothing to do: start it with a"
+                    " larger --memory-limit, or start another"
+                )
+            before = paused
+
+    watcher = Thread(target=look, name="paused workers", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
 
 
 def _require_workers(client: Client, address: str, tell: Tell) -> None:

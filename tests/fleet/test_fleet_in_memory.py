@@ -8,9 +8,11 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import psutil
+import pyarrow as pa
 import pytest
 from distributed import LocalCluster, get_worker
 from fsspec.implementations.memory import MemoryFileSystem
@@ -18,7 +20,7 @@ from helpers.fleets import BEGIN, WEEK, kind, write_recording
 
 from ident_service.cli import main
 from ident_service.errors import Unavailable, UsageError
-from ident_service.fleet import reduction, storage
+from ident_service.fleet import reduction, results, storage
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 COUNT = 3
@@ -114,6 +116,22 @@ def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
         assert client.submit(os.getpid, pure=False).result(timeout=20) in client.run(os.getpid).values()
 
 
+def test_a_worker_of_others_that_dask_pauses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command would wait for it for ever, without a word."""
+    monkeypatch.setattr(reduction, "_LOOKED_AFTER_S", 0.2)
+    said: list[str] = []
+    with LocalCluster(
+        n_workers=1, memory_limit="400MiB", host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=50
+    ) as cluster:
+        request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler=cluster.scheduler_address)
+        with reduction.connected(request, said.append) as client:
+            client.submit(_fill, 0.87).result(timeout=60)
+            until = time.monotonic() + 20.0
+            while len(said) < 2 and time.monotonic() < until:
+                time.sleep(0.05)
+    assert "is paused by Dask near its limit of 400 MiB" in said[1]
+
+
 def test_a_missing_extra_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,3 +182,20 @@ def test_a_folder_of_somebody_else_is_not_replaced(tmp_path: Path, capsys: pytes
     assert main([*words, "--out", str(tmp_path / "mine")]) == 2
     assert "holds what is no result of a fleet" in capsys.readouterr().err
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (pa.string(), ["", "Hz", None, "Gelenk 3 – größer"]),
+        (pa.string(), [None, None]),
+        (pa.string(), ["m"] * 9),
+        (pa.float64(), [0.5, None, -1e-300]),
+        (pa.float64(), [1.0, 2.0]),
+        (pa.timestamp("us", tz="UTC"), [1_767_225_600_000_001, None]),
+    ],
+)
+def test_columns_of_the_table_are_as_pyarrow_makes_them(kind: pa.DataType, values: list[Any]) -> None:
+    made = results._column(kind, values)
+    made.validate(full=True)
+    assert made.equals(pa.array(values, type=kind))
