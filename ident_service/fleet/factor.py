@@ -551,6 +551,9 @@ def _conditions(recording: Recording) -> dict[str, float]:
     return found
 
 
+_upper = cache(np.triu_indices)
+
+
 def packed(merged: Merged) -> bytes:
     """Return a factor as the bytes of an npz file: rows of each triangle, and the triangles' upper parts in a row."""
     parts = (merged.moving, merged.near, *merged.clusters)
@@ -560,7 +563,7 @@ def packed(merged: Merged) -> bytes:
             size = factor.shape[1]
             square = np.zeros((size, size))
             square[: len(factor)] = factor
-            values.append(square[np.triu_indices(size)])
+            values.append(square[_upper(size)])
     stream = io.BytesIO()
     np.savez(
         stream,
@@ -586,7 +589,7 @@ def unpacked(content: bytes, described: Described) -> Merged:
             samples, size = int(archive["samples"]), int(archive["base"])
     except (zipfile.BadZipFile, KeyError, OSError, EOFError) as error:
         raise ValueError(f"damaged: {error}") from None
-    upper = [np.triu_indices(len(support) + 1) for support in supports]
+    upper = [_upper(len(support) + 1) for support in supports]
     lengths = [len(one[0]) for one in upper]
     if size != base.size or rows.shape[1:] != (len(supports),) or len(triangles) != len(rows) * sum(lengths):
         raise ValueError(f"about {size} base parameters, not {base.size}")
