@@ -19,10 +19,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from distributed import Client, Future, KilledWorker
+from distributed import Client, Future
 
 from ident_service.config.load import load_arm
-from ident_service.errors import StorageError, Unavailable, UsageError
+from ident_service.errors import StorageError, UsageError
 from ident_service.fleet.arm_results import (
     Files,
     Leaves,
@@ -46,6 +46,7 @@ from ident_service.fleet.reduction import (
     merged_on_workers,
     reduce_again,
     reduce_fleet,
+    result_of,
 )
 from ident_service.fleet.results import (
     FLEET,
@@ -148,10 +149,7 @@ def _fitted(
             telling[arm] = client.submit(fits_told, fitting[arm], pure=False)
         lost: dict[str, tuple[str, ...]] = {}
         for arm in waiting:
-            try:
-                found = telling[arm].result()
-            except KilledWorker:
-                raise Unavailable(f"{arm}: merging it ended every worker; give workers more with --memory") from None
+            found = result_of(telling[arm], f"merging and fitting {arm}")
             if isinstance(found[0], str):
                 lost[arm] = found
             else:
@@ -184,9 +182,9 @@ def _analysed(
         for arm, of in leaves.items()
         if of.count < len(of.keys)
     }
-    found = finding.result()
+    found = result_of(finding, "the common model")
     compared = compare_arms(arms, fits, found, described)
-    errors = {arm: future.result() for arm, future in judging.items()}
+    errors = {arm: result_of(future, f"judging {arm}") for arm, future in judging.items()}
     several, single = (
         HeldOut({arm: one[k][0] for arm, one in errors.items()}, {arm: one[k][1] for arm, one in errors.items()})
         for k in (0, 1)
@@ -209,8 +207,11 @@ def _analysed(
         arm: _split_files(client, arm, [one for one in compared.changed if one.arm == arm], reduced, store, config)
         for arm in sorted({one.arm for one in compared.changed})
     }
-    written = {arm: future.result() for arm, future in files_of.items()}
-    splits = {arm: (first.result(), second.result()) for arm, (first, second) in splits_of.items()}
+    written = {arm: result_of(future, f"estimating {arm}") for arm, future in files_of.items()}
+    splits = {
+        arm: (result_of(before, f"estimating {arm}"), result_of(after, f"estimating {arm}"))
+        for arm, (before, after) in splits_of.items()
+    }
     result = FleetResult(folder, reduced, found, shares, several, single, compared, {})
     summaries = {arm: summary for arm, (_, summary) in written.items()}
     result.document.update(fleet_document(result, summaries, load_arm(request.arm).sha256))

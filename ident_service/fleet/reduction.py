@@ -235,6 +235,22 @@ def _require_workers(client: Client, address: str, tell: Tell) -> None:
     tell(f"{len(versions['workers'])} workers of {address}, dashboard {client.dashboard_link}")
 
 
+def result_of(future: Future, what: str) -> Any:
+    """Wait for the result of a task.
+
+    Args:
+        future: of the task.
+        what: it does, in words, for the error.
+
+    Raises:
+        Unavailable: it ended every worker that tried.
+    """
+    try:
+        return future.result()
+    except KilledWorker:
+        raise Unavailable(f"{what} ended every worker that tried; give workers more with --memory") from None
+
+
 def in_order(
     client: Client, function: Callable[..., _Result], tasks: Sequence[tuple[Any, ...]], failed: Callable[[int], _Result]
 ) -> Iterator[tuple[int, _Result]]:
@@ -417,7 +433,8 @@ def _settled(
     problems: list[Problem] = []
     for arm in sorted(arms)[:_ARMS_TRIED]:
         tell(f"filter, delay and friction's shape are chosen from recordings of {arm}")
-        found = client.submit(settle, arms[arm][:_PILOTS_TRIED], description, pure=False).result()
+        settling = client.submit(settle, arms[arm][:_PILOTS_TRIED], description, pure=False)
+        found = result_of(settling, "choosing filter, delay and friction's shape")
         if isinstance(found, Settled):
             names = ", ".join(found.pilots)
             store.write(name, f"{names}\n{found.description}".encode())
@@ -483,7 +500,7 @@ def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store:
         if (part.source.url, part.label) in urls
     ]
     for future in [client.submit(reduce_recording, *task, pure=False) for task in tasks]:
-        outcome = future.result()
+        outcome = result_of(future, "reducing a recording again")
         if outcome.problem is not None:
             raise StorageError(outcome.problem.url, f"its factor is damaged, and {outcome.problem.message}")
     reduced.computed += len(tasks)

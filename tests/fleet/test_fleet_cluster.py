@@ -26,8 +26,9 @@ from moto.server import ThreadedMotoServer
 
 from ident_service.certificate_verifier import verify_path
 from ident_service.cli import main
+from ident_service.errors import Unavailable
 from ident_service.fleet.identify import identify_fleet
-from ident_service.fleet.reduction import FleetRequest, in_order
+from ident_service.fleet.reduction import FleetRequest, in_order, result_of
 
 pytestmark = [
     pytest.mark.slow,
@@ -281,6 +282,8 @@ def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
         client.run_on_scheduler(_allow, 0)
         try:
             assert dict(in_order(client, _ends, [(0,), (1,)], lambda number: -number)) == {0: 0, 1: -1}
+            with pytest.raises(Unavailable, match="choosing ended every worker that tried; give workers more"):
+                result_of(client.submit(_ends, 1, pure=False), "choosing")
         finally:
             client.run_on_scheduler(_allow, 3)
         assert client.submit(_ends, 2, pure=False).result() == 2
