@@ -368,7 +368,7 @@ def fleet_lines(document: Mapping[str, Any]) -> list[str]:
             helps = "pooled" if held["pooling_helps"] else "each arm alone"
             lines.append(
                 f"torque error on held-out recordings, {words}: {held['alone_percent']:.3g} % alone,"
-                f" {held['pooled_percent']:.3g} % pooled ({-100.0 * held['gain']:+.0f} %): {helps}"
+                f" {held['pooled_percent']:.3g} % pooled ({round(-100.0 * held['gain']):+d} %): {helps}"
             )
     differing = {arm: document["arms"][arm]["differs"] for arm in document["ranking"]}
     lines.append(f"unlike the others: {', '.join(arm for arm, found in differing.items() if found) or 'no arm'}")

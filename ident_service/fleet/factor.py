@@ -56,7 +56,7 @@ from ident_service.recordings.resampling import grid
 
 _Given = ParamSpec("_Given")
 _Found = TypeVar("_Found")
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 STRETCHES: Final = 12  # kept of a recording, as few as the uncertainty of one needs
 FAN_IN: Final = 16  # factors that are merged at once
 AT_ONCE: Final = FAN_IN**2  # factors that one task merges, a whole branch of the tree: what it sends on is large
@@ -64,6 +64,10 @@ MOST_CLUSTERS: Final = 64  # of an arm; neighbours merge beyond, so that memory 
 # What a recording's own metadata may say of the conditions, and the key of a row.
 CONDITIONS: Final = {"temperature_celsius": "temperature", "operating_hours": "operating_hours"}
 _TRIMMED_EVERY: Final = 16  # tasks
+# Of glibc's malloc.h, and what they are set to: free memory that is kept, and size from which memory is mapped.
+_M_TRIM_THRESHOLD: Final = -1
+_M_MMAP_THRESHOLD: Final = -3
+_KEPT_BYTES, _MAPPED_BYTES = 256 << 20, 32 << 20
 _PILOTS: Final = 3  # recordings that settle choices
 # Raised for what is in a recording; a file of random bytes can make a reader raise any of these.
 _UNUSABLE: Final = (IdentError, ArithmeticError, ValueError, EOFError, np.linalg.LinAlgError)
@@ -303,31 +307,44 @@ class Settled:
     pilots: tuple[str, ...]
 
 
-def _trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Give free memory back to the system after some tasks, where the C library can: half of what a worker has.
+def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
+    """Let the C library, where it can, keep what a task frees for the next one, and give it back after some tasks.
 
-    Else a worker that has long finished looks as if it needed more than it may have, and Dask gives it nothing to do.
-    After each task it would take a tenth of a second, for the next one needs the memory again.
+    Dask's workers give everything back at once, so that a sixth of a task's time would go into having the same pages
+    again. If nothing was ever given back, a worker that has long finished would look as if it needed more than it may
+    have, and Dask would give it nothing to do.
     """
     done = itertools.count(1)
 
     @wraps(task)
     def run(*given: _Given.args, **named: _Given.kwargs) -> _Found:
+        _malloc_trim()
         try:
             return task(*given, **named)
         finally:
-            if next(done) % _TRIMMED_EVERY == 0 and (trim := _malloc_trim()) is not None:
-                trim(0)
+            if next(done) % _TRIMMED_EVERY == 0:
+                give_back()
 
     return run
 
 
+def give_back() -> None:
+    """Give memory that this process does not use back to the system."""
+    if (trim := _malloc_trim()) is not None:
+        trim(0)
+
+
 @cache
 def _malloc_trim() -> Any:
+    """Have freed memory kept; return what gives it back, None where the C library is another."""
     try:
-        return ctypes.CDLL(None).malloc_trim
+        library = ctypes.CDLL(None)
+        trim = library.malloc_trim
+        library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+        library.mallopt(_M_MMAP_THRESHOLD, _MAPPED_BYTES)
     except (AttributeError, OSError, TypeError):  # no glibc
         return None
+    return trim
 
 
 def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Problem, ...]:
@@ -378,7 +395,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
     return Settled(settled.model_dump_json(), tuple(pilots))
 
 
-@_trimmed
+@trimmed
 @one_blas_thread()
 def reduce_recording(part: Part, described: Described, store: Store, version: str, again: bool = False) -> Outcome:
     """Reduce a recording, or a piece of one, to a factor in the store, unless it is there.
@@ -534,6 +551,9 @@ def _conditions(recording: Recording) -> dict[str, float]:
     return found
 
 
+_upper = cache(np.triu_indices)
+
+
 def packed(merged: Merged) -> bytes:
     """Return a factor as the bytes of an npz file: rows of each triangle, and the triangles' upper parts in a row."""
     parts = (merged.moving, merged.near, *merged.clusters)
@@ -543,7 +563,7 @@ def packed(merged: Merged) -> bytes:
             size = factor.shape[1]
             square = np.zeros((size, size))
             square[: len(factor)] = factor
-            values.append(square[np.triu_indices(size)])
+            values.append(square[_upper(size)])
     stream = io.BytesIO()
     np.savez(
         stream,
@@ -569,7 +589,7 @@ def unpacked(content: bytes, described: Described) -> Merged:
             samples, size = int(archive["samples"]), int(archive["base"])
     except (zipfile.BadZipFile, KeyError, OSError, EOFError) as error:
         raise ValueError(f"damaged: {error}") from None
-    upper = [np.triu_indices(len(support) + 1) for support in supports]
+    upper = [_upper(len(support) + 1) for support in supports]
     lengths = [len(one[0]) for one in upper]
     if size != base.size or rows.shape[1:] != (len(supports),) or len(triangles) != len(rows) * sum(lengths):
         raise ValueError(f"about {size} base parameters, not {base.size}")
@@ -587,7 +607,7 @@ def unpacked(content: bytes, described: Described) -> Merged:
     return Merged(parts[0], parts[1], tuple(parts[2:]), samples)
 
 
-@_trimmed
+@trimmed
 @one_blas_thread()
 def merge_stored(keys: Sequence[str], described: Described, store: Store, whole: bool) -> Merged | tuple[str, ...]:
     """Merge stored factors in the order given, in a tree of `FAN_IN` neighbours each.

@@ -13,38 +13,27 @@ the files. A folder of results holds
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
 import shutil
-import tempfile
-import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from distributed import Client
+from distributed import Client, Future
 
-from ident_service import __version__
 from ident_service.config.load import load_arm
-from ident_service.errors import UsageError
-from ident_service.estimation.least_squares import LeastSquares
-from ident_service.estimation.plausibility import reasons_against
-from ident_service.estimation.uncertainty import Uncertainty, negligible
-from ident_service.fleet.arm_page import ARM_PAGE, ArmShown, arm_page
-from ident_service.fleet.factor import Described, Merged, merge_stored
-from ident_service.fleet.population import (
-    ArmFit,
-    HeldOut,
-    arm_estimate,
-    arm_fit,
-    held_out_errors,
-    pooled_fit,
-    population,
-    variance_shares,
+from ident_service.errors import StorageError, UsageError
+from ident_service.fleet.arm_results import (
+    Files,
+    Leaves,
+    arm_files,
+    arm_fits,
+    errors_held_out,
+    fits_told,
+    population_of,
+    side_files,
 )
+from ident_service.fleet.population import ArmFit, HeldOut, variance_shares
 from ident_service.fleet.reduction import (
     REDUCED,
     FleetRequest,
@@ -54,7 +43,10 @@ from ident_service.fleet.reduction import (
     absolute_url,
     connected,
     list_recordings,
+    merged_on_workers,
+    reduce_again,
     reduce_fleet,
+    result_of,
 )
 from ident_service.fleet.results import (
     FLEET,
@@ -73,16 +65,12 @@ from ident_service.fleet.trends import Change, compare_arms
 from ident_service.model.chain import Array
 from ident_service.operations.drift_alarms import verdict_of
 from ident_service.operations.parameter_files import DOCUMENT, compare_files
-from ident_service.results.evidence.file import EVIDENCE, write_evidence
-from ident_service.results.evidence.gathering import evidence_without_samples
 from ident_service.results.manifest import (
     exchange_folders,
     require_place,
     staging_beside,
     write_atomically,
 )
-from ident_service.results.parameter_file import write_parameters
-from ident_service.results.run_folder import PARAMETERS, write_manifest, write_results
 
 
 def identify_fleet(
@@ -139,9 +127,42 @@ def _require_file_name(arm: str) -> None:
         raise UsageError(f"an arm cannot be called {arm!r:.60}; give --names with a shorter group (?P<arm>...)")
 
 
-Files = Mapping[str, bytes]
-KEPT = "results"  # of the store: what follows from an arm's factors
-_SUMMARY = "summary.json"
+def _fitted(
+    client: Client, reduced: Reduced, leaves: Mapping[str, Leaves], between: Array, store: Store, tell: Tell
+) -> tuple[dict[str, Future], dict[str, Future], dict[str, ArmFit]]:
+    """Return futures of each arm's fits, of those that the fleet needs, and each arm's fit to all recordings.
+
+    Factors that are damaged in the store are computed again, once.
+    """
+    described = reduced.described
+    fitting: dict[str, Future] = {}
+    telling: dict[str, Future] = {}
+    fits: dict[str, ArmFit] = {}
+    waiting, mended = list(leaves), False
+    while waiting:
+        for arm in waiting:
+            keys, count, whole = leaves[arm].keys, leaves[arm].count, leaves[arm].by_recording
+            trees = [
+                merged_on_workers(client, of, described, store, whole=whole) for of in (keys[:count], keys[count:])
+            ]
+            fitting[arm] = client.submit(arm_fits, leaves[arm], described, store, between, *trees, pure=False)
+            telling[arm] = client.submit(fits_told, fitting[arm], pure=False)
+        lost: dict[str, tuple[str, ...]] = {}
+        for arm in waiting:
+            found = result_of(telling[arm], f"merging and fitting {arm}")
+            if isinstance(found[0], str):
+                lost[arm] = found
+            else:
+                fits[arm] = found[0]
+        damaged = {key for found in lost.values() for key in found}
+        if damaged and mended:
+            shown = ", ".join(sorted(damaged)[:3])
+            raise StorageError(store.url, f"factors that were just written cannot be read: {shown}")
+        if damaged:
+            tell(f"{len(damaged)} factors are damaged in the store and are computed again")
+            reduce_again(client, reduced, damaged, store)
+        waiting, mended = list(lost), True
+    return fitting, telling, fits
 
 
 def _analysed(
@@ -150,213 +171,66 @@ def _analysed(
     described, arms = reduced.described, reduced.arms
     groups = described.groups
     shares = variance_shares({arm: [one.row for one in recordings] for arm, recordings in arms.items()}, groups)
-
-    def submit(function: Any, *arguments: Any) -> Any:
-        return client.submit(function, *arguments, pure=False)
-
-    def between(arm: str, count: int) -> Array | None:
-        return None if reduced.trees[arm].by_recording else shares.recordings / count
-
     step("fitting arms", REDUCED)
     tell(f"{len(arms)} arms: each alone, and all together")
     store = Store(absolute_url(request.store))
-
-    def fit(merged: Any, leaves: Leaves, between: Array | None) -> Any:
-        return submit(_kept_fit, merged, leaves, described, store, between)
-
-    fitting, training = {}, {}
-    for arm, tree in reduced.trees.items():
-        whole = tree.by_recording
-        fitting[arm] = fit(tree.merged, (tree.keys, whole), between(arm, len(arms[arm])))
-        training[arm] = fit(tree.trained, (tree.keys[: tree.count], whole), between(arm, tree.count))
-    fits = {arm: future.result() for arm, future in fitting.items()}
-    found = population(fits, groups)
-    told = population({arm: future.result() for arm, future in training.items()}, groups)
-    judged: dict[str, Any] = {}
-    for arm, tree in reduced.trees.items():
-        if tree.held is not None:
-            prior = told.other_arms(arm)
-            one = fit(tree.single, (tree.keys[:1], False), shares.recordings)
-            judged[arm] = (
-                submit(held_out_errors, training[arm], tree.held, prior, told.scale, described),
-                submit(held_out_errors, one, tree.held, prior, told.scale, described),
-            )
-    errors = {arm: (several.result(), single.result()) for arm, (several, single) in judged.items()}
+    leaves = {arm: Leaves.of(reduced.keys_of(recordings)) for arm, recordings in arms.items()}
+    fitting, telling, fits = _fitted(client, reduced, leaves, shares.recordings, store, tell)
+    finding, told = (client.submit(population_of, telling, number, groups, pure=False) for number in (0, 1))
+    judging = {
+        arm: client.submit(errors_held_out, fitting[arm], arm, told, described, pure=False)
+        for arm, of in leaves.items()
+        if of.count < len(of.keys)
+    }
+    found = result_of(finding, "the common model")
+    compared = compare_arms(arms, fits, found, described)
+    errors = {arm: result_of(future, f"judging {arm}") for arm, future in judging.items()}
     several, single = (
         HeldOut({arm: one[k][0] for arm, one in errors.items()}, {arm: one[k][1] for arm, one in errors.items()})
         for k in (0, 1)
     )
-    compared = compare_arms(arms, fits, found, described)
     step("estimates inside the feasible set", 0.9)
     tell("estimates inside the feasible set, with their proofs")
-    files_of: dict[str, Any] = {}
+    files_of: dict[str, Future] = {}
     config = load_arm(request.arm).model_dump_json()
-    for arm, tree in reduced.trees.items():
-        helps = several.helps if len(arms[arm]) > 1 else single.helps
-        pooled = pooled_fit(fits[arm], found.other_arms(arm), found.scale) if len(arms) > 1 else None
-        names = [(one.name, one.row.sha256) for one in arms[arm]]
-        used = helps and pooled is not None
+    for arm, recordings in arms.items():
+        helps = several.helps if len(recordings) > 1 else single.helps
+        names = [(one.name, one.row.sha256) for one in recordings]
+        used = helps and len(arms) > 1
         held_out = (several.pooled if used else several.alone).get(arm)
         more = {"arm": arm, "pooled": used, "arms": len(arms), "held_out_percent": held_out}
-        leaves = (tree.keys, tree.by_recording)
         shown = shown_of(arm, reduced, compared, found.common)
-        files_of[arm] = submit(
-            *(_arm_files, fits[arm], tree.merged, leaves, names, described, pooled, config, more, store, shown)
+        files_of[arm] = client.submit(
+            *(arm_files, fitting[arm], names, described, finding, config, more, store, shown), pure=False
         )
     splits_of = {
         arm: _split_files(client, arm, [one for one in compared.changed if one.arm == arm], reduced, store, config)
         for arm in sorted({one.arm for one in compared.changed})
     }
-    written = {arm: future.result() for arm, future in files_of.items()}
-    splits = {arm: (first.result()[0], second.result()[0]) for arm, (first, second) in splits_of.items()}
+    written = {arm: result_of(future, f"estimating {arm}") for arm, future in files_of.items()}
+    splits = {
+        arm: (result_of(before, f"estimating {arm}"), result_of(after, f"estimating {arm}"))
+        for arm, (before, after) in splits_of.items()
+    }
     result = FleetResult(folder, reduced, found, shares, several, single, compared, {})
     summaries = {arm: summary for arm, (_, summary) in written.items()}
     result.document.update(fleet_document(result, summaries, load_arm(request.arm).sha256))
     return result, written, splits
 
 
-Leaves = tuple[tuple[str, ...], bool]
-"""Keys of the factors of an estimate in the order in which they are merged, and whether each is one cluster."""
-
-
-def _kept_name(kind: str, described: Described, leaves: Leaves, *more: str) -> str:
-    """Return the name in the store of what follows from factors, the description and this version."""
-    told = json.dumps([__version__, described.description, leaves, more])
-    return f"{KEPT}/{hashlib.sha256(told.encode()).hexdigest()}.{kind}"
-
-
-def _kept_fit(merged: Merged, leaves: Leaves, described: Described, store: Store, between: Array | None) -> ArmFit:
-    """Return `arm_fit`, whose uncertainty is kept in the store by content."""
-    name, method = _kept_name("npz", described, leaves), described.config.identification.method
-    content = store.read(name)
-    if content is not None:
-        try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-                doubt = Uncertainty(**{**archive, "inflation": float(archive["inflation"])})
-                return arm_fit(merged, method, between, doubt)
-        except (ValueError, TypeError, KeyError, OSError, EOFError, zipfile.BadZipFile):
-            pass  # damaged, or another version's: made again
-    found = arm_fit(merged, method, between)
-    stream = io.BytesIO()
-    np.savez(stream, **{key: value for key, value in vars(found.doubt).items() if value is not None})
-    store.write(name, stream.getvalue())
-    return found
-
-
-def _arm_files(
-    alone: ArmFit,
-    merged: Merged,
-    leaves: Leaves,
-    recordings: Sequence[tuple[str, str]],
-    described: Described,
-    pooled: LeastSquares | None,
-    config: str,
-    more: dict[str, Any],
-    store: Store,
-    shown: ArmShown | None = None,
-) -> tuple[Files, dict[str, Any]]:
-    """Return the files of one arm's results, with a page where there is more to show, and what the fleet's say of it.
-
-    What does not depend on the other arms is kept in the store by content: the estimate with its proof.
-    """
-    used = pooled if more["pooled"] else None
-    drawn = () if used is None else (used.beta.tobytes().hex(), used.R1.tobytes().hex(), str(more["arms"]))
-    name = _kept_name("zip", described, leaves, config, json.dumps(recordings), *drawn)
-    kept = _unzipped(store.read(name))
-    if kept is None:
-        kept = _estimated(alone, merged, recordings, described, used, config, more["arms"])
-        stream = io.BytesIO()
-        with zipfile.ZipFile(stream, "w") as archive:
-            for file, data in kept.items():
-                archive.writestr(zipfile.ZipInfo(file), data)
-        store.write(name, stream.getvalue())
-    fleet = {
-        **more,
-        "alone": alone.fit.beta.tolist(),
-        "alone_deviations": [float(value) if np.isfinite(value) else None for value in alone.doubt.deviations],
-        "together": None if pooled is None else pooled.beta.tolist(),
-        "together_deviations": None if pooled is None else pooled.standard_deviations.tolist(),
-    }
-    summary = json.loads(kept[_SUMMARY]) | {"pooled": more["pooled"], "negligible": negligible(alone.total)}
-    with tempfile.TemporaryDirectory(prefix="ident-fleet-") as folder:
-        place = Path(folder)
-        for file, data in kept.items():
-            if file not in (_SUMMARY, PARAMETERS):
-                (place / file).write_bytes(data)
-        write_parameters(place / PARAMETERS, json.loads(kept[PARAMETERS]) | {"fleet": fleet})
-        if shown is not None:
-            write_atomically(place / ARM_PAGE, arm_page(place, shown))
-        (place / EVIDENCE).unlink()
-        write_manifest(place)
-        return {path.name: path.read_bytes() for path in sorted(place.iterdir())}, summary
-
-
-def _unzipped(content: bytes | None) -> dict[str, bytes] | None:
-    """Return the files of a kept estimate; None where there is none, or it is damaged."""
-    if content is None:
-        return None
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            found = {name: archive.read(name) for name in archive.namelist()}
-    except (zipfile.BadZipFile, OSError, EOFError, zlib.error):
-        return None
-    return (
-        found
-        if {_SUMMARY, PARAMETERS, EVIDENCE} <= set(found) and all(Path(name).name == name for name in found)
-        else None
-    )
-
-
-def _estimated(
-    alone: ArmFit,
-    merged: Merged,
-    recordings: Sequence[tuple[str, str]],
-    described: Described,
-    pooled: LeastSquares | None,
-    config: str,
-    arms: int,
-) -> dict[str, bytes]:
-    """Return the files of an arm's estimate without what the fleet says of it, and a summary."""
-    from ident_service.config.arm import ArmConfig
-
-    chosen = arm_estimate(alone, merged, recordings, described, pooled, arms)
-    unusable = reasons_against(chosen)
-    torque = described.config.identification.torque or "recorded"
-    summary = {
-        "feasible": chosen.feasible,
-        "margin": chosen.margin,
-        "unusable": list(unusable),
-        "error_percent": chosen.candidates[chosen.chosen].identification.relative_percent,
-        "values": chosen.beta.tolist(),
-        "standard_deviations": [float(v) if np.isfinite(v) else None for v in chosen.standard_deviations],
-        "verdicts": list(chosen.verdicts),
-    }
-    with tempfile.TemporaryDirectory(prefix="ident-fleet-") as name:
-        place = Path(name)
-        write_results(place, chosen, None, unusable, ArmConfig.model_validate_json(config), torque)
-        digest = hashlib.sha256((place / PARAMETERS).read_bytes()).hexdigest()
-        write_evidence(place / EVIDENCE, evidence_without_samples(chosen, digest))
-        content = {path.name: path.read_bytes() for path in sorted(place.iterdir())}
-    return content | {_SUMMARY: json.dumps(summary).encode()}
-
-
 def _split_files(
     client: Client, arm: str, changes: Sequence[Change], reduced: Reduced, store: Store, config: str
-) -> tuple[Any, Any]:
+) -> tuple[Future, Future]:
     """Return futures of the results before and after an arm's most significant change."""
     change = min(changes, key=lambda one: (one.p, -one.statistic))
     described, found = reduced.described, []
     recordings = reduced.arms[arm]
     for part in (recordings[: change.at], recordings[change.at :]):
-        keys = [one.row.key for one in sorted(part, key=lambda one: (one.row.sha256, one.row.label, one.row.key))]
-        leaves = (tuple(keys), False)
-        merged = client.submit(merge_stored, keys, described, store, False, pure=False)
-        alone = client.submit(_kept_fit, merged, leaves, described, store, None, pure=False)
+        keys = reduced.keys_of(part)
+        merged = merged_on_workers(client, keys, described, store, whole=False)
         names = [(one.name, one.row.sha256) for one in part]
         more = {"arm": arm, "pooled": False, "arms": len(reduced.arms)}
-        found.append(
-            client.submit(*(_arm_files, alone, merged, leaves, names, described, None, config, more, store), pure=False)
-        )
+        found.append(client.submit(side_files, keys, merged, names, described, config, more, store, pure=False))
     return found[0], found[1]
 
 

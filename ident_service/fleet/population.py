@@ -25,6 +25,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from ident_service.estimation.change_detection import (
     ALPHA,
@@ -62,6 +63,7 @@ from ident_service.model.information import Information
 from ident_service.model.likely_bodies import likely_bodies
 
 _ROUNDS = 200
+_REGULAR = 1e-5  # least entry on the diagonal of a Cholesky factor, of the largest, of a matrix that is not singular
 _SETTLED = 1e-4  # relative change of the largest tau
 _GROUP_ARMS = 2.0  # that the spread of a parameter's group counts as, against what arms say of the parameter itself
 # Deviations above chance, below which recordings of an arm do not differ by more than their noise: what is taken for a
@@ -93,6 +95,23 @@ class ArmFit:
     total: Information
     error: TorqueError
 
+    @classmethod
+    def of(cls, fit: LeastSquares, doubt: Uncertainty, clusters: int, total: Information, error: TorqueError) -> ArmFit:
+        """Return the estimate with its precision where nothing differs from recording to recording."""
+        degrees = max(int(total.rows.sum()) - total.base, 1)
+        variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
+        # One factor for all: factors of their own would turn the combinations that are known well into others.
+        precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
+        return cls(fit, doubt, clusters, precision, total, error)
+
+    def weighed(self, between: Array) -> ArmFit:
+        """Return the estimate as less sure by what differs from recording to recording.
+
+        Args:
+            between: variance of the arm's mean by that [SI^2], shape (base,).
+        """
+        return replace(self, precision=_widened(self.precision, between))
+
     @property
     def right(self) -> Array:
         """Return the precision times the estimate, shape (base,)."""
@@ -100,27 +119,20 @@ class ArmFit:
 
 
 @one_blas_thread()
-def arm_fit(merged: Merged, method: str, between: Array | None = None, doubt: Uncertainty | None = None) -> ArmFit:
+def arm_fit(merged: Merged, method: str, between: Array | None = None) -> ArmFit:
     """Estimate one arm from merged factors.
 
     Args:
         merged: its information.
         method: `ols` gives all joints the same weight.
-        between: variance of the arm's mean by what differs from recording to recording [SI^2], shape (base,); None
-            where recordings are the clusters, whose covariance has it already.
-        doubt: its uncertainty, which takes most of the time, where it is known; estimated if None.
+        between: as of `ArmFit.weighed`; None where recordings are the clusters, whose covariance has it already.
     """
-    total = merged.fitted.total
+    fitted = merged.fitted
+    total = fitted.total
     fit = ordinary_least_squares(total) if method == "ols" else weighted_least_squares(total)
-    doubt = uncertainty(merged.fitted, fit) if doubt is None else doubt
-    degrees = max(int(total.rows.sum()) - total.base, 1)
-    variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
-    # One factor for all: factors of their own would turn the combinations that are known well into others.
-    precision = fit.R1.T @ fit.R1 / (max(variance, np.finfo(float).tiny) * doubt.inflation)
-    if between is not None:
-        precision = _widened(precision, between)
-    everything = merged.everything
-    return ArmFit(fit, doubt, len(merged.clusters), precision, total, torque_error(everything, fit.beta))
+    error = torque_error(merged.everything, fit.beta)
+    found = ArmFit.of(fit, uncertainty(fitted, fit), len(merged.clusters), total, error)
+    return found if between is None else found.weighed(between)
 
 
 def _widened(precision: Array, variances: Array) -> Array:
@@ -242,15 +254,35 @@ def _torque_scale(fits: Mapping[str, ArmFit]) -> tuple[Array, float]:
 
 
 def _inverse(matrix: Array) -> Array:
+    """Return the inverse of a positive semidefinite matrix; the pseudo-inverse where it is singular."""
+    L, failed = dpotrf(matrix, lower=True)
+    if not failed and np.diag(L).min() > _REGULAR * np.diag(L).max():
+        return _inverse_of(L)
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-12, hermitian=True))
 
 
+def _inverse_of(L: Array) -> Array:
+    """Return the inverse of L L^T, L lower triangular."""
+    half, _ = dpotri(L, lower=True)  # the lower half; above are zeros
+    inverse = half + half.T
+    np.fill_diagonal(inverse, np.diag(half))
+    return np.asarray(inverse)
+
+
 def _common(P: Array, right: Array, variances: Array) -> tuple[Array, Array, Array, Array]:
-    """Return mu, its covariance, and of every arm M_i = (C_i + T)^-1 and M_i beta_i."""
-    shrinking = np.eye(P.shape[1]) + P * variances
-    M = np.linalg.solve(shrinking, P)
+    """Return mu, its covariance, and of every arm M_i = (C_i + T)^-1 and M_i beta_i.
+
+    With s the square root of T, M = P - P s (1 + s P s)^-1 s P, where P may be singular, and s may be zero.
+    """
+    s = np.sqrt(variances)
+    felt = s[:, None] * P  # s P
+    inner = felt * s
+    inner[:, np.arange(len(s)), np.arange(len(s))] += 1.0
+    inverses = np.array([_inverse_of(dpotrf(one, lower=True)[0]) for one in inner])
+    shrunk = np.swapaxes(felt, 1, 2) @ inverses  # P s (1 + s P s)^-1
+    M = P - shrunk @ felt
     M = 0.5 * (M + np.swapaxes(M, 1, 2))
-    weighted = np.linalg.solve(shrinking, right[:, :, None])[:, :, 0]
+    weighted = right - (shrunk @ (s * right)[:, :, None])[:, :, 0]
     covariance = _inverse(M.sum(axis=0))
     return np.asarray(covariance @ weighted.sum(axis=0)), covariance, np.asarray(M), np.asarray(weighted)
 
@@ -591,9 +623,11 @@ def held_out_errors(
         scale: D, shape (base,).
         described: the arm.
     """
-    everything = unseen.everything
-    errors = [
-        torque_error(everything, constrained(fit, described)).relative_percent
-        for fit in (alone.fit, pooled_fit(alone, prior, scale))
-    ]
-    return errors[0], errors[1]
+    alone_fit, pooled = alone.fit, pooled_fit(alone, prior, scale)
+    return error_on(unseen, alone_fit, described), error_on(unseen, pooled, described)
+
+
+@one_blas_thread()
+def error_on(unseen: Merged, fit: LeastSquares, described: Described) -> float:
+    """Return the torque error of an estimate, inside the feasible set, on recordings that it has not seen [percent]."""
+    return torque_error(unseen.everything, constrained(fit, described)).relative_percent

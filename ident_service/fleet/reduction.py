@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any, Final, TypeVar
 
 import dask
-from distributed import Client, KilledWorker, LocalCluster, as_completed
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 
 from ident_service import __version__
 from ident_service.config.arm import ArmConfig
@@ -28,16 +29,15 @@ from ident_service.fleet.factor import (
     FACTORS,
     FAN_IN,
     SETTLED,
-    STRETCHES,
     Described,
     Outcome,
     Part,
     Problem,
     Row,
     Settled,
+    give_back,
     merge,
     merge_stored,
-    missing,
     reduce_recording,
     require_mergeable,
     settle,
@@ -56,6 +56,7 @@ PIECE_BYTES: Final = 256 * 2**20  # of a file, beyond which it is cut into piece
 MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
 _ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
 _CONNECT_S: Final = 10.0
+_LOOKED_AFTER_S = 3.0  # between looks at workers that Dask may have paused
 _WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
 _LOOKED_UP: Final = 64  # recordings that one task looks up in the store
 _PILOTS_TRIED, _ARMS_TRIED = 20, 5  # recordings of an arm that choices may be settled with, and arms
@@ -109,29 +110,6 @@ class Recorded:
         return self.url.rpartition("/")[2] + self.row.label
 
 
-@dataclass(frozen=True)
-class Tree:
-    """Futures of one arm's information (`factor.Merged`), which stays on the workers.
-
-    Attributes:
-        single: of the first recording, in the order of hashes.
-        trained: of those that are not held out.
-        held: of those held out to judge, a third; None where there is one recording only.
-        merged: of all.
-        by_recording: whether each recording is a cluster of the uncertainty.
-        keys: of the factors, in the order in which they are merged.
-        count: recordings that are not held out, the first ones.
-    """
-
-    single: Any
-    trained: Any
-    held: Any | None
-    merged: Any
-    by_recording: bool
-    keys: tuple[str, ...]
-    count: int
-
-
 @dataclass
 class Reduced:
     """Fleet whose recordings are reduced.
@@ -140,17 +118,22 @@ class Reduced:
         described: the arms, with numbers for all that could be chosen.
         pilot: URLs of the recordings that chose them; empty where there was nothing to choose.
         arms: recordings of each arm, by time.
-        trees: information of each arm, on the workers.
         problems: why recordings were left out.
         computed: factors that were computed, the others having been in the store.
+        parts: that were asked for.
     """
 
     described: Described
     pilot: str
     arms: dict[str, list[Recorded]] = field(default_factory=dict)
-    trees: dict[str, Tree] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     computed: int = 0
+    parts: tuple[Part, ...] = ()
+
+    def keys_of(self, recordings: Iterable[Recorded]) -> tuple[str, ...]:
+        """Return the factors of recordings in the order in which they are merged: by the recordings' hashes."""
+        found = sorted(recordings, key=lambda one: (one.row.sha256, one.row.label, one.row.key))
+        return tuple(one.row.key for one in found)
 
 
 @contextmanager
@@ -171,13 +154,15 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
             ) from None
         with client:
             _require_workers(client, request.scheduler, tell)
-            yield client
+            with _paused_workers_told(client, tell):
+                yield client
         return
     count = request.workers or os.cpu_count() or 1
     # Dask would pause a worker at 80 % of its memory until that falls, which nothing makes it do: this call would wait
-    # for ever. At 95 % it is started anew. Numbers as text: what Dask does not know as bytes is the caller's mistake.
-    try:
-        with dask.config.set({"distributed.worker.memory.pause": False}):
+    # for ever. At 95 % it is started anew. What a worker's threads do is not looked at a hundred times a second.
+    settings = {"distributed.worker.memory.pause": False, "distributed.worker.profile.enabled": False}
+    try:  # numbers as text: what Dask does not know as bytes is the caller's mistake
+        with dask.config.set(settings):
             cluster = LocalCluster(
                 n_workers=count,
                 threads_per_worker=1,
@@ -191,6 +176,43 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
     with cluster, Client(cluster, set_as_default=False) as client:
         tell(f"{count} workers of {request.memory} each on this machine, dashboard {cluster.dashboard_link}")
         yield client
+
+
+@contextmanager
+def _paused_workers_told(client: Client, tell: Tell) -> Iterator[None]:
+    """Look after workers that Dask has paused near their memory limit, as it does with those that we did not start.
+
+    Such a worker goes on where it needs less, so it is told to give back what it does not use. One that stays paused is
+    named: a command whose workers are all paused waits until somebody starts another.
+    """
+    over, named = Event(), set[str]()
+
+    def look() -> None:
+        before: set[str] = set()
+        while not over.wait(_LOOKED_AFTER_S):
+            try:
+                workers = client.scheduler_info(n_workers=-1)["workers"]
+                paused = {address for address, of in workers.items() if of.get("status") == "paused"}
+                if paused:
+                    client.run(give_back, workers=list(paused), on_error="ignore")
+            except (OSError, TimeoutError, ValueError):
+                continue  # the call that waits for the scheduler says so
+            for address in sorted(paused & before - named):
+                named.add(address)
+                limit = f"{(workers[address].get('memory_limit') or 0) / 2**20:.0f} MiB"
+                tell(
+                    f"{address} is paused by Dask near its limit of {limit} and gets nothing to do: start it with a"
+                    " larger --memory-limit, or start another"
+                )
+            before = paused
+
+    watcher = Thread(target=look, name="paused workers", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
 
 
 def _require_workers(client: Client, address: str, tell: Tell) -> None:
@@ -211,6 +233,22 @@ def _require_workers(client: Client, address: str, tell: Tell) -> None:
             if theirs.get(package) != own.get(package):
                 tell(f"{worker} has {package} {theirs.get(package)}, not {own.get(package)}: last bits may differ")
     tell(f"{len(versions['workers'])} workers of {address}, dashboard {client.dashboard_link}")
+
+
+def result_of(future: Future, what: str) -> Any:
+    """Wait for the result of a task.
+
+    Args:
+        future: of the task.
+        what: it does, in words, for the error.
+
+    Raises:
+        Unavailable: it ended every worker that tried.
+    """
+    try:
+        return future.result()
+    except KilledWorker:
+        raise Unavailable(f"{what} ended every worker that tried; give workers more with --memory") from None
 
 
 def in_order(
@@ -287,7 +325,7 @@ def reduce_fleet(
     tell: Tell,
     step: Step = lambda words, share: None,
 ) -> Reduced:
-    """Reduce recordings and merge those of each arm.
+    """Reduce recordings, each to its factor and row.
 
     Args:
         client: of the scheduler.
@@ -311,7 +349,7 @@ def reduce_fleet(
         for count in [max(1, -(-source.size // request.piece_bytes))]
         for number in range(count)
     ]
-    reduced = Reduced(described, pilot)
+    reduced = Reduced(described, pilot, parts=tuple(parts))
     outcomes = _mapped(client, parts, described, store, tell, step)
     seen: dict[tuple[str, str], str] = {}
     for outcome in outcomes:
@@ -331,7 +369,6 @@ def reduce_fleet(
         reasons = "; ".join(f"{one.url}{one.label}: {one.message}" for one in reduced.problems[:3])
         raise RecordingError(sources[0].url, f"no recording of {len(sources)} can be used: {reasons}")
     reduced.arms = {arm: sorted(reduced.arms[arm], key=_by_time) for arm in sorted(reduced.arms)}
-    _merge_arms(client, reduced, store, parts, tell)
     return reduced
 
 
@@ -396,7 +433,8 @@ def _settled(
     problems: list[Problem] = []
     for arm in sorted(arms)[:_ARMS_TRIED]:
         tell(f"filter, delay and friction's shape are chosen from recordings of {arm}")
-        found = client.submit(settle, arms[arm][:_PILOTS_TRIED], description, pure=False).result()
+        settling = client.submit(settle, arms[arm][:_PILOTS_TRIED], description, pure=False)
+        found = result_of(settling, "choosing filter, delay and friction's shape")
         if isinstance(found, Settled):
             names = ", ".join(found.pilots)
             store.write(name, f"{names}\n{found.description}".encode())
@@ -443,57 +481,52 @@ def _mapped(
     return [outcome for outcome in outcomes if outcome is not None]
 
 
-def _merge_arms(client: Client, reduced: Reduced, store: Store, parts: Sequence[Part], tell: Tell) -> None:
-    waiting = list(reduced.arms)
-    for attempt in range(2):
-        for arm in waiting:
-            reduced.trees[arm] = _tree(client, reduced.arms[arm], reduced.described, store)
-        checks = {arm: client.submit(missing, reduced.trees[arm].merged, pure=False) for arm in waiting}
-        damaged: dict[str, tuple[str, ...]] = {}
-        for arm, check in checks.items():
-            try:
-                if found := check.result():
-                    damaged[arm] = found
-            except KilledWorker:
-                raise Unavailable(f"{arm}: merging it ended every worker; give workers more with --memory") from None
-        if not damaged:
-            return
-        keys = {key for found in damaged.values() for key in found}
-        if attempt:
-            told = ", ".join(sorted(keys)[:3])
-            raise StorageError(store.url, f"factors that were just written cannot be read: {told}")
-        tell(f"{len(keys)} factors are damaged in the store and are computed again")
-        urls = {(one.url, one.row.label) for arm in damaged for one in reduced.arms[arm] if one.row.key in keys}
-        again = [part for part in parts if (part.source.url, part.label) in urls]
-        tasks = [(part, reduced.described, store, __version__, True) for part in again]
-        for future in [client.submit(reduce_recording, *task, pure=False) for task in tasks]:
-            outcome = future.result()
-            if outcome.problem is not None:
-                raise StorageError(outcome.problem.url, f"its factor is damaged, and {outcome.problem.message}")
-        reduced.computed += len(tasks)
-        waiting = list(damaged)
+def reduce_again(client: Client, reduced: Reduced, keys: Collection[str], store: Store) -> None:
+    """Compute factors again that are gone from the store, or damaged.
+
+    Args:
+        client: of the scheduler.
+        reduced: what they are of.
+        keys: of the factors.
+        store: of the factors.
+
+    Raises:
+        StorageError: a recording cannot be read any more.
+    """
+    urls = {(one.url, one.row.label) for of in reduced.arms.values() for one in of if one.row.key in keys}
+    tasks = [
+        (part, reduced.described, store, __version__, True)
+        for part in reduced.parts
+        if (part.source.url, part.label) in urls
+    ]
+    for future in [client.submit(reduce_recording, *task, pure=False) for task in tasks]:
+        outcome = result_of(future, "reducing a recording again")
+        if outcome.problem is not None:
+            raise StorageError(outcome.problem.url, f"its factor is damaged, and {outcome.problem.message}")
+    reduced.computed += len(tasks)
 
 
-def _tree(client: Client, recordings: Sequence[Recorded], described: Described, store: Store) -> Tree:
-    """Merge an arm's factors in the order of the recordings' hashes."""
-    keys = [one.row.key for one in sorted(recordings, key=lambda one: (one.row.sha256, one.row.label, one.row.key))]
-    count = len(keys) - (max(len(keys) // 3, 1) if len(keys) > 1 else 0)
-    whole = count >= STRETCHES
+def merged_on_workers(
+    client: Client, keys: Sequence[str], described: Described, store: Store, *, whole: bool
+) -> Future | None:
+    """Merge factors in a tree of tasks; None where they are so few that a task that needs them can merge them itself.
 
-    def branch(of: Sequence[str]) -> Any:
-        level = [
-            client.submit(merge_stored, of[k : k + AT_ONCE], described, store, whole, pure=False)
-            for k in range(0, len(of), AT_ONCE)
-        ]
-        while len(level) > 1:
-            level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
-        return level[0]
-
-    single = client.submit(merge_stored, keys[:1], described, store, False, pure=False)
-    trained = single if count == 1 else branch(keys[:count])
-    held = branch(keys[count:]) if count < len(keys) else None
-    merged = trained if held is None else client.submit(merge, [trained, held], pure=False)
-    return Tree(single, trained, held, merged, whole, tuple(keys), count)
+    Args:
+        client: of the scheduler.
+        keys: of the factors, in the order in which they are merged.
+        described: the arm.
+        store: of the factors.
+        whole: as of `merge_stored`.
+    """
+    if len(keys) <= AT_ONCE:
+        return None
+    level = [
+        client.submit(merge_stored, keys[k : k + AT_ONCE], described, store, whole, pure=False)
+        for k in range(0, len(keys), AT_ONCE)
+    ]
+    while len(level) > 1:
+        level = [client.submit(merge, level[k : k + FAN_IN], pure=False) for k in range(0, len(level), FAN_IN)]
+    return level[0]
 
 
 def status_of(request: FleetRequest) -> Mapping[str, Any]:

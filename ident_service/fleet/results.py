@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.resources import files
@@ -30,6 +30,7 @@ FORMAT: Final = "ident-fleet"
 _ARMS_DRAWN = 12  # arms whose trends the page shows
 _GROUPS_DRAWN = 6  # of each
 _POINTS = 200  # of a small drawing
+_WRITTEN = 64  # recordings that are written into the table at once
 _ALL_LISTED = 500  # recordings, beyond which a page lists those with something to tell
 _OF_TABLE = ("values", "standard_deviations", "verdicts", "negligible")  # of a summary, which the table has
 
@@ -242,24 +243,48 @@ def write_table(path: Path, result: FleetResult, summaries: Summaries) -> None:
     with pq.ParquetWriter(path, _SCHEMA) as writer:
         for arm, recordings in result.reduced.arms.items():
             summary = summaries[arm]
-            entries: list[dict[str, Any]] = [_of_recording(one, summary) for one in recordings]
-            entries.append(
-                {
-                    "recording": None,
-                    "sha256": None,
-                    "time": None,
-                    "value": summary["values"],
-                    "deviation": summary["standard_deviations"],
-                    "verdict": summary["verdicts"],
-                    "quality": "; ".join(summary["unusable"]) or "good",
-                    "torque_error_percent": summary["error_percent"],
-                    "temperature": None,
-                    "operating_hours": None,
-                }
-            )
-            for entry in entries:
-                whole = {key: value if isinstance(value, list) else [value] * size for key, value in entry.items()}
-                writer.write_table(pa.table({"arm": [arm] * size, **columns, **whole}, schema=_SCHEMA))
+            own = {
+                "recording": None,
+                "sha256": None,
+                "time": None,
+                "value": summary["values"],
+                "deviation": summary["standard_deviations"],
+                "verdict": summary["verdicts"],
+                "quality": "; ".join(summary["unusable"]) or "good",
+                "torque_error_percent": summary["error_percent"],
+                "temperature": None,
+                "operating_hours": None,
+            }
+            for begin in range(0, len(recordings) + 1, _WRITTEN):
+                entries: list[dict[str, Any]] = [
+                    _of_recording(one, summary) for one in recordings[begin : begin + _WRITTEN]
+                ]
+                if begin + _WRITTEN > len(recordings):
+                    entries.append(own)
+                whole = [
+                    {key: value if isinstance(value, list) else [value] * size for key, value in entry.items()}
+                    | {"arm": [arm] * size, **columns}
+                    for entry in entries
+                ]
+                values = [_column(field.type, [one for part in whole for one in part[field.name]]) for field in _SCHEMA]
+                writer.write_table(pa.Table.from_arrays(values, schema=_SCHEMA))
+
+
+def _column(kind: pa.DataType, values: Sequence[Any]) -> pa.Array:
+    """Return text, numbers or whole numbers, None where there is none, as a column.
+
+    The conversions of pyarrow load pandas for a second where it is installed, to see whether values are of it.
+    """
+    known = np.array([value is not None for value in values])
+    validity = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    if pa.types.is_string(kind):
+        texts = [b"" if value is None else value.encode() for value in values]
+        offsets = np.cumsum([0, *map(len, texts)], dtype=np.int32)
+        buffers = [validity, pa.py_buffer(offsets), pa.py_buffer(b"".join(texts))]
+    else:
+        of = np.float64 if pa.types.is_floating(kind) else np.int64
+        buffers = [validity, pa.py_buffer(np.array([0 if value is None else value for value in values], dtype=of))]
+    return pa.Array.from_buffers(kind, len(values), buffers)
 
 
 def _of_recording(one: Recorded, summary: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,8 @@ from ident_service.errors import ModelError
 from ident_service.model.chain import Array, Chain
 from ident_service.model.parameter_layout import INERTIAL, Layout
 
+_PANEL = 8  # columns that are eliminated at once
+
 
 @dataclass(frozen=True)
 class Information:
@@ -146,7 +148,15 @@ def _stacked(factors: Sequence[Array]) -> Array:
 
 def triangle(rows: Array) -> Array:
     """Return R of a QR decomposition, with arbitrary signs."""
-    return np.asarray(np.linalg.qr(rows, mode="r"))
+    count, size = rows.shape
+    if count < size:
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+    from scipy.linalg.lapack import dtpqrt  # loads for 0.2 s, as in `zero_phase.py`
+
+    # Rows are merged into a triangle of zeros: unlike LAPACK's plain QR, it works in blocks on narrow matrices, too,
+    # which takes a quarter of the time for thousands of rows.
+    R, *_ = dtpqrt(0, min(_PANEL, size), np.zeros((size, size), order="F"), rows)
+    return np.asarray(R)
 
 
 def sparsity(chain: Chain, layout: Layout, base_columns: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:

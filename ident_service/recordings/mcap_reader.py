@@ -9,9 +9,11 @@ to stamp; for a bag neither is known. A file that was cut off is read up to the 
 
 from __future__ import annotations
 
+import hashlib
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Final, Self
 
@@ -209,12 +211,13 @@ class JointStateDecoder:
 def _joined(payloads: Sequence[bytes | NDArray[np.uint8]]) -> list[bytes] | NDArray[np.uint8]:
     """Return payloads as rows, shape (payloads, bytes), where they are of one length, else one by one."""
     lengths = {len(one) if isinstance(one, bytes) else one.shape[1] for one in payloads}
-    parts = [one if isinstance(one, bytes) else one.tobytes() for one in payloads]
-    if len(lengths) == 1 and (length := lengths.pop()):
-        return np.frombuffer(b"".join(parts), np.uint8).reshape(-1, length)
+    if len(lengths) == 1 and lengths != {0}:
+        return np.concatenate(
+            [np.frombuffer(one, np.uint8)[None] if isinstance(one, bytes) else one for one in payloads]
+        )
     whole: list[bytes] = []
-    for one, data in zip(payloads, parts, strict=True):
-        whole += [data] if isinstance(one, bytes) else [row.tobytes() for row in one]
+    for one in payloads:
+        whole += [one] if isinstance(one, bytes) else [row.tobytes() for row in one]
     return whole
 
 
@@ -493,8 +496,12 @@ class McapRecording:
             stream.seek(0)
             if stream.read(len(mcap.MAGIC)) != mcap.MAGIC:
                 raise RecordingError(self.path, "is not an MCAP file")
-        self.sha256 = sha256(self.path, self._size)
-        self._runs = self._verify()
+            stream.seek(0)
+            content = self._read(stream) if self._size <= _KEPT else None
+        # From memory, records are found in half the time.
+        self.sha256 = sha256(self.path, self._size) if content is None else hashlib.sha256(content).hexdigest()
+        with self._open() if content is None else BytesIO(content) as stream:
+            self._runs = self._verify(stream)
         self._offset_ns = self._utc_offset()
         self.torque_held = self.metadata.get("torque_hold") == "zero_order"
         self.own = bool(self.metadata)
@@ -678,8 +685,17 @@ class McapRecording:
         with self._open() as stream:
             yield from mcap.contents(stream, self._size)
 
-    def _verify(self) -> tuple[bytes, ...] | None:
+    def _read(self, stream: IO[bytes]) -> bytes:
+        try:
+            return stream.read(self._size)
+        except OSError as error:
+            raise RecordingError(self.path, f"cannot be read: {error.strerror}") from error
+
+    def _verify(self, stream: IO[bytes]) -> tuple[bytes, ...] | None:
         """Read every chunk and every metadata record once, so that `torn` is known from the start.
+
+        Args:
+            stream: the file, or its content.
 
         Returns:
             The runs of records in the chunks and outside; None where they are more than `_KEPT` bytes, or torn.
@@ -687,17 +703,16 @@ class McapRecording:
         runs: list[bytes] = []
         kept = 0
         try:
-            with self._open() as stream:
-                for opcode, content in mcap.records(stream, self._size, {*mcap.CONTENTS, Opcode.METADATA}):
-                    if opcode != Opcode.METADATA:
-                        run = mcap.run_of(opcode, content)
-                        kept += len(run)
-                        if kept > _KEPT:
-                            runs.clear()
-                        else:
-                            runs.append(run)
-                    elif (record := mcap.metadata(content)).name == METADATA_NAME:
-                        self.metadata.update(record.metadata)
+            for opcode, content in mcap.records(stream, self._size, {*mcap.CONTENTS, Opcode.METADATA}):
+                if opcode != Opcode.METADATA:
+                    run = mcap.run_of(opcode, content)
+                    kept += len(run)
+                    if kept > _KEPT:
+                        runs.clear()
+                    else:
+                        runs.append(run)
+                elif (record := mcap.metadata(content)).name == METADATA_NAME:
+                    self.metadata.update(record.metadata)
             return tuple(runs) if kept <= _KEPT else None
         except mcap.TornError as error:
             self._tear(error)

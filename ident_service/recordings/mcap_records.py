@@ -59,13 +59,45 @@ class TooLargeError(Exception):
     """Report a record or chunk beyond the bounds of size."""
 
 
+class Period(NamedTuple):
+    """Hold the messages of one cycle of a loop, of which whole runs consist.
+
+    Attributes:
+        length: of all of its records [bytes].
+        where: places of their kinds, lengths and channels in it, shape (bytes,).
+        expected: what stands there, shape (bytes,).
+        wanted: places of those of them that are read, at most one.
+    """
+
+    length: int
+    where: NDArray[np.intp]
+    expected: NDArray[np.uint8]
+    wanted: tuple[int, ...]
+
+    @classmethod
+    def of(cls, run: bytes, begins: Sequence[int], end: int, wanted: Sequence[int]) -> Period:
+        """Return the period of the messages at `begins`, which end at `end`."""
+        start, length = begins[0], end - begins[0]
+        where = np.add.outer(np.array(begins) - start, np.arange(_MESSAGE_HEAD.size)).ravel()
+        expected = np.frombuffer(run, np.uint8, length, start)[where]
+        return cls(length, where, expected, tuple(at - start for at in wanted))
+
+    def repeats(self, run: bytes, position: int) -> int:
+        """Return how often it follows from `position` on, in kind, length and channel."""
+        length = self.length
+        rows = np.frombuffer(run, np.uint8, (len(run) - position) // length * length, position).reshape(-1, length)
+        same = (rows[:, self.where] == self.expected).all(axis=1)
+        return len(rows) if same.all() else int(np.argmin(same))
+
+
 class Directory:
-    """The channels and schemas met so far, by id, and which channels are read."""
+    """The channels and schemas met so far, by id, which channels are read, and the period of a run that had one."""
 
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, str] = {}
         self.chosen: dict[int, bool] = {}
+        self.period: Period | None = None
 
     def schema_of(self, channel: Channel) -> str:
         """Return the name of the channel's message type, empty where the file does not say."""
@@ -187,6 +219,11 @@ def series(
         TornError: the bytes cannot be records.
     """
     position, end, chosen = 0, len(run), directory.chosen
+    if (known := directory.period) is not None and end % known.length == 0 < end:
+        count = end // known.length
+        if known.repeats(run, 0) == count:
+            yield from (_gathered(run, offset, 0, known.length, count) for offset in known.wanted)
+            return
     head, unpack = _HEAD.size, _MESSAGE_HEAD.unpack_from  # three messages a cycle: what is looked up here counts
     # The head of the message that a period may begin with, and where its messages begin.
     regular, first = True, b""
@@ -197,12 +234,15 @@ def series(
                 if regular and run[position : position + _MESSAGE_HEAD.size] == first:
                     last, begins = begins, []
                     slots = [at for at in last if chosen[unpack(run, at)[2]]]
-                    count = _repeats(run, last, position) if len(slots) < 2 else 0
+                    period = Period.of(run, last, position, slots)
+                    count = period.repeats(run, position) if len(slots) < 2 else 0
                     regular = count >= _FEW
                     first = b""
+                    if regular:
+                        directory.period = period
                     if slots and count:
-                        yield _gathered(run, slots[0] - last[0], position, position - last[0], count)
-                    position += count * (position - last[0])
+                        yield _gathered(run, slots[0] - last[0], position, period.length, count)
+                    position += count * period.length
                     if count:
                         continue
                 _, length, channel = unpack(run, position)
@@ -234,16 +274,6 @@ def series(
                 directory.schemas[schema.id] = schema.name
     except struct.error as error:
         raise TornError("a chunk ends within a record") from error
-
-
-def _repeats(run: bytes, begins: Sequence[int], position: int) -> int:
-    """Return how often the messages at `begins` follow anew from `position` on, in kind, length and channel."""
-    period = position - begins[0]
-    rows = np.frombuffer(run, np.uint8, (len(run) - position) // period * period, position).reshape(-1, period)
-    where = np.add.outer(np.array(begins) - begins[0], np.arange(_MESSAGE_HEAD.size)).ravel()
-    expected = np.frombuffer(run, np.uint8, period, begins[0])[where]
-    other = np.flatnonzero((rows[:, where] != expected).any(axis=1))
-    return int(other[0]) if len(other) else len(rows)
 
 
 def _gathered(run: bytes, offset: int, position: int, period: int, count: int) -> Series:

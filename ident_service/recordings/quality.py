@@ -201,7 +201,8 @@ class _Joints:
         self._at_limit = np.zeros(joints)
         self._still, self._pairs = np.zeros(joints), 0
         self._timing = ArrivalTest(stamps)
-        self._plateaus = [(_Plateau(), _Plateau()) for _ in names]
+        # Where no limit is known.
+        self._plateaus = {int(joint): (_Plateau(), _Plateau()) for joint in np.flatnonzero(np.isnan(limit))}
 
     def add(self, block: Block) -> None:
         """Add the next samples to the statistics."""
@@ -216,7 +217,7 @@ class _Joints:
         self._torque = _wider(self._torque, torque)
         self._timing.add(block)
         self._at_limit += (np.abs(torque) >= SATURATED * self._limit).sum(axis=0)
-        for joint, (top, bottom) in enumerate(self._plateaus):
+        for joint, (top, bottom) in self._plateaus.items():
             top.add(torque[:, joint])
             bottom.add(-torque[:, joint])
         run = block if self._tail is None else join([self._tail, block])
@@ -264,10 +265,10 @@ class _Joints:
         samples = self._stamps.samples
         found = []
         for k, name in enumerate(self._names):
-            top, bottom = self._plateaus[k]
-            varies = self._torque[0][k] < self._torque[1][k]
-            guessed = top.samples() + bottom.samples() if varies else 0
-            at_limit = guessed if np.isnan(self._limit[k]) else self._at_limit[k]
+            at_limit = self._at_limit[k]
+            if k in self._plateaus:
+                varies = self._torque[0][k] < self._torque[1][k]
+                at_limit = sum(side.samples() for side in self._plateaus[k]) if varies else 0
             found.append(
                 JointQuality(
                     name=name,

@@ -26,8 +26,9 @@ from moto.server import ThreadedMotoServer
 
 from ident_service.certificate_verifier import verify_path
 from ident_service.cli import main
+from ident_service.errors import Unavailable
 from ident_service.fleet.identify import identify_fleet
-from ident_service.fleet.reduction import FleetRequest
+from ident_service.fleet.reduction import FleetRequest, in_order, result_of
 
 pytestmark = [
     pytest.mark.slow,
@@ -261,6 +262,31 @@ def test_killed_workers_change_nothing(
         killer.join()
     assert len(killed) == 2
     assert bits(tmp_path / "disturbed") == undisturbed
+
+
+def _ends(number: int) -> int:
+    """End this worker, if it is asked to."""
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def _allow(failures: int, dask_scheduler: Any = None) -> None:
+    dask_scheduler.allowed_failures = failures
+
+
+def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
+    """After one try here, after four as a rule."""
+    with Client(cluster, set_as_default=False) as client:
+        client.wait_for_workers(2)
+        client.run_on_scheduler(_allow, 0)
+        try:
+            assert dict(in_order(client, _ends, [(0,), (1,)], lambda number: -number)) == {0: 0, 1: -1}
+            with pytest.raises(Unavailable, match="choosing ended every worker that tried; give workers more"):
+                result_of(client.submit(_ends, 1, pure=False), "choosing")
+        finally:
+            client.run_on_scheduler(_allow, 3)
+        assert client.submit(_ends, 2, pure=False).result() == 2
 
 
 def test_after_a_killed_client_the_next_call_goes_on(

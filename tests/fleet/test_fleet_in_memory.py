@@ -5,12 +5,15 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import psutil
+import pyarrow as pa
 import pytest
 from distributed import LocalCluster, get_worker
 from fsspec.implementations.memory import MemoryFileSystem
@@ -18,7 +21,8 @@ from helpers.fleets import BEGIN, WEEK, kind, write_recording
 
 from ident_service.cli import main
 from ident_service.errors import Unavailable, UsageError
-from ident_service.fleet import reduction, storage
+from ident_service.fleet import factor, reduction, results, storage
+from ident_service.fleet.identify import identify_fleet
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
 COUNT = 3
@@ -32,6 +36,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.fixture(scope="module")
+def threads() -> Iterator[LocalCluster]:
+    """Workers that are threads, as memory is this process's own."""
+    with LocalCluster(
+        processes=False, n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0", silence_logs=50
+    ) as cluster:
+        yield cluster
+
+
 @pytest.fixture(autouse=True)
 def known_systems() -> Iterator[None]:
     storage._system.cache_clear()
@@ -40,9 +53,12 @@ def known_systems() -> Iterator[None]:
 
 
 def test_recordings_and_store_in_memory(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    threads: LocalCluster,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Workers are threads here, as memory is this process's own."""
     monkeypatch.setattr(MemoryFileSystem, "store", {})
     memory = fsspec.filesystem("memory")
     for path in sorted(folder.rglob("*.mcap")):
@@ -57,18 +73,45 @@ def test_recordings_and_store_in_memory(
         "memory://store",
         "--json",
     ]
-    with LocalCluster(
-        processes=False, n_workers=1, threads_per_worker=2, dashboard_address="127.0.0.1:0", silence_logs=50
-    ) as cluster:
-        assert main([*words, "--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "out")]) == 0
-        assert json.loads(capsys.readouterr().out)["recordings"] == COUNT
-        # A client of another version than the worker's is refused before anything is computed.
-        with monkeypatch.context() as other:
-            other.setattr(reduction, "__version__", "0.0.0")
-            assert main([*words, "--scheduler", cluster.scheduler_address, "--out", str(tmp_path / "other")]) == 2
-        assert "this client 0.0.0: install the same on every worker" in capsys.readouterr().out
-        assert not (tmp_path / "other").exists()
+    there = ["--scheduler", threads.scheduler_address]
+    assert main([*words, *there, "--out", str(tmp_path / "out")]) == 0
+    assert json.loads(capsys.readouterr().out)["recordings"] == COUNT
+    # A client of another version than the worker's is refused before anything is computed.
+    with monkeypatch.context() as other:
+        other.setattr(reduction, "__version__", "0.0.0")
+        assert main([*words, *there, "--out", str(tmp_path / "other")]) == 2
+    assert "this client 0.0.0: install the same on every worker" in capsys.readouterr().out
+    assert not (tmp_path / "other").exists()
     assert len(memory.find("/store/factors")) == COUNT
+
+
+def test_damaged_factors_are_made_again_large_files_are_cut_and_many_factors_merged_by_tasks(
+    threads: LocalCluster, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """None of which changes a bit of the result."""
+    store, said, found = tmp_path / "store", list[str](), []
+    size = min(path.stat().st_size for path in folder.rglob("*.mcap"))
+    request = reduction.FleetRequest(
+        "planar2", (str(folder),), str(store), r"(?P<arm>arm\d)", threads.scheduler_address, piece_bytes=size // 2
+    )
+    for damaged in (False, True):
+        if damaged:
+            shutil.rmtree(store / "results")
+            path = sorted((store / "factors").iterdir())[1]
+            path.write_bytes(path.read_bytes()[:1000])
+            for module in (reduction, factor):  # a tree of two neighbours, two levels of it in one task
+                monkeypatch.setattr(module, "FAN_IN", 2)
+                monkeypatch.setattr(module, "AT_ONCE", 4)
+        else:
+            monkeypatch.setattr(factor, "FAN_IN", 2)
+        found.append(identify_fleet(request, tmp_path / "out", said.append))
+    first, second = found
+    pieces = {one.row.label for one in first.reduced.arms["arm0"]}
+    assert len(pieces) == len(first.reduced.arms["arm0"]) // COUNT == 3, "more are fitted to than one task merges"
+    assert "1 factors are damaged in the store and are computed again" in said
+    assert (first.reduced.computed, second.reduced.computed) == (len(pieces) * COUNT, 1)
+    for key in ("arms", "parameters", "held_out", "groups"):
+        assert second.document[key] == first.document[key], key
 
 
 def test_a_pattern_that_names_nothing_is_refused_before_workers_start(
@@ -112,6 +155,22 @@ def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
         client.submit(_fill, 0.87).result(timeout=60)
         time.sleep(1.0)  # in which its memory is looked at
         assert client.submit(os.getpid, pure=False).result(timeout=20) in client.run(os.getpid).values()
+
+
+def test_a_worker_of_others_that_dask_pauses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command would wait for it for ever, without a word."""
+    monkeypatch.setattr(reduction, "_LOOKED_AFTER_S", 0.2)
+    said: list[str] = []
+    with LocalCluster(
+        n_workers=1, memory_limit="400MiB", host="127.0.0.1", dashboard_address="127.0.0.1:0", silence_logs=50
+    ) as cluster:
+        request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler=cluster.scheduler_address)
+        with reduction.connected(request, said.append) as client:
+            client.submit(_fill, 0.87).result(timeout=60)
+            until = time.monotonic() + 20.0
+            while len(said) < 2 and time.monotonic() < until:
+                time.sleep(0.05)
+    assert "is paused by Dask near its limit of 400 MiB" in said[1]
 
 
 def test_a_missing_extra_is_named(
@@ -164,3 +223,20 @@ def test_a_folder_of_somebody_else_is_not_replaced(tmp_path: Path, capsys: pytes
     assert main([*words, "--out", str(tmp_path / "mine")]) == 2
     assert "holds what is no result of a fleet" in capsys.readouterr().err
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        (pa.string(), ["", "Hz", None, "Gelenk 3 – größer"]),
+        (pa.string(), [None, None]),
+        (pa.string(), ["m"] * 9),
+        (pa.float64(), [0.5, None, -1e-300]),
+        (pa.float64(), [1.0, 2.0]),
+        (pa.timestamp("us", tz="UTC"), [1_767_225_600_000_001, None]),
+    ],
+)
+def test_columns_of_the_table_are_as_pyarrow_makes_them(kind: pa.DataType, values: list[Any]) -> None:
+    made = results._column(kind, values)
+    made.validate(full=True)
+    assert made.equals(pa.array(values, type=kind))

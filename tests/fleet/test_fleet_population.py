@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ from helpers.fleets import Kind, kind, write_recording
 from ident_service import __version__
 from ident_service.estimation.least_squares import ordinary_least_squares, torque_error
 from ident_service.estimation.uncertainty import Uncertainty
-from ident_service.fleet import identify
+from ident_service.fleet import arm_results
+from ident_service.fleet.arm_page import ArmShown
+from ident_service.fleet.arm_results import ArmFits, Leaves
 from ident_service.fleet.factor import Described, Merged, Part, Row, Settled, merge_stored, reduce_recording, settle
 from ident_service.fleet.population import (
     ArmFit,
@@ -234,43 +237,67 @@ def test_what_follows_from_an_arms_factors_is_made_once(
     fleet: dict[str, list[Row]], found: Population, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Other arms may change what is said of it, and a damaged file is made again; nothing else is computed twice."""
-    keys = tuple(one.key for one in fleet["3"])
-    leaves, names = (keys, False), [(f"{one.label}w", one.sha256) for one in fleet["3"]]
+    rows = sorted(fleet["3"], key=lambda one: one.sha256)
+    leaves, names = Leaves.of([one.key for one in rows]), [(f"{one.label}w", one.sha256) for one in rows]
+    assert (leaves.count, leaves.by_recording) == (1, False)
     store, config = Store(str(tmp_path)), DESCRIBED.config.model_dump_json()
+    for folder in ("factors", "rows"):
+        shutil.copytree(Path(STORE.url, folder), tmp_path / folder)
+    between = np.zeros(DESCRIBED.base.size)
+    shown = ArmShown("3", [("one", "2026-01-01 00:00", 12.0, 100.0, 2.0, "")], [])
 
-    def made(arms: int, pooled: bool = False) -> tuple[ArmFit, dict[str, bytes], dict[str, Any]]:
-        fit = identify._kept_fit(merged(*fleet["3"]), leaves, DESCRIBED, store, None)
-        drawn = pooled_fit(fit, found.other_arms("3"), found.scale)
-        more = {"arm": "3", "pooled": pooled, "arms": arms}
-        return fit, *identify._arm_files(
-            *(fit, merged(*fleet["3"]), leaves, names, DESCRIBED, drawn, config, more, store)
-        )
+    def made(arms: int, pooled: bool = False) -> tuple[ArmFits, Any, dict[str, bytes], dict[str, Any]]:
+        fits = arm_results.arm_fits(leaves, DESCRIBED, store, between)
+        assert isinstance(fits, ArmFits)
+        errors = arm_results.errors_held_out(fits, "3", found, DESCRIBED)
+        more = {"arm": "3", "pooled": pooled, "arms": arms, "held_out_percent": None}
+        return fits, errors, *arm_results.arm_files(fits, names, DESCRIBED, found, config, more, store, shown)
 
-    first, files, summary = made(10)
-    assert sorted(path.suffix for path in (tmp_path / "results").iterdir()) == [".npz", ".zip"]
+    first, errors, files, summary = made(10)
+    assert first.merged is not None
+    assert sorted("".join(path.suffixes) for path in (tmp_path / "results").iterdir()) == [
+        *(".fit.npz", ".fit.npz", ".held.npz", ".zip")
+    ]
+    single, held = merged(rows[0]), merged(rows[1])
+    assert errors[1] == pytest.approx(
+        held_out_errors(arm_fit(single, "wls", between), held, found.other_arms("3"), found.scale, DESCRIBED)
+    )
 
     def again(*_: object, **__: object) -> None:
         raise AssertionError("computed again")
 
     with monkeypatch.context() as patched:
-        patched.setattr("ident_service.fleet.population.uncertainty", again)
-        patched.setattr(identify, "arm_estimate", again)
-        second, same, told = made(10)
+        for name in ("arm_fit", "arm_estimate", "merge_stored"):
+            patched.setattr(arm_results, name, again)
+        second, same_errors, same, told = made(10)
+        assert second.merged is None
+        assert same_errors == errors
         assert same == files
         assert {**told, "negligible": None} == {**summary, "negligible": None}
-        np.testing.assert_array_equal(second.precision, first.precision)
-        other = json.loads(made(11)[1]["parameters.json"])
+        np.testing.assert_array_equal(second.fit.precision, first.fit.precision)
+        np.testing.assert_array_equal(told["negligible"], summary["negligible"])
+        other = json.loads(made(11)[2]["parameters.json"])
         assert (other["fleet"]["arms"], other["base_parameters"]) == (
             11,
             json.loads(files["parameters.json"])["base_parameters"],
         )
         with pytest.raises(AssertionError, match="computed again"):
             made(10, pooled=True)
+    assert made(10, pooled=True)[0].merged is None, "merged for its estimate alone"
     for path in (tmp_path / "results").iterdir():
         path.write_bytes(path.read_bytes()[:100])
-    _, mended, _ = made(10)
+    _, _, mended, _ = made(10)
     assert set(mended) == set(files)
     assert mended["report.txt"] == files["report.txt"]
+
+
+def test_factors_that_are_gone_are_named(fleet: dict[str, list[Row]], tmp_path: Path) -> None:
+    store, keys = Store(str(tmp_path)), [one.key for one in fleet["3"]]
+    for key in keys[1:]:
+        store.write(f"factors/{key}.npz", Path(STORE.url, "factors", f"{key}.npz").read_bytes())
+    found = arm_results.arm_fits(Leaves.of(keys), DESCRIBED, store, np.zeros(DESCRIBED.base.size))
+    assert found == (keys[0],)
+    assert arm_results.fits_told(found) == (keys[0],)
 
 
 def test_pooling_is_judged_by_its_gain() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import reduce
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -198,3 +199,17 @@ def test_where_only_one_has_equations_its_factors_stay(monkeypatch: pytest.Monke
             assert all(np.array_equal(one, other) for one, other in zip(both.factors, some.factors, strict=True))
             assert both.rows.tolist() == some.rows.tolist()
         assert not empty.merged(empty).rows.any()
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (3, 9), (9, 9), (10, 9), (500, 9), (70, 1)])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_triangle_has_the_products_of_its_rows(rows: int, columns: int, order: Literal["C", "F"]) -> None:
+    made = np.asarray(np.random.default_rng(rows).standard_normal((rows, columns)), order=order)
+    made[:, -1:] *= 1e-9  # a column's digits are its own, unlike those of products
+    before = made.copy()
+    R = information.triangle(made)
+    np.testing.assert_array_equal(made, before)
+    assert R.shape == (min(rows, columns), columns)
+    assert not np.tril(R, -1).any()
+    sizes = np.linalg.norm(made, axis=0)
+    np.testing.assert_allclose(R.T @ R / np.outer(sizes, sizes), made.T @ made / np.outer(sizes, sizes), atol=1e-13)

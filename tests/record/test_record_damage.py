@@ -198,12 +198,38 @@ def test_records_that_repeat_are_the_same_messages_as_one_by_one(
 ) -> None:
     run, messages = made
     chosen = lambda channel: channel < 3  # noqa: E731
-    assert list(mcap_records.messages(run, mcap_records.Directory(), chosen)) == messages
+    directory = mcap_records.Directory()
+    assert list(mcap_records.messages(run, directory, chosen)) == messages
+    # What was learnt of a run's period changes nothing of the next one.
+    assert list(mcap_records.messages(run, directory, chosen)) == messages
     # Of a run that ends too early, all that came before.
     short, found = run[: max(len(run) - cut, 0)], []
     with suppress(mcap_records.TornError):
         found.extend(mcap_records.messages(short, mcap_records.Directory(), chosen))
     assert found == messages[: len(found)]
+
+
+def test_runs_of_whole_cycles_are_read_at_once_unless_one_is_another() -> None:
+    cycle = [(1, 16), (2, 8), (3, 4)]
+
+    def run(first: int, count: int, odd: int | None = None) -> bytes:
+        return b"".join(
+            _message(4 if (n, channel) == (odd, 3) else channel, n, bytes([n]) * length)
+            for n in range(first, first + count)
+            for channel, length in cycle
+        )
+
+    directory, choose = mcap_records.Directory(), lambda channel: channel == 2
+    assert len(list(mcap_records.series(run(0, 20), directory, choose))) == 2
+    (whole,) = mcap_records.series(run(20, 5), directory, choose)
+    assert isinstance(whole, mcap_records.Series)
+    assert whole.log_times.tolist() == list(range(20, 25))
+    assert whole.payloads.tolist() == [[n] * 8 for n in range(20, 25)]
+    # As long as whole cycles, but one message is of another channel; and a run that ends within a message.
+    found = list(mcap_records.messages(run(25, 12, odd=30), directory, choose))
+    assert [time for _, time, _ in found] == list(range(25, 37))
+    with pytest.raises(mcap_records.TornError):
+        list(mcap_records.messages(run(37, 12)[:-1], directory, choose))
 
 
 def test_many_at_once_are_found_in_a_loops_records() -> None:

@@ -31,6 +31,7 @@ from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, s
 from ident_service.estimation.feasible.formulation import EPSILON, LinkParameterMap
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
+from ident_service.model.information import triangle
 from ident_service.model.likely_bodies import LikelyBodies
 
 _ITERATIONS = 200
@@ -38,7 +39,8 @@ _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the
 _QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
 _STEP = 0.99  # largest share of the distance to the boundary in one step
 _LONGEST = 10.0  # largest multiple of Newton's step
-_HALVINGS = 50  # bisections of the step length
+_ROUNDS, _SAME = 50, 1e-12  # of the search for the step length, and relative change of it that ends it
+_RANK = 1e-10  # least entry on the diagonal of R that counts
 _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data press against the set
 
 
@@ -131,7 +133,7 @@ def centre(
         r = np.concatenate([*wanted, -np.sqrt(2.0 / left) * away, np.zeros(1)])
         norms = np.linalg.norm(J, axis=0)
         unit = np.divide(1.0, norms, out=np.zeros(len(norms)), where=norms > 0.0)  # 0: no condition feels the direction
-        step = unit * scipy.linalg.lstsq(J * unit, r, lapack_driver="gelsy")[0]
+        step = unit * _least_squares(J * unit, r)
         decrement = float(np.linalg.norm(J @ step))
         if decrement < _CONVERGED or (decrement < _QUADRATIC and decrement > 0.5 * before):
             break
@@ -140,6 +142,15 @@ def centre(
         y += _length(changes, away, N @ step, decrement) * step
     found = np.asarray(delta + free @ y)
     return found if conditions.margin(found)[0] > 0.0 else delta
+
+
+def _least_squares(J: Array, r: Array) -> Array:
+    """Return the x that minimises |J x - r|, the smallest one where several do; columns of J have unit length, or none."""
+    size = J.shape[1]
+    R = triangle(np.column_stack([J, r]))
+    if len(R) > size and np.abs(np.diag(R)[:size]).min(initial=1.0) > _RANK:
+        return np.asarray(scipy.linalg.solve_triangular(R[:size, :size], R[:size, size], check_finite=False))
+    return np.asarray(scipy.linalg.lstsq(J, r, lapack_driver="gelsy")[0])
 
 
 def _length(changes: Array, away: Array, going: Array, decrement: float) -> float:
@@ -151,24 +162,31 @@ def _length(changes: Array, away: Array, going: Array, decrement: float) -> floa
     """
     c, b, a = float(away @ away), float(away @ going), float(going @ going)
 
-    def bound(s: float) -> float:
-        return 2.0 * (b + a * s) / (1.0 - c - 2.0 * b * s - a * s**2)
-
-    def slope(s: float) -> float:
-        barrier = float(np.sum(changes * (1.0 - 1.0 / (1.0 + s * changes))))
-        return barrier + bound(s) - bound(0.0) - decrement**2
+    def slope(s: float) -> tuple[float, float]:
+        """Return the slope of f and that of the slope."""
+        left = 1.0 - c - 2.0 * b * s - a * s**2
+        bound, share = 2.0 * (b + a * s) / left, 1.0 / (1.0 + s * changes)
+        barrier = float(changes @ (1.0 - share))
+        return barrier + bound - 2.0 * b / (1.0 - c) - decrement**2, float(np.sum((changes * share) ** 2)) + (
+            2.0 * a / left + bound**2
+        )
 
     longest = min(_STEP / max(-float(changes.min()), np.finfo(float).tiny), _LONGEST)
     if a > 0.0:  # to where |N x| is 1
         longest = min(longest, _STEP * (np.sqrt(b**2 + a * (1.0 - c)) - b) / a)
-    if slope(longest) < 0.0:
+    if slope(longest)[0] < 0.0:
         return longest
-    # f is convex: halving finds its minimum, without the 0.1 s in which scipy.optimize loads.
-    low, high = 0.0, longest
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-    return 0.5 * (low + high)
+    # f is convex: Newton's method between two ends, and their middle where it leaves them.
+    low, high, s = 0.0, longest, min(1.0, 0.5 * longest)
+    for _ in range(_ROUNDS):
+        value, rise = slope(s)
+        low, high = (s, high) if value < 0.0 else (low, s)
+        before, s = s, s - value / rise
+        if not low < s < high:
+            s = 0.5 * (low + high)
+        if abs(s - before) <= _SAME * before:
+            break
+    return s
 
 
 def _matrices(
