@@ -18,7 +18,7 @@ from ident_service.errors import ModelError
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 
-_RANK_TOLERANCE = 1e-10
+RANK_TOLERANCE = 1e-10
 _LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
 _SETTLED = 1e-9
 _MOST_ROUNDS = 500
@@ -94,7 +94,7 @@ def ordinary_least_squares(information: Information, weights: Array | None = Non
     # Columns differ by orders of magnitude in SI units; rank is judged on unit columns.
     scale, seen = unit_columns(R1)
     U, s, Vt = scipy.linalg.svd(np.where(seen, R1, 0.0) / scale)
-    rank = int(np.sum(s > _RANK_TOLERANCE * s[0])) if s[0] > 0.0 else 0
+    rank = int(np.sum(s > RANK_TOLERANCE * s[0])) if s[0] > 0.0 else 0
     inverse = ((Vt[:rank].T / s[:rank]) @ U[:, :rank].T) / scale[:, None]
     singular = np.linalg.svd(R1, compute_uv=False)
     beta = inverse @ rho1
