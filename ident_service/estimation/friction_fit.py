@@ -47,6 +47,7 @@ FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
 _GAP = 1.5  # periods; a longer step is a gap
+_KEPT_DIRECTIONS = 12  # per drive: those of a search's values, of which the same are asked for again and again
 
 
 @dataclass
@@ -66,6 +67,7 @@ class _Travel:
     segments: list[NDArray[np.intp]] = field(default_factory=list)
     since: list[Array] = field(default_factory=list)
     fresh: set[int] = field(default_factory=set)
+    _found: dict[float, Array] = field(default_factory=dict)
 
     def follow(self, rate: Array, period: float, wanted: NDArray[np.intp], fresh: bool) -> None:
         """Add the velocities of consecutive samples; `wanted` are those that are kept."""
@@ -92,6 +94,13 @@ class _Travel:
 
     def direction(self, presliding: float) -> Array:
         """Return the direction of Coulomb friction at the kept samples, shape (samples,), as `direction.direction`."""
+        if presliding not in self._found:
+            if len(self._found) >= _KEPT_DIRECTIONS:
+                self._found.pop(next(iter(self._found)))
+            self._found[presliding] = self._direction(presliding)
+        return self._found[presliding]
+
+    def _direction(self, presliding: float) -> Array:
         segments, signs = np.concatenate(self.segments), np.array(self.signs)
         if presliding <= 0.0:
             return signs[segments]
@@ -511,11 +520,19 @@ def at_search_bounds(shape: FrictionShape, joints: Sequence[str], terms: Sequenc
 _Numbers = dict[str, Array]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Search:
     trials: FrictionTrials
     model: ArmModel
     base: BaseParameters
+    _last: tuple[_Numbers, Moments, Array] | None = None
+
+    def _weighed(self, values: _Numbers) -> tuple[Moments, Array]:
+        """Return the products of the equations with these numbers, and the joint weights that they ask for."""
+        if self._last is None or any(not np.array_equal(values[key], self._last[0][key]) for key in values):
+            (now,) = self._moments(values)
+            self._last = (values, now, now.weights(None if self._last is None else self._last[2]))
+        return self._last[1:]
 
     def coordinate_search(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
         """Search one number after the other over its whole grid."""
@@ -555,11 +572,12 @@ class _Search:
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Return, per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
         # All trials use the joint weights of the best values so far.
-        weights = self._moments(values)[0].weights()
+        now, weights = self._weighed(values)
         terms = _own_terms(self.model, self.base)
         left = []
         for trial in trials:
-            (total,) = self._moments(values | trial)
+            same = all(np.array_equal(trial[key], values[key]) for key in trial)
+            total = now if same else self._moments(values | trial)[0]
             beta = total.solved(weights)
             left.append(
                 _unpredicted(self._moments(values | trial, self.trials.thirds), beta, terms)
