@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import SolverError
-from ident_service.estimation.equations import Rows, equation_rows
+from ident_service.estimation.equations import motions_of, rows_of_motion
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import (
@@ -26,13 +26,13 @@ from ident_service.estimation.least_squares import (
     torque_error,
     unit_columns,
 )
+from ident_service.estimation.signal_processing import Motion
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, sparsity, triangle
 from ident_service.recordings.adapters import RangeRecording
-from ident_service.recordings.cached_recording import Memory, memory_of, payload_of
-from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Recording
+from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid
 
 SUSPECTED_FROM, CONCERNED_FROM = 10.0, 5.0  # percent of a joint's torque: to search at all, and to try a joint
@@ -153,7 +153,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     rms = estimate.candidates[estimate.chosen].moving.joint_rms
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     weights /= np.exp(np.mean(np.log(weights)))
-    parts = _parts(recordings, estimate.model.config)
+    parts = _samples(recordings, estimate.prepared.model)
     as_read = _equations(estimate, parts, None) if recordings else _equations_of_estimate(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
     at_positions: dict[tuple[int, ...], list[Reading]] = {}
@@ -270,18 +270,13 @@ def _equations_of_estimate(estimate: Estimate) -> _Equations:
     return _Equations(moving.supports, columns, tuple(torques), moving.rows, moving.base)
 
 
-def _equations(estimate: Estimate, recordings: Sequence[Recording], reading: Reading | None) -> _Equations:
-    """Return the equations of recordings with one reading of the positions."""
+def _equations(estimate: Estimate, parts: Sequence[tuple[Recording, Motion]], reading: Reading | None) -> _Equations:
+    """Return the equations of some samples of recordings with one reading of the positions."""
     model, base = estimate.prepared.model, estimate.base
     supports = sparsity(model.chain, model.layout, base.base)
-    stamps = [grid(one, model.config.recording) for one in recordings]
-    step = sum(one.last_ns - one.first_ns for one in stamps) * 1e-9 / _ROWS
     rows = [
-        _thinned(one, step)
-        for recording, at in zip(recordings, stamps, strict=True)
-        for one in equation_rows(
-            _Rearranged(recording, reading) if reading else recording, _decimated(model, int(step / at.period_s)), base
-        )
+        rows_of_motion(motion if reading is None else _rearranged(motion, reading, model), recording, model, base)
+        for recording, motion in parts
     ]
     torque, keep = (np.concatenate([getattr(one, name) for one in rows]) for name in ("torque", "keep"))
     keep = keep if keep.any() else np.ones_like(keep)
@@ -295,20 +290,34 @@ def _equations(estimate: Estimate, recordings: Sequence[Recording], reading: Rea
     return _Equations(supports, tuple(columns), tuple(torques), keep.sum(axis=0).astype(np.int64), base.size)
 
 
-def _decimated(model: ArmModel, step: int) -> ArmModel:
-    """Return the arm with its smoothed samples thinned out to every `step`-th, where that is fewer."""
+def _rearranged(motion: Motion, reading: Reading, model: ArmModel) -> Motion:
+    """Return smoothed samples as they are with another reading of the positions: each column is smoothed alone."""
+    names = ("position", "velocity", "acceleration")
+    moved = {name: reading.read(getattr(motion, name), "position") for name in names}
+    coupling, direction = model.chain.coupling, motion.direction
+    if direction is not None:
+        uncoupled = np.array_equal(coupling != 0.0, np.eye(len(coupling), dtype=bool))
+        # Where drives share joints, nothing is known of the pre-sliding of a motion that they did not make.
+        direction = reading.read(direction, "position") if uncoupled else np.sign(moved["velocity"] @ coupling.T)
+    keep = motion.keep
+    if not reading.negates:
+        keep = keep.copy()
+        keep[:, reading.joints] = motion.keep[:, reading.joints[::-1]]
+    return replace(motion, **moved, keep=keep, direction=direction)
+
+
+def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[tuple[Recording, Motion]]:
+    """Return about `_ROWS` smoothed samples of at most a minute of the recordings."""
     options = model.config.identification
-    smoothing = options.smoothing.model_copy(update={"decimate": max(int(options.smoothing.decimate), step)})
+    # What else filters the equations is left out: readings are compared among themselves.
+    smoothing = options.smoothing.model_copy(update={"regressor_cutoff": None})
+    if options.smoothing.regressor_cutoff is not None:
+        smoothing = smoothing.model_copy(update={"filter_torque": True})
     config = model.config.model_copy(update={"identification": options.model_copy(update={"smoothing": smoothing})})
-    return replace(model, config=config)
-
-
-def _thinned(rows: Rows, step: float) -> Rows:
-    """Return a copy of the first row in each step of time [s]."""
-    first = np.unique(np.floor(rows.time / step), return_index=True)[1]
-    H_b = rows.H_b[:, :, first]  # a copy: the next chunk is written into the same memory
-    of = {name: getattr(rows, name)[first] for name in Rows.__dataclass_fields__ if name != "H_b"}
-    return Rows(H_b=H_b, **of)
+    model = replace(model, config=config)
+    parts = [(one, list(motions_of(one, model))) for one in _parts(recordings, config)]
+    step = max(sum(len(motion.time) for _, motions in parts for motion in motions) // _ROWS, 1)
+    return [(one, motion[slice(None, None, step)]) for one, motions in parts for motion in motions]
 
 
 def _parts(recordings: Sequence[Recording], config: ArmConfig) -> list[Recording]:
@@ -328,44 +337,3 @@ def _parts(recordings: Sequence[Recording], config: ArmConfig) -> list[Recording
         if seconds >= _LONGEST:
             break
     return found
-
-
-class _Rearranged:
-    """Read another recording with the positions of other joints, or with other signs."""
-
-    def __init__(self, whole: Recording, reading: Reading) -> None:
-        self.path, self.sha256 = whole.path, whole.sha256
-        self.joint_names, self.joints = whole.joint_names, whole.joints
-        self.torque_held, self.torn = whole.torque_held, whole.torn
-        self.payload = payload_of(whole)
-        self.memory = _RearrangedMemory(memory, reading) if (memory := memory_of(whole)) else None
-        self._whole, self._reading = whole, reading
-
-    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order; see `Recording.blocks`."""
-        for block in self._whole.blocks(samples):
-            position = self._reading.read(block.position, "position")
-            velocity = None if block.velocity is None else self._reading.read(block.velocity, "position")
-            yield Block(block.stamp_ns, position, block.torque, velocity, block.repeats, block.skipped)
-
-
-class _RearrangedMemory(Memory):
-    """Recall what was smoothed of another recording, rearranged: each column is smoothed alone."""
-
-    def __init__(self, whole: Memory, reading: Reading) -> None:
-        super().__init__(max_bytes=0)
-        self._whole, self._reading = whole, reading
-
-    def recall(self, kind: str, key: object) -> Any:
-        """Return what was computed of the other recording with an equal key, rearranged; None where nothing was."""
-        found = self._whole.recall(kind, key)
-        if found is None or kind != "smoothed":
-            return found
-        names = ("position", "velocity", "acceleration")
-        return [
-            replace(one, **{name: self._reading.read(getattr(one, name), "position") for name in names})
-            for one in found
-        ]
-
-    def remember(self, kind: str, key: object, value: Any) -> None:
-        """Keep nothing: the other recording's memory has what is recalled."""

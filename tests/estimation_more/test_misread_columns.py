@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording, Waves, recorded, waves
+from estimation.synthetic import SampledRecording, Waves, recorded, waves, with_options
 
 from ident_service.config.load import load_arm
 from ident_service.errors import SolverError
@@ -63,6 +63,16 @@ def test_the_wrong_columns_are_named(which: str, joints: tuple[int, ...]) -> Non
     assert all(names[joint] in reason for joint in joints)
     assert ("exchanged" if len(joints) == 2 else "other direction" if which == "both" else "wrong sign") in reason
     assert "recording.columns" in reason
+
+
+def test_it_is_found_where_both_sides_of_the_equations_are_filtered() -> None:
+    model = elbowed()[0]
+    options = model.config.identification
+    filtered = options.model_copy(update={"smoothing": options.smoothing.model_copy(update={"regressor_cutoff": 3.0})})
+    recording = misread(Reading("position", (1,)))
+    found = misread_columns(identify(with_options(model, filtered), [recording], method="wls"), [recording])
+    assert found is not None
+    assert found.reading == Reading("position", (1,))
 
 
 def test_torques_that_are_all_negated_are_named_as_such() -> None:

@@ -38,7 +38,8 @@ _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the
 _QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
 _STEP = 0.99  # largest share of the distance to the boundary in one step
 _LONGEST = 10.0  # largest multiple of Newton's step
-_HALVINGS = 50  # bisections of the step length
+_ROUNDS = 50  # in which the step length is sought, a handful as a rule
+_SETTLED = 1e-12  # share of the longest step length
 _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data press against the set
 
 
@@ -151,24 +152,27 @@ def _length(changes: Array, away: Array, going: Array, decrement: float) -> floa
     """
     c, b, a = float(away @ away), float(away @ going), float(going @ going)
 
-    def bound(s: float) -> float:
-        return 2.0 * (b + a * s) / (1.0 - c - 2.0 * b * s - a * s**2)
-
-    def slope(s: float) -> float:
-        barrier = float(np.sum(changes * (1.0 - 1.0 / (1.0 + s * changes))))
-        return barrier + bound(s) - bound(0.0) - decrement**2
+    def slope_and_curvature(s: float) -> tuple[float, float]:
+        shares, left = changes / (1.0 + s * changes), 1.0 - c - 2.0 * b * s - a * s**2
+        bound, at_0 = 2.0 * (b + a * s) / left, 2.0 * b / (1.0 - c)
+        slope = s * float(changes @ shares) + bound - at_0 - decrement**2
+        return slope, float(shares @ shares) + 2.0 * a / left + bound**2
 
     longest = min(_STEP / max(-float(changes.min()), np.finfo(float).tiny), _LONGEST)
     if a > 0.0:  # to where |N x| is 1
         longest = min(longest, _STEP * (np.sqrt(b**2 + a * (1.0 - c)) - b) / a)
-    if slope(longest) < 0.0:
+    if slope_and_curvature(longest)[0] < 0.0:
         return longest
-    # f is convex: halving finds its minimum, without the 0.1 s in which scipy.optimize loads.
-    low, high = 0.0, longest
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-    return 0.5 * (low + high)
+    # f is convex: Newton's method, halved where it leaves the bracket, without the 0.1 s in which scipy.optimize loads.
+    low, high, s = 0.0, longest, min(1.0, longest)
+    for _ in range(_ROUNDS):
+        slope, curvature = slope_and_curvature(s)
+        low, high = (s, high) if slope < 0.0 else (low, s)
+        newton = s - slope / curvature if curvature > 0.0 else low
+        before, s = s, newton if low <= newton <= high else 0.5 * (low + high)
+        if abs(s - before) <= _SETTLED * longest:
+            break
+    return s
 
 
 def _matrices(
