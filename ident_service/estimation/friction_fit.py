@@ -14,8 +14,9 @@ Between their results decides what predicts better: the recordings are cut into 
 predicted by friction fitted to the other two, inertias being those of the whole. A shape that only explains what it has
 seen, such as a spike at a few reversals, loses there. Nothing but the recordings that are fitted to is looked at.
 
-An arm without pre-sliding, or without Stribeck friction, is the alternative: it is taken where it predicts held-out
-thirds clearly better (`choices.py`).
+An arm without pre-sliding, or without Stribeck friction, is the alternative (`choices.py`). No gear turns round at
+once, so that pre-sliding is left out only where held-out thirds are predicted clearly better without. Stribeck friction
+is a further term: without it, a model that predicts better by a hundredth is the simpler one, too, and is taken.
 """
 
 from __future__ import annotations
@@ -28,7 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import FrictionShape, JointTerm
-from ident_service.estimation.choices import Choice, held_out_thirds, significant_choice
+from ident_service.estimation.choices import (
+    Choice,
+    best_choice,
+    held_out_thirds,
+    of_thirds_together,
+    significant_choice,
+)
 from ident_service.estimation.equations import Equations, Rows, equation_rows, require_motion
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import Moments, ridge, weighted_least_squares
@@ -592,7 +599,7 @@ class _Search:
     def chosen(
         self, start: _Numbers, fitted: _Numbers, wanted: Sequence[str], conditions: FeasibleSet
     ) -> tuple[_Numbers, list[Choice]]:
-        """Leave out each kind, refit the others, and keep it out where held-out thirds are clearly better without."""
+        """Leave out each kind, refit the others, and keep it out where held-out thirds are better without."""
         values, choices = fitted, []
         gathered = self._equations(fitted)
         shares = standstill_weights(gathered)
@@ -607,7 +614,11 @@ class _Search:
                 name: held_out_thirds(self._equations(way).with_near(shares).blocks, weights, self.base, conditions)
                 for name, way in (("fit", values), ("none", without))
             }
-            choices.append(significant_choice(f"friction.{key}", errors))
+            option = f"friction.{key}"
+            simpler = key == "stribeck_velocity"
+            choices.append(
+                best_choice(option, of_thirds_together(errors)) if simpler else significant_choice(option, errors)
+            )
             values = values if choices[-1].value == "fit" else without
         return values, choices
 
