@@ -23,11 +23,12 @@
     │   └── StorageError (OSError)     storage of a fleet's recordings or factors is gone, or too slow
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
+        │   ├── ActionNeeded           a person has to act at the arm first, as the message says
         │   ├── AnotherDrive           a drive answers that the description does not name
-         │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
-         │   └── PositionUnknown        the encoders lost their zero: a person must set the home
-         ├── Stopped                    a motion did not come to its end, because a stop was requested
-         └── ArmFault                   the safety monitor or a drive stopped a motion; has code and last samples
+        │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
+        │   └── PositionUnknown        the encoders lost their zero: a person must set the home
+        ├── Stopped                    a motion did not come to its end, because a stop was requested
+        └── ArmFault                   the safety monitor or a drive stopped a motion; has code and last samples
 
 Each leaf also is the builtin it resembles, so that callers who do not know this package can catch it.
 """
@@ -222,6 +223,10 @@ class ArmError(IdentError, RuntimeError):
 
 class DriverError(ArmError, OSError):
     """The arm cannot be opened, enabled or reached."""
+
+
+class ActionNeeded(DriverError):
+    """A person has to act at the arm first; the message says how."""
 
 
 class AnotherDrive(DriverError):

@@ -34,7 +34,7 @@ from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, motor_coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.barrett import BarrettDriver
-from ident_service.errors import DriverError, NobodyEnabled, PositionUnknown
+from ident_service.errors import ActionNeeded, DriverError, NobodyEnabled, PositionUnknown
 
 LOOK_RATE = 20.0  # Hz
 _SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
@@ -277,7 +277,7 @@ class BarrettArm(Arm):
             bus.cycle(None)
         self._require_sound()
         if bus.codec.safety.pendant.faults:
-            raise DriverError(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
+            raise ActionNeeded(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
 
     def exchange(self, torque: Vector | None) -> Sample:
         """Exchange one cycle, as the contract says.
@@ -419,10 +419,10 @@ class BarrettArm(Arm):
                 f"{', '.join(bad)} has an error (STAT 1), which `ident recover ARM` clears once its cause has gone"
             )
         if codec.safety.mode == SafetyMode.ESTOP:
-            raise DriverError("the emergency stop is pressed, or has been: release it, then press Shift-Idle")
+            raise ActionNeeded("the emergency stop is pressed, or has been: release it, then press Shift-Idle")
         causes = [cause for cause in codec.safety.pendant.faults if cause not in ("heartbeat", "e-stop")]
         if causes:
-            raise DriverError(f"the pendant shows {' and '.join(causes)} fault; {_SHIFT_IDLE}")
+            raise ActionNeeded(f"the pendant shows {' and '.join(causes)} fault; {_SHIFT_IDLE}")
         if active and codec.safety.mode != SafetyMode.ACTIVE:
             raise DriverError(f"the arm left ACTIVE at once; the pendant: {codec.safety.pendant}")
 

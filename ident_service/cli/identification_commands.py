@@ -31,6 +31,7 @@ from ident_service.model.notation import NOTATIONS
 
 if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
+    from ident_service.estimation.plausibility import Objections
 
 
 _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
@@ -154,7 +155,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     scored, estimate = result.score, result.estimate
     lines = [
         "",
-        summary(estimate, result.unusable, warnings=result.warnings),
+        summary(estimate, result.objections.reasons, warnings=result.warnings),
         "comparison with the true parameters",
         f"  predicted torque against noise-free torque (validation): {scored.noise_free_percent:.3f} %",
         f"  validation residual over that of the true parameters: {scored.residual_ratio:.4f}",
@@ -165,7 +166,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
         "",
     ]
     document = {"folder": str(result.folder), "score": score_document(scored)}
-    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    document |= _estimate_document(estimate, result.objections, result.warnings)
     return _exit_code(document), "\n".join(lines), document
 
 
@@ -213,11 +214,11 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
     sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
-    text = summary(estimate, result.unusable, result.torque, result.warnings)
+    text = summary(estimate, result.objections.reasons, result.torque, result.warnings)
     text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
     document["torque"] = result.torque
-    document |= _estimate_document(estimate, result.unusable, result.warnings)
+    document |= _estimate_document(estimate, result.objections, result.warnings)
     return _exit_code(document), text, document
 
 
@@ -225,18 +226,19 @@ def _exit_code(document: dict[str, Any]) -> int:
     return DONE if document["usable"] else VERDICT_NO
 
 
-def _estimate_document(estimate: Estimate, unusable: Sequence[str], warnings: Sequence[str]) -> dict[str, Any]:
+def _estimate_document(estimate: Estimate, objections: Objections, warnings: Sequence[str]) -> dict[str, Any]:
     from ident_service.results.assessment import assess_estimate
     from ident_service.results.parameter_file import convex_document
     from ident_service.results.summary import how_fitted, implausible_links, torque_constants_document
 
     own = estimate.candidates[estimate.chosen]
-    found = assess_estimate(estimate, unusable, warnings)
+    found = assess_estimate(estimate, objections.reasons, warnings)
     return {
         "arm": estimate.model.config.name,
         "assessment": found.document(),
         "usable": found.word != "do not use",
-        "unusable": list(unusable),
+        "unusable": list(objections.reasons),
+        "another_motion_mends": objections.motion_mends,
         "feasible": estimate.feasible,
         "margin": estimate.margin,
         "relative_error_percent": own.identification.relative_percent,

@@ -214,8 +214,8 @@ def _stopped(ended: Ended) -> list[str] | None:
 def _identified(ended: Ended) -> list[str]:
     if not ended.good:
         # A longer or richer motion is no remedy for what is wrong with the recording or the description.
-        short = not ended.said.get("unusable") or all("s of motion" in one for one in ended.said["unusable"])
-        return ["design", ended.arm] if short else ["report", ended.run]
+        mends = not ended.said.get("unusable") or ended.said.get("another_motion_mends")
+        return ["design", ended.arm] if mends else ["report", ended.run]
     given = getattr(ended.given, "recordings", None)
     how = "commissioned in simulation" if given is None else f"identified from {', '.join(p.name for p in given)}"
     return ["accept", ended.run, "--note", how]

@@ -68,7 +68,7 @@ def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
     """
     usual, *others = held_out
     before = held_out[usual]
-    together = {name: float(np.sqrt(np.mean(np.square(errors)))) for name, errors in held_out.items()}
+    together = of_thirds_together(held_out)
 
     def clear(name: str) -> bool:
         if not np.all(np.isfinite(held_out[name])):
@@ -79,6 +79,11 @@ def significant_choice(option: str, held_out: Mapping[str, Array]) -> Choice:
 
     better = [name for name in others if np.all(np.isfinite(before)) and clear(name)]
     return Choice(option, min(better, key=lambda name: together[name], default=usual), together)
+
+
+def of_thirds_together(held_out: Mapping[str, Array]) -> dict[str, float]:
+    """Return the root mean square of the thirds' torque errors [percent], per alternative."""
+    return {name: float(np.sqrt(np.mean(np.square(errors)))) for name, errors in held_out.items()}
 
 
 def held_out_thirds(

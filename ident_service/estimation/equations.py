@@ -292,9 +292,20 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -
     """
     mixes = _torque_factors(model)
     for rows in _recorded_rows(recording, model, base):
-        torque = rows.torque if mixes is None else rows.torque @ mixes.T
-        carried = known_torque(recording, model, base, rows)
-        yield replace(rows, torque=torque if carried is None else torque - carried)
+        yield _of_links(rows, recording, model, base, mixes)
+
+
+def rows_of_motion(motion: Motion, recording: Recording, model: ArmModel, base: BaseParameters) -> Rows:
+    """Return the equations of smoothed samples of a recording, such as some of them with other positions."""
+    rows = _rows(motion, _regressor(motion, model, base), motion.torque, model)
+    return _of_links(rows, recording, model, base, _torque_factors(model))
+
+
+def _of_links(rows: Rows, recording: Recording, model: ArmModel, base: BaseParameters, mixes: Array | None) -> Rows:
+    """Return equations with recorded torques multiplied by the motors' factors, less what a known payload needs."""
+    torque = rows.torque if mixes is None else rows.torque @ mixes.T
+    carried = known_torque(recording, model, base, rows)
+    return replace(rows, torque=torque if carried is None else torque - carried)
 
 
 def motors_of_torques(model: ArmModel) -> Array:
@@ -354,17 +365,25 @@ def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters) 
         yield from _filtered_rows(recording, model, base, options.smoothing.regressor_cutoff)
         return
     H: Array | None = None
-    motions = smoothed(recording, options, model.chain.coupling, model.config.recording)
-    if options.period is not None:
-        mean = averaged(recording, options, options.period, model.chain.coupling, model.config.recording)
-        motions = iter([mean.motion])
-    for motion in motions:
+    for motion in motions_of(recording, model):
         for start in range(0, len(motion.time), _CHUNK):
             part = motion[slice(start, start + _CHUNK)]
             reuse = H if H is not None and H.shape[2] >= len(part.time) else None
             regressor = _regressor(part, model, base, reuse)
             H = regressor if reuse is None else H
             yield _rows(part, regressor, part.torque, model)
+
+
+def motions_of(recording: Recording, model: ArmModel) -> Iterator[Motion]:
+    """Yield the smoothed samples of a recording in parts, or one mean period where its periods are averaged.
+
+    Raises:
+        RecordingError: the recording cannot be smoothed.
+    """
+    options, coupling, fmt = model.config.identification, model.chain.coupling, model.config.recording
+    if options.period is not None:
+        return iter([averaged(recording, options, options.period, coupling, fmt).motion])
+    return smoothed(recording, options, coupling, fmt)
 
 
 def _regressor(motion: Motion, model: ArmModel, base: BaseParameters, out: Array | None = None) -> Array:

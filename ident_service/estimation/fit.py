@@ -143,6 +143,9 @@ def prepare(
     fitted = fitted_friction_parameters(model)
     model, shapes = fit_friction(trials, model, base, conditions)
     choices += shapes
+    # A number of friction that was left out moves nothing.
+    left_out = {choice.option for choice in shapes if choice.value == "none"}
+    fitted = tuple(key for key in fitted if f"friction.{key}" not in left_out)
     constants = None
     if torque_constants != "described":
         within = conditions if torque_constants == "feasible" else None

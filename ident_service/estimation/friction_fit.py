@@ -14,8 +14,9 @@ Between their results decides what predicts better: the recordings are cut into 
 predicted by friction fitted to the other two, inertias being those of the whole. A shape that only explains what it has
 seen, such as a spike at a few reversals, loses there. Nothing but the recordings that are fitted to is looked at.
 
-An arm without pre-sliding, or without Stribeck friction, is the alternative: it is taken where it predicts held-out
-thirds clearly better (`choices.py`).
+An arm without pre-sliding, or without Stribeck friction, is the alternative (`choices.py`). No gear turns round at
+once, so that pre-sliding is left out only where held-out thirds are predicted clearly better without. Stribeck friction
+is a further term: without it, a model that predicts better by a hundredth is the simpler one, too, and is taken.
 """
 
 from __future__ import annotations
@@ -28,7 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.config.arm import FrictionShape, JointTerm
-from ident_service.estimation.choices import Choice, held_out_thirds, significant_choice
+from ident_service.estimation.choices import (
+    Choice,
+    best_choice,
+    held_out_thirds,
+    of_thirds_together,
+    significant_choice,
+)
 from ident_service.estimation.equations import Equations, Rows, equation_rows, require_motion
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.least_squares import Moments, ridge, weighted_least_squares
@@ -47,6 +54,7 @@ FOLDS = 3
 _MOST_ROWS = 30_000  # samples that are kept; of longer recordings every second, every fourth ...
 _CHANGING: tuple[JointTerm, ...] = ("coulomb", "stribeck")
 _GAP = 1.5  # periods; a longer step is a gap
+_KEPT_DIRECTIONS = 12  # per drive: those of a search's values, of which the same are asked for again and again
 
 
 @dataclass
@@ -66,6 +74,7 @@ class _Travel:
     segments: list[NDArray[np.intp]] = field(default_factory=list)
     since: list[Array] = field(default_factory=list)
     fresh: set[int] = field(default_factory=set)
+    _found: dict[float, Array] = field(default_factory=dict)
 
     def follow(self, rate: Array, period: float, wanted: NDArray[np.intp], fresh: bool) -> None:
         """Add the velocities of consecutive samples; `wanted` are those that are kept."""
@@ -92,6 +101,13 @@ class _Travel:
 
     def direction(self, presliding: float) -> Array:
         """Return the direction of Coulomb friction at the kept samples, shape (samples,), as `direction.direction`."""
+        if presliding not in self._found:
+            if len(self._found) >= _KEPT_DIRECTIONS:
+                self._found.pop(next(iter(self._found)))
+            self._found[presliding] = self._direction(presliding)
+        return self._found[presliding]
+
+    def _direction(self, presliding: float) -> Array:
         segments, signs = np.concatenate(self.segments), np.array(self.signs)
         if presliding <= 0.0:
             return signs[segments]
@@ -511,11 +527,19 @@ def at_search_bounds(shape: FrictionShape, joints: Sequence[str], terms: Sequenc
 _Numbers = dict[str, Array]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Search:
     trials: FrictionTrials
     model: ArmModel
     base: BaseParameters
+    _last: tuple[_Numbers, Moments, Array] | None = None
+
+    def _weighed(self, values: _Numbers) -> tuple[Moments, Array]:
+        """Return the products of the equations with these numbers, and the joint weights that they ask for."""
+        if self._last is None or any(not np.array_equal(values[key], self._last[0][key]) for key in values):
+            (now,) = self._moments(values)
+            self._last = (values, now, now.weights(None if self._last is None else self._last[2]))
+        return self._last[1:]
 
     def coordinate_search(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
         """Search one number after the other over its whole grid."""
@@ -555,11 +579,12 @@ class _Search:
     def best(self, values: _Numbers, trials: Sequence[_Numbers], *, predicting: bool = False) -> _Numbers:
         """Return, per drive, the trial that leaves its joint the smallest residual, or predicts its torque best."""
         # All trials use the joint weights of the best values so far.
-        weights = self._moments(values)[0].weights()
+        now, weights = self._weighed(values)
         terms = _own_terms(self.model, self.base)
         left = []
         for trial in trials:
-            (total,) = self._moments(values | trial)
+            same = all(np.array_equal(trial[key], values[key]) for key in trial)
+            total = now if same else self._moments(values | trial)[0]
             beta = total.solved(weights)
             left.append(
                 _unpredicted(self._moments(values | trial, self.trials.thirds), beta, terms)
@@ -574,7 +599,7 @@ class _Search:
     def chosen(
         self, start: _Numbers, fitted: _Numbers, wanted: Sequence[str], conditions: FeasibleSet
     ) -> tuple[_Numbers, list[Choice]]:
-        """Leave out each kind, refit the others, and keep it out where held-out thirds are clearly better without."""
+        """Leave out each kind, refit the others, and keep it out where held-out thirds are better without."""
         values, choices = fitted, []
         gathered = self._equations(fitted)
         shares = standstill_weights(gathered)
@@ -589,7 +614,11 @@ class _Search:
                 name: held_out_thirds(self._equations(way).with_near(shares).blocks, weights, self.base, conditions)
                 for name, way in (("fit", values), ("none", without))
             }
-            choices.append(significant_choice(f"friction.{key}", errors))
+            option = f"friction.{key}"
+            simpler = key == "stribeck_velocity"
+            choices.append(
+                best_choice(option, of_thirds_together(errors)) if simpler else significant_choice(option, errors)
+            )
             values = values if choices[-1].value == "fit" else without
         return values, choices
 

@@ -7,7 +7,7 @@ columns from a poor model. The reading that is right leaves an error smaller by 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -16,26 +16,34 @@ from numpy.typing import NDArray
 
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import SolverError
-from ident_service.estimation.equations import Rows, equation_rows
+from ident_service.estimation.equations import motions_of, rows_of_motion
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate
-from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
+from ident_service.estimation.least_squares import (
+    RANK_TOLERANCE,
+    TorqueError,
+    ordinary_least_squares,
+    torque_error,
+    unit_columns,
+)
+from ident_service.estimation.signal_processing import Motion
+from ident_service.model.arm_model import ArmModel
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, sparsity, triangle
 from ident_service.recordings.adapters import RangeRecording
-from ident_service.recordings.cached_recording import payload_of
-from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Recording
+from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid
 
 SUSPECTED_FROM, CONCERNED_FROM = 10.0, 5.0  # percent of a joint's torque: to search at all, and to try a joint
 NO_ERROR = 1.0  # percent of a joint's torque; smaller errors count as this one
 BETTER = 3.0  # by which the product of the joints' errors must shrink; real arms with right columns reach 1.7
 NONE_WORSE = 2.0  # by which the error of no joint may grow; that of one whose torque is noise may
+LIKELIER = 2.0  # by which an exchange must explain more than a sign: poor joints gain a little by many exchanges
 EXPLAINED = 10.0  # percent of all torques in motion that the right reading leaves at most; wrong geometry leaves more
 _LONGEST = 60.0  # s of recordings that are fitted, and of one of them at most
 _ROWS = 1000  # that are fitted, about
-_TRIED = 6  # readings besides signs of torques that are fitted under the conditions, the best without them
+_TRIED = 6  # readings besides signs of torques that are fitted under the conditions, while none explains: the best
 
 _Which = Literal["torque", "position", "both"]
 
@@ -145,34 +153,37 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     rms = estimate.candidates[estimate.chosen].moving.joint_rms
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     weights /= np.exp(np.mean(np.log(weights)))
-    parts = _parts(recordings, estimate.model.config)
-    as_read = _Equations(estimate, parts, None) if recordings else _EstimatesEquations(estimate)
+    parts = _samples(recordings, estimate.prepared.model)
+    as_read = _equations(estimate, parts, None) if recordings else _equations_of_estimate(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
-    found: list[tuple[float, Reading, Information]] = []
-    at_positions: dict[tuple[int, ...], _Equations | _EstimatesEquations] = {(): as_read}
+    at_positions: dict[tuple[int, ...], list[Reading]] = {}
     for reading in _readings(estimate, np.flatnonzero(own > CONCERNED_FROM)):
-        if not recordings and not reading.of_torque_signs:
-            continue
-        moved = () if reading.which == "torque" else reading.joints
-        if moved not in at_positions:
-            at_positions[moved] = _Equations(estimate, parts, reading)
-        information = at_positions[moved].information(reading)
-        free = torque_error(information, ordinary_least_squares(information, weights).beta)
-        found.append((float(_gains(before, free).sum()), reading, information))
-    best, most = None, float(np.log(BETTER))
-    # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and of others the best.
+        if recordings or reading.of_torque_signs:
+            at_positions.setdefault(() if reading.which == "torque" else reading.joints, []).append(reading)
+    found: list[tuple[float, Reading, _Equations]] = []
+    for moved, readings in at_positions.items():
+        equations = _equations(estimate, parts, readings[0]) if moved else as_read
+        for reading, errors in zip(readings, equations.free_errors(readings, weights), strict=True):
+            found.append((float(_gains(before.joint_relative_percent, errors).sum()), reading, equations))
+    best, most = None, -np.inf
+    # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and of others the best;
+    # once one explains the recordings, every other is compared with it.
     signs = [one for one in found if one[1].of_torque_signs]
-    others = sorted((one for one in found if not one[1].of_torque_signs), key=lambda one: -one[0])[:_TRIED]
-    for without_conditions, reading, information in (*signs, *others):
-        if without_conditions < most:  # conditions only add to the error
+    others = sorted((one for one in found if not one[1].of_torque_signs), key=lambda one: -one[0])
+    for number, (without_conditions, reading, equations) in enumerate((*signs, *others)):
+        if without_conditions < max(most, np.log(BETTER)):  # conditions only add to the error
             continue
+        if best is None and number >= len(signs) + _TRIED:
+            break
         try:
-            after = _constrained_error(estimate, information, weights)
+            after = _constrained_error(estimate, equations.information(reading), weights)
         except SolverError:  # it explains nothing, and must not end what has been identified
             continue
-        gains = _gains(before, after)
-        if gains.sum() >= most and gains.min() >= -np.log(NONE_WORSE) and after.relative_percent < EXPLAINED:
-            best, most = MisreadColumns(reading, before, after), float(gains.sum())
+        gains = _gains(before.joint_relative_percent, after.joint_relative_percent)
+        gained = float(gains.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
+        enough = gains.sum() >= np.log(BETTER) and gains.min() >= -np.log(NONE_WORSE)
+        if enough and after.relative_percent < EXPLAINED and (best is None or gained > most):
+            best, most = MisreadColumns(reading, before, after), gained
     return best
 
 
@@ -193,64 +204,120 @@ def _constrained_error(estimate: Estimate, information: Information, weights: Ar
     return torque_error(information, constrained_least_squares(fit, estimate.base, estimate.conditions).beta)
 
 
-def _gains(before: TorqueError, after: TorqueError) -> Array:
-    """Return per joint the logarithm of the factor by which its error shrinks, shape (joints,)."""
-    was, will = (np.maximum(one.joint_relative_percent, NO_ERROR) for one in (before, after))
-    return np.asarray(np.log(was / will))
+def _gains(before: Array, after: Array) -> Array:
+    """Return per joint the logarithm of the factor by which its error [percent] shrinks, shape (joints,)."""
+    return np.asarray(np.log(np.maximum(before, NO_ERROR) / np.maximum(after, NO_ERROR)))
 
 
-class _EstimatesEquations:
-    """Equations that an estimate keeps, for other signs of torques."""
-
-    def __init__(self, estimate: Estimate) -> None:
-        self._moving = estimate.prepared.equations.moving
-
-    def information(self, reading: Reading | None) -> Information:
-        """Return their information with a reading of the torques."""
-        signs = np.ones((1, self._moving.joints))
-        return self._moving.with_torques_times((signs if reading is None else reading.read(signs, "torque"))[0])
-
-
+@dataclass(frozen=True)
 class _Equations:
-    """Equations of recordings with one reading of the positions, for every reading of the torques."""
+    """Equations with one reading of the positions, for every reading of the torques.
 
-    def __init__(self, estimate: Estimate, recordings: Sequence[Recording], reading: Reading | None) -> None:
-        model, base = estimate.prepared.model, estimate.base
-        self._supports = sparsity(model.chain, model.layout, base.base)
-        self._scales, self._base = estimate.prepared.torque_scales, base.size
-        stamps = [grid(one, model.config.recording) for one in recordings]
-        step = sum(one.last_ns - one.first_ns for one in stamps) * 1e-9 / _ROWS
-        rows = [
-            thin
-            for recording in recordings
-            for one in equation_rows(_Rearranged(recording, reading) if reading else recording, model, base)
-            for thin in [_thinned(one, step)]
-        ]
-        torques, keep = (np.concatenate([getattr(one, name) for one in rows]) for name in ("torque", "keep"))
-        keep = keep if keep.any() else np.ones_like(keep)
-        self._factors: list[Array] = []
-        self._rows = keep.sum(axis=0)
-        for joint, support in enumerate(self._supports):
-            H = np.concatenate([one.H_b[joint, support].T for one in rows])
-            # With all torques beside the columns, every reading of them needs no other decomposition.
-            self._factors.append(triangle(np.column_stack([H, torques])[keep[:, joint]]))
+    Attributes:
+        supports: per joint, which base parameters it feels, increasing.
+        columns: per joint, orthogonal combinations of its rows, shape (rows, k).
+        torques: the same combinations of all joints' torques, shape (rows, joints).
+        rows: equations that went into each joint's, shape (joints,).
+        base: number of base parameters.
+    """
+
+    supports: tuple[NDArray[np.intp], ...]
+    columns: tuple[Array, ...]
+    torques: tuple[Array, ...]
+    rows: NDArray[np.int64]
+    base: int
+
+    def _torques(self, joint: int, reading: Reading | None) -> Array:
+        torques = self.torques[joint]
+        return (torques if reading is None else reading.read(torques, "torque"))[:, joint]
 
     def information(self, reading: Reading | None) -> Information:
         """Return their information with a reading of the torques, which is about the same positions or none."""
-        factors = []
-        for joint, (support, factor) in enumerate(zip(self._supports, self._factors, strict=True)):
-            torques = factor[:, len(support) :]
-            torques = torques if reading is None else reading.read(torques, "torque")
-            factors.append(np.column_stack([factor[:, : len(support)], self._scales[joint] * torques[:, joint]]))
-        return Information(self._supports, tuple(factors), self._rows.astype(np.int64), self._base)
+        factors = (np.column_stack([one, self._torques(joint, reading)]) for joint, one in enumerate(self.columns))
+        return Information(self.supports, tuple(factors), self.rows.copy(), self.base)
+
+    def free_errors(self, readings: Sequence[Reading], weights: Array) -> Array:
+        """Return the torque errors that least squares without conditions leaves [percent], shape (readings, joints).
+
+        Args:
+            readings: of the torques.
+            weights: per joint, what its equations are multiplied by, shape (joints,).
+        """
+        H, torques = [], []
+        for joint, (support, columns) in enumerate(zip(self.supports, self.columns, strict=True)):
+            H.append(np.zeros((len(columns), self.base)))
+            H[-1][:, support] = weights[joint] * columns
+            torques.append(weights[joint] * np.column_stack([self._torques(joint, one) for one in readings]))
+        stacked, wanted = np.vstack(H), np.vstack(torques)
+        unit, seen = unit_columns(stacked)
+        scaled = np.where(seen, stacked, 0.0) / unit
+        left = wanted - scaled @ np.linalg.lstsq(scaled, wanted, rcond=RANK_TOLERANCE)[0]
+        ends = np.cumsum([len(one) for one in H])[:-1]
+        squares, of = (
+            np.array([np.sum(np.square(part), axis=0) for part in np.split(one, ends)]) for one in (left, wanted)
+        )
+        return 100.0 * np.sqrt(squares / np.where(of > 0.0, of, np.inf)).T
 
 
-def _thinned(rows: Rows, step: float) -> Rows:
-    """Return a copy of the first row in each step of time [s]."""
-    first = np.unique(np.floor(rows.time / step), return_index=True)[1]
-    H_b = rows.H_b[:, :, first]  # a copy: the next chunk is written into the same memory
-    of = {name: getattr(rows, name)[first] for name in Rows.__dataclass_fields__ if name != "H_b"}
-    return Rows(H_b=H_b, **of)
+def _equations_of_estimate(estimate: Estimate) -> _Equations:
+    """Return the equations that an estimate keeps, for other signs of torques."""
+    moving = estimate.prepared.equations.moving
+    torques = []
+    for joint, factor in enumerate(moving.factors):
+        torques.append(np.zeros((len(factor), moving.joints)))
+        torques[-1][:, joint] = factor[:, -1]
+    columns = tuple(factor[:, :-1] for factor in moving.factors)
+    return _Equations(moving.supports, columns, tuple(torques), moving.rows, moving.base)
+
+
+def _equations(estimate: Estimate, parts: Sequence[tuple[Recording, Motion]], reading: Reading | None) -> _Equations:
+    """Return the equations of some samples of recordings with one reading of the positions."""
+    model, base = estimate.prepared.model, estimate.base
+    supports = sparsity(model.chain, model.layout, base.base)
+    rows = [
+        rows_of_motion(motion if reading is None else _rearranged(motion, reading, model), recording, model, base)
+        for recording, motion in parts
+    ]
+    torque, keep = (np.concatenate([getattr(one, name) for one in rows]) for name in ("torque", "keep"))
+    keep = keep if keep.any() else np.ones_like(keep)
+    columns, torques = [], []
+    for joint, support in enumerate(supports):
+        H = np.concatenate([one.H_b[joint, support].T for one in rows])
+        # With all torques beside the columns, every reading of them needs no other decomposition.
+        factor = triangle(np.column_stack([H, torque])[keep[:, joint]])
+        columns.append(factor[:, : len(support)])
+        torques.append(estimate.prepared.torque_scales[joint] * factor[:, len(support) :])
+    return _Equations(supports, tuple(columns), tuple(torques), keep.sum(axis=0).astype(np.int64), base.size)
+
+
+def _rearranged(motion: Motion, reading: Reading, model: ArmModel) -> Motion:
+    """Return smoothed samples as they are with another reading of the positions: each column is smoothed alone."""
+    names = ("position", "velocity", "acceleration")
+    moved = {name: reading.read(getattr(motion, name), "position") for name in names}
+    coupling, direction = model.chain.coupling, motion.direction
+    if direction is not None:
+        uncoupled = np.array_equal(coupling != 0.0, np.eye(len(coupling), dtype=bool))
+        # Where drives share joints, nothing is known of the pre-sliding of a motion that they did not make.
+        direction = reading.read(direction, "position") if uncoupled else np.sign(moved["velocity"] @ coupling.T)
+    keep = motion.keep
+    if not reading.negates:
+        keep = keep.copy()
+        keep[:, reading.joints] = motion.keep[:, reading.joints[::-1]]
+    return replace(motion, **moved, keep=keep, direction=direction)
+
+
+def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[tuple[Recording, Motion]]:
+    """Return about `_ROWS` smoothed samples of at most a minute of the recordings."""
+    options = model.config.identification
+    # What else filters the equations is left out: readings are compared among themselves.
+    smoothing = options.smoothing.model_copy(update={"regressor_cutoff": None})
+    if options.smoothing.regressor_cutoff is not None:
+        smoothing = smoothing.model_copy(update={"filter_torque": True})
+    config = model.config.model_copy(update={"identification": options.model_copy(update={"smoothing": smoothing})})
+    model = replace(model, config=config)
+    parts = [(one, list(motions_of(one, model))) for one in _parts(recordings, config)]
+    step = max(sum(len(motion.time) for _, motions in parts for motion in motions) // _ROWS, 1)
+    return [(one, motion[slice(None, None, step)]) for one, motions in parts for motion in motions]
 
 
 def _parts(recordings: Sequence[Recording], config: ArmConfig) -> list[Recording]:
@@ -270,21 +337,3 @@ def _parts(recordings: Sequence[Recording], config: ArmConfig) -> list[Recording
         if seconds >= _LONGEST:
             break
     return found
-
-
-class _Rearranged:
-    """Read another recording with the positions of other joints, or with other signs."""
-
-    def __init__(self, whole: Recording, reading: Reading) -> None:
-        self.path, self.sha256 = whole.path, whole.sha256
-        self.joint_names, self.joints = whole.joint_names, whole.joints
-        self.torque_held, self.torn = whole.torque_held, whole.torn
-        self.payload = payload_of(whole)
-        self._whole, self._reading = whole, reading
-
-    def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:
-        """Read the samples in order; see `Recording.blocks`."""
-        for block in self._whole.blocks(samples):
-            position = self._reading.read(block.position, "position")
-            velocity = None if block.velocity is None else self._reading.read(block.velocity, "position")
-            yield Block(block.stamp_ns, position, block.torque, velocity, block.repeats, block.skipped)

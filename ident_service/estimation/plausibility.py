@@ -8,6 +8,7 @@ description, can do. Its limits are far from what sound recordings show, so that
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,29 @@ _JUMP = 20.0  # times the usual step between samples
 _LEAST_JUMP = 0.02  # rad or m
 _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
+
+
+@dataclass(frozen=True)
+class Objections:
+    """Reasons why an estimate must not be used.
+
+    Attributes:
+        wrong: what is wrong with recordings or description.
+        little_motion: that the motion tells too little, which a longer or richer one mends.
+    """
+
+    wrong: tuple[str, ...]
+    little_motion: tuple[str, ...] = ()
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Return all of them."""
+        return (*self.wrong, *self.little_motion)
+
+    @property
+    def motion_mends(self) -> bool:
+        """Return whether another motion mends all that is objected to."""
+        return bool(self.little_motion) and not self.wrong
 
 
 def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) -> tuple[str, ...]:

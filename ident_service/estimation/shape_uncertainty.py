@@ -65,6 +65,8 @@ class ShapeUncertainty:
         both = variances[0] + variances[1]
         share = np.divide(variances[1], both, out=np.zeros_like(both), where=np.isfinite(both) & (both > 0.0))
         wider = np.sqrt(variances[0] * widening(own) ** 2 + variances[1] * widening(added) ** 2)
+        # What no equation sees has no degrees of freedom at all.
+        own, added = (np.maximum(one, np.finfo(float).tiny) for one in (own, added))
         return wider, np.minimum(degrees, 1.0 / ((1.0 - share) ** 2 / own + share**2 / added))
 
 

@@ -20,7 +20,7 @@ from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.feasible_set import SetName
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import torque_error
-from ident_service.estimation.plausibility import remarks_on_limits
+from ident_service.estimation.plausibility import Objections, remarks_on_limits
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.appearance import visible_bodies
@@ -135,7 +135,7 @@ class Commissioning:
         estimate: what was identified.
         runs: how the two motions went.
         score: against the truth.
-        unusable: why the estimate must not be used; empty where nothing says so.
+        objections: why the estimate must not be used; empty where nothing says so.
         warnings: what is wrong with the recordings, in words.
     """
 
@@ -143,7 +143,7 @@ class Commissioning:
     estimate: Estimate
     runs: tuple[RunReport, RunReport]
     score: Score
-    unusable: tuple[str, ...]
+    objections: Objections
     warnings: tuple[str, ...]
 
 
@@ -296,7 +296,7 @@ def simulate(
         step("scoring, and writing the report", _MOTIONS + 0.6 * (1.0 - _MOTIONS))
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
-        unusable = unusable_because(estimate, found)
+        objections = unusable_because(estimate, found)
         warnings = [f"{one.path.name}: {line}" for one, seen in found for line in seen.warnings()]
         warnings += [line for one, seen in found for line in remarks_on_limits(one.path.name, seen.joints, model)]
         warnings += estimate.remarks
@@ -304,13 +304,13 @@ def simulate(
             staging,
             estimate,
             {"warnings": warnings},
-            unusable,
+            objections.reasons,
             described=config if described is None else described,
         )
         write_atomically(staging / "score.json", json.dumps(score_document(scored), indent=1) + "\n")
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
-    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, unusable, tuple(warnings))
+    return Commissioning(folder, estimate, (reports[0], reports[1]), scored, objections, tuple(warnings))
 
 
 def score_document(scored: Score) -> dict[str, object]:

@@ -22,6 +22,7 @@ from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.estimation.model_reduction import essential_parameters
 from ident_service.estimation.plausibility import (
+    Objections,
     reasons_against,
     reasons_in_length,
     reasons_in_recording,
@@ -100,14 +101,14 @@ class IdentificationResult:
         estimate: with everything known of it.
         files: names of the files in the folder.
         warnings: what is wrong with the recordings, in words.
-        unusable: why the estimate must not be used; empty where nothing says so.
+        objections: why the estimate must not be used; empty where nothing says so.
         torque: it was identified from (`Opened.torque`).
     """
 
     estimate: Estimate
     files: tuple[str, ...]
     warnings: tuple[str, ...]
-    unusable: tuple[str, ...]
+    objections: Objections
     torque: str
 
 
@@ -187,7 +188,7 @@ def identify_files(
     for recording, seen in found:
         warnings += remarks_on_limits(recording.path.name, seen.joints, model)
     warnings += estimate.remarks
-    unusable = unusable_because(estimate, found)
+    objections = unusable_because(estimate, found)
     more: dict[str, Any] = {
         "recording_quality": [_quality_document(recording, seen) for recording, seen in found],
         "warnings": list(warnings),
@@ -203,12 +204,12 @@ def identify_files(
         more["essential"] = _essential(estimate)
     step("writing results and report", 0.8)
     with replacing_folder(folder) as staging:
-        files = write_results(staging, estimate, more, unusable, described, opened.torque)
+        files = write_results(staging, estimate, more, objections.reasons, described, opened.torque)
         if request.sdpa:
             files += _write_sdpa(staging, estimate)
         files += write_report(staging, estimate, recordings, validation, warnings)
         write_manifest(staging)
-    return IdentificationResult(estimate, (*files, MANIFEST), warnings, unusable, opened.torque)
+    return IdentificationResult(estimate, (*files, MANIFEST), warnings, objections, opened.torque)
 
 
 CUSTOM = ("constraints", "custom")
@@ -233,18 +234,16 @@ def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
         raise config_error(arm, CUSTOM, str(error)) from error
 
 
-def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> tuple[str, ...]:
+def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Quality]]) -> Objections:
     """Return the reasons, from its recordings and its errors, why an estimate must not be used."""
     model = estimate.model
     seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
     known = set(estimate.recordings)
     fitted = [(recording, one) for recording, one in found if (recording.path.name, recording.sha256) in known]
     seconds = sum(one.duration_s for _, one in fitted)
-    return (
-        *(reason for reasons in seen for reason in reasons),
-        *reasons_against(estimate, [recording for recording, _ in fitted]),
-        *reasons_in_length(estimate, seconds),
-    )
+    wrong = (reason for reasons in seen for reason in reasons)
+    against = reasons_against(estimate, [recording for recording, _ in fitted])
+    return Objections((*wrong, *against), reasons_in_length(estimate, seconds))
 
 
 def _config(config: ArmConfig, request: Request) -> ArmConfig:

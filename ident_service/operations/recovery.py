@@ -20,7 +20,7 @@ from drivers.arm import Arm, StopKind
 from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.errors import DriverError, MotionRefused, PositionUnknown, UsageError
+from ident_service.errors import ActionNeeded, DriverError, MotionRefused, PositionUnknown, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.clearance import position_limit_violations, require_near
@@ -98,7 +98,8 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
         steps = (*first, f"`ident recover {called}` again, when it is at rest.")
         return Recovery(config.name, faults, pid, None, "", "", (), {}, (), steps, False)
     arm = make_arm(config) if arm is None else arm
-    seen, unreachable, zero_lost, refusal = None, "", "", ""
+    seen, unreachable, zero_lost = None, "", ""
+    refusal: DriverError | None = None
     reset: tuple[str, ...] = ()
     try:
         seen = watch(arm, LOOK)
@@ -158,16 +159,16 @@ def _tripped(seen: Watched) -> dict[str, str]:
     }
 
 
-def _reset(arm: Arm) -> str:
-    """Reset the drives; return why they refuse, or an empty text."""
+def _reset(arm: Arm) -> DriverError | None:
+    """Reset the drives; return why they refuse, or None."""
     with arm:
         arm.exchange(None)
         try:
             arm.reset()
             arm.exchange(None)
         except DriverError as error:
-            return str(error)
-    return ""
+            return error
+    return None
 
 
 def _before(
@@ -177,13 +178,13 @@ def _before(
     unreachable: str,
     zero_lost: str,
     tripped: dict[str, str],
-    refusal: str,
+    refusal: DriverError | None,
     limits: MotionLimits,
     support: str,
 ) -> list[str]:
     """Return what must be done before the arm is usable, in order."""
     steps = [f"`ident acknowledge {name} {one.code}`, when you know the cause: {one.cause}." for one in faults]
-    zero_lost, refusal = (words.replace(" ARM`", f" {name}`") for words in (zero_lost, refusal))
+    zero_lost = zero_lost.replace(" ARM`", f" {name}`")
     if unreachable:
         steps.append(f"Check power, cables, emergency stop, and that no other program uses the arm: {unreachable}.")
     if zero_lost:
@@ -196,7 +197,7 @@ def _before(
     if bool((np.abs(seen.velocity) > REST_SPEED * limits.velocity).any()):
         steps.append("Keep out of its reach until it rests: the arm moves without a command.")
     if tripped and refusal:
-        steps.append(_to_mend(tripped, refusal))
+        steps.append(_to_mend(tripped, refusal).replace(" ARM`", f" {name}`"))
     if tripped or (faults and steps):
         steps.append(f"`ident recover {name}` again: it resets the drives when every fault is acknowledged.")
     if not silent and (out := position_limit_violations(seen.position, limits, seen.joint_names)):
@@ -211,13 +212,14 @@ def _before(
     return [support, *steps] if steps or support is not _SUPPORT else steps
 
 
-def _to_mend(tripped: dict[str, str], refusal: str) -> str:
+def _to_mend(tripped: dict[str, str], refusal: DriverError) -> str:
     """Return what must be done before drives that refuse to be reset can be."""
-    if "press " in refusal:  # it says so itself
-        return f"{refusal[0].upper()}{refusal[1:]}."
+    words = str(refusal)
+    if isinstance(refusal, ActionNeeded):
+        return f"{words[0].upper()}{words[1:]}."
     stopped = any("emergency stop" in words for words in tripped.values())
     what = "Release the emergency stop" if stopped else "Read the drive's own fault code and mend its cause"
-    return f"{what}: {refusal}."
+    return f"{what}: {words}."
 
 
 def _last_step(name: str, seen: Watched | None, limits: MotionLimits, out: bool) -> str:

@@ -13,7 +13,7 @@ from helpers.random_arms import model_around, random_delta
 
 from ident_service.cli import main
 from ident_service.estimation.identify import Estimate, identify
-from ident_service.estimation.plausibility import ENOUGH_MOTION, reasons_in_length
+from ident_service.estimation.plausibility import ENOUGH_MOTION, Objections, reasons_in_length
 from ident_service.model.regressor import joint_regressor
 
 RATE = 250.0
@@ -45,6 +45,13 @@ def test_little_motion_that_leaves_much_unknown_is_no_yes(cut_short: Estimate) -
     assert f"record at least {ENOUGH_MOTION:g} s" in reason
 
 
+def test_another_motion_mends_what_little_motion_alone_is_the_reason_of(cut_short: Estimate) -> None:
+    reasons = reasons_in_length(cut_short, 2.5)
+    assert Objections((), reasons).motion_mends
+    assert not Objections(("a wrong sign",), reasons).motion_mends
+    assert not Objections(()).motion_mends
+
+
 def test_standstill_is_no_motion(cut_short: Estimate) -> None:
     """Of a long recording that hardly moves only the motion counts."""
     standing = moved(30.0)
@@ -74,3 +81,5 @@ def test_the_command_says_no(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert code == 3, document
     assert document["usable"] is False
     assert any("s of motion, and " in reason for reason in document["unusable"])
+    # These are no body's parameters, which another motion does not mend.
+    assert document["another_motion_mends"] is False

@@ -78,7 +78,7 @@ def changed(change: Change, model: ArmModel) -> list[Changed]:
 
 
 def objections(estimate: Estimate, recordings: list[Changed]) -> tuple[str, ...]:
-    return unusable_because(estimate, [(one, recording_quality(one, estimate.model)) for one in recordings])
+    return unusable_because(estimate, [(one, recording_quality(one, estimate.model)) for one in recordings]).reasons
 
 
 def nothing(position: np.ndarray, torque: np.ndarray) -> None:
@@ -148,7 +148,7 @@ def test_sound_recordings_are_not_objected_to(identified: Identified) -> None:
             for path in paths
         ]
         estimate = identified(case.arm)
-        assert unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings]) == ()
+        assert unusable_because(estimate, [(one, recording_quality(one, model)) for one in recordings]).reasons == ()
 
 
 def written(folder: Path, change: Change, tree: dict[str, Any]) -> list[str]:

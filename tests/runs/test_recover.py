@@ -16,6 +16,7 @@ from drivers.axis_status import TRIPPED, AxisStatus
 from ident_service.cli import main
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm, shipped_arms
+from ident_service.errors import ActionNeeded, DriverError
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.recovery import Recovery, recover
@@ -135,6 +136,26 @@ def test_a_cause_that_lasts_is_not_reset_away(tmp_path: Path, state: Path) -> No
     assert found.tripped == {"shoulder": "emergency stop", "elbow": "emergency stop"}
     assert found.reset == ()
     numbered(found, "Support", "Release the emergency stop", "again", "`ident preflight planar2`")
+
+
+@pytest.mark.parametrize(
+    ("refusal", "step"),
+    [
+        (ActionNeeded("the cabinet is locked: unlock it"), "The cabinet is locked: unlock it."),
+        (DriverError("the brake's press is worn"), "Read the drive's own fault code and mend its cause: the brake's"),
+    ],
+)
+def test_what_a_person_has_to_do_is_a_step_as_the_driver_says_it(
+    refusal: DriverError, step: str, tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: LookedAt) -> None:
+        raise refusal
+
+    config = config_with(tmp_path, more=LEVEL)
+    arm = broken(config)
+    monkeypatch.setattr(LookedAt, "reset", refuse)
+    found = recover(config, state, arm)
+    assert any(words.startswith(step) for words in found.steps), found.steps
 
 
 def test_a_tripped_watchdog_is_reset(tmp_path: Path, state: Path) -> None:

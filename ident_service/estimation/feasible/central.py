@@ -39,8 +39,9 @@ _CONVERGED = 1e-10  # Newton's decrement: the distance from the minimiser in the
 _QUADRATIC = 1e-2  # decrement from which Newton's method at least halves it with every step, unless rounding forbids
 _STEP = 0.99  # largest share of the distance to the boundary in one step
 _LONGEST = 10.0  # largest multiple of Newton's step
-_ROUNDS, _SAME = 50, 1e-12  # of the search for the step length, and relative change of it that ends it
 _RANK = 1e-10  # least entry on the diagonal of R that counts
+_ROUNDS = 50  # in which the step length is sought, a handful as a rule
+_SETTLED = 1e-12  # share of the longest step length
 _KEPT = 0.5  # share of the margin, at most the paper's, that is left where data press against the set
 
 
@@ -162,29 +163,25 @@ def _length(changes: Array, away: Array, going: Array, decrement: float) -> floa
     """
     c, b, a = float(away @ away), float(away @ going), float(going @ going)
 
-    def slope(s: float) -> tuple[float, float]:
-        """Return the slope of f and that of the slope."""
-        left = 1.0 - c - 2.0 * b * s - a * s**2
-        bound, share = 2.0 * (b + a * s) / left, 1.0 / (1.0 + s * changes)
-        barrier = float(changes @ (1.0 - share))
-        return barrier + bound - 2.0 * b / (1.0 - c) - decrement**2, float(np.sum((changes * share) ** 2)) + (
-            2.0 * a / left + bound**2
-        )
+    def slope_and_curvature(s: float) -> tuple[float, float]:
+        shares, left = changes / (1.0 + s * changes), 1.0 - c - 2.0 * b * s - a * s**2
+        bound, at_0 = 2.0 * (b + a * s) / left, 2.0 * b / (1.0 - c)
+        slope = s * float(changes @ shares) + bound - at_0 - decrement**2
+        return slope, float(shares @ shares) + 2.0 * a / left + bound**2
 
     longest = min(_STEP / max(-float(changes.min()), np.finfo(float).tiny), _LONGEST)
     if a > 0.0:  # to where |N x| is 1
         longest = min(longest, _STEP * (np.sqrt(b**2 + a * (1.0 - c)) - b) / a)
-    if slope(longest)[0] < 0.0:
+    if slope_and_curvature(longest)[0] < 0.0:
         return longest
-    # f is convex: Newton's method between two ends, and their middle where it leaves them.
-    low, high, s = 0.0, longest, min(1.0, 0.5 * longest)
+    # f is convex: Newton's method, halved where it leaves the bracket, without the 0.1 s in which scipy.optimize loads.
+    low, high, s = 0.0, longest, min(1.0, longest)
     for _ in range(_ROUNDS):
-        value, rise = slope(s)
-        low, high = (s, high) if value < 0.0 else (low, s)
-        before, s = s, s - value / rise
-        if not low < s < high:
-            s = 0.5 * (low + high)
-        if abs(s - before) <= _SAME * before:
+        slope, curvature = slope_and_curvature(s)
+        low, high = (s, high) if slope < 0.0 else (low, s)
+        newton = s - slope / curvature if curvature > 0.0 else low
+        before, s = s, newton if low <= newton <= high else 0.5 * (low + high)
+        if abs(s - before) <= _SETTLED * longest:
             break
     return s
 
