@@ -18,6 +18,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.conftest import commissioned as commissioned
+from helpers.meshes import threelink
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, Response, expect
 
@@ -330,20 +331,23 @@ def test_runs_are_sorted_filtered_and_overlaid(browser: Browser, story: Story) -
 
 
 def test_a_urdf_becomes_an_arm(browser: Browser, story: Story, tmp_path: Path) -> None:
-    from ident_service.config.load import shipped_arms
-
-    urdf = shipped_arms()["threelink"].with_name("threelink.urdf")
+    _, urdf, meshes = threelink()
+    for name, content in {"threelink.urdf": urdf.encode(), **meshes}.items():
+        (tmp_path / name).write_bytes(content)
     page = log_in(browser, story.reached)
     page.goto(f"{story.reached.url}/new")
-    page.get_by_label("URDF and meshes").set_input_files(urdf)
+    page.get_by_label("URDF and meshes").set_input_files(sorted(tmp_path.iterdir()))
     expect(page.get_by_label("Name of the arm")).to_have_value("threelink")
     page.get_by_label("Name of the arm").fill("crane")
     page.get_by_role("button", name="Describe").click()
     expect(page.locator("#describe-status")).to_contain_text("Described", timeout=60_000)
     assert "name: crane" in page.locator("#description").input_value()
+    expect(page.locator("#with-files")).to_contain_text("threelink.urdf, arm.obj, boom.dae, column.stl")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/arms/crane")
     expect(page.locator(".badges")).to_contain_text("simulated")
+    view = page.evaluate("fetch('/api/v1/arms/crane/view').then((answer) => answer.json())")
+    assert [one["owner"] for one in view["figure"]["meshes"]] == ["waist", "shoulder", "slide"]
     page.goto(f"{story.reached.url}/new")
     page.locator("#description").fill("format: ident-arm\nnonsense: 1\n")
     page.get_by_role("button", name="Add", exact=True).click()

@@ -4,6 +4,7 @@
 
 const byId = (name) => document.getElementById(name);
 const files = new Map(); // name to text, of what the description names
+let meshes = {}; // name to base 64, of what pages draw of it
 const MOST = 11 * 2 ** 20; // bytes of a URDF and its meshes
 
 byId("describe").hidden = false;
@@ -28,22 +29,39 @@ function base64(bytes) {
 
 const plain = (name) => name.replace(/[^A-Za-z0-9_.-]/g, "_").replace(/^[_.-]+/, "");
 
+const size = (list) => list.reduce((sum, file) => sum + file.size, 0);
+const named = (elements) => new Set(elements.map((mesh) => (mesh.getAttribute("filename") || "").split(/[/\\]/).pop()));
+const content = async (file) => base64(new Uint8Array(await file.arrayBuffer()));
+
+// What pages draw: of each link its visual meshes, else those of its collision; those that are chosen.
+async function drawn(list, robot) {
+  const meshes = [...robot.querySelectorAll("link")].flatMap((link) => [...link.querySelectorAll(link.querySelector("visual") ? "visual mesh" : "collision mesh")]);
+  const names = named(meshes);
+  const sent = list.filter((file) => names.has(file.name) && plain(file.name) === file.name && /\.(stl|obj|dae)$/i.test(file.name));
+  if (size(sent) > MOST) return [{}, ["its meshes are larger than 11 MiB; pages show capsules instead"]];
+  const found = {};
+  for (const file of sent) found[file.name] = await content(file);
+  return [found, []];
+}
+
 // Meshes that are drawn only are not sent: collision is what a description is about.
 async function chosen(list) {
   const urdf = list.find((file) => /\.(urdf|xml)$/i.test(file.name));
   if (!urdf) throw new Error("Choose a URDF among the files.");
   const robot = new DOMParser().parseFromString(await urdf.text(), "text/xml");
-  const needed = new Set([...robot.querySelectorAll("collision mesh")].map((mesh) => (mesh.getAttribute("filename") || "").split(/[/\\]/).pop()));
+  const needed = named([...robot.querySelectorAll("collision mesh")]);
   const sent = list.filter((file) => file === urdf || needed.has(file.name));
   const missing = [...needed].filter((name) => !list.some((file) => file.name === name));
-  if (sent.reduce((sum, file) => sum + file.size, 0) > MOST) throw new Error("The URDF and its collision meshes are larger than 11 MiB; use ident new.");
-  const content = {};
-  for (const file of sent) content[file === urdf ? plain(file.name) : file.name] = base64(new Uint8Array(await file.arrayBuffer()));
-  return { urdf: plain(urdf.name), files: content, missing };
+  if (size(sent) > MOST) throw new Error("The URDF and its collision meshes are larger than 11 MiB; use ident new.");
+  const files = {};
+  for (const file of sent) files[file === urdf ? plain(file.name) : file.name] = await content(file);
+  const [toDraw, remarks] = await drawn(list, robot);
+  return { urdf: plain(urdf.name), files, meshes: toDraw, remarks: [...missing.map((name) => `the mesh ${name} was not chosen`), ...remarks] };
 }
 
 function showFiles() {
-  byId("with-files").textContent = files.size ? `It goes up with ${[...files.keys()].join(", ")}.` : "";
+  const names = [...files.keys(), ...Object.keys(meshes)];
+  byId("with-files").textContent = names.length ? `It goes up with ${names.join(", ")}.` : "";
 }
 
 byId("urdf-files").addEventListener("change", () => {
@@ -70,7 +88,8 @@ byId("describe").addEventListener("submit", (event) => {
     files.clear();
     for (const [name, text] of Object.entries(told.files)) files.set(name, text);
     showFiles();
-    const remarks = [...told.guessed, ...sent.missing.map((name) => `the mesh ${name} was not chosen`)];
+    meshes = sent.meshes;
+    const remarks = [...told.guessed, ...sent.remarks];
     byId("guessed").replaceChildren(...remarks.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
     status.textContent = remarks.length ? "Described. Look at what was guessed, correct it below, then add it." : "Described. Read it below, then add it.";
     byId("description").scrollIntoView({ block: "center" });
@@ -86,6 +105,7 @@ byId("add").addEventListener("submit", (event) => {
   const body = {
     description: byId("description").value.replaceAll("\r\n", "\n"),
     files: Object.fromEntries(files),
+    meshes,
     replace: byId("add").elements.replace.checked,
   };
   asked("/api/v1/arms", body)
