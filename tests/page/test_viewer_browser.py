@@ -157,7 +157,7 @@ def test_distances_are_told_while_the_arm_is_on_its_way(shown: tuple[Browser, Re
       joints, time: [1.5], position: posture.map((value) => [0, value]) } }))"""
     joints = [joint["name"] for joint in view["figure"]["joints"]]
     page.evaluate(tell, [joints, posture])
-    expect(page.locator("#viewer-status")).to_have_text("As measured, 1.5 s after the recording began.")
+    expect(page.locator("#viewer-status")).to_have_text("As measured, 1.5 s after the beginning.")
     pair = view["clearance"]["pairs"][near["pair"][row]]
     expect(page.locator("#viewer-itself")).to_have_text(f"{1000 * near['distance'][row]:.0f} mm, {pair}")
     expect(page.locator("#viewer-distances")).to_be_visible()

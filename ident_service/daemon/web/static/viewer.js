@@ -383,7 +383,7 @@ async function begin() {
     byId("distances").hidden = true;
     if (player) player.showLive(newest);
     byId("clearance").setAttribute("hidden", "");
-    byId("status").textContent = `As measured, ${detail.time[detail.time.length - 1].toFixed(1)} s after the recording began.`;
+    byId("status").textContent = `As measured, ${detail.time[detail.time.length - 1].toFixed(1)} s after the beginning.`;
     draw();
   });
 }
