@@ -332,17 +332,23 @@ def test_runs_are_sorted_filtered_and_overlaid(browser: Browser, story: Story) -
 
 def test_a_urdf_becomes_an_arm(browser: Browser, story: Story, tmp_path: Path) -> None:
     _, urdf, meshes = threelink()
-    for name, content in {"threelink.urdf": urdf.encode(), **meshes}.items():
-        (tmp_path / name).write_bytes(content)
+    # As makers lay them out: files of one name for collisions and for looks, of which the URDF names the folder.
+    for name, content in {
+        "threelink.urdf": urdf.encode(),
+        "meshes/collision/column.stl": b"",
+        **{f"meshes/visual/{name}": content for name, content in meshes.items()},
+    }.items():
+        (tmp_path / "crane" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "crane" / name).write_bytes(content)
     page = log_in(browser, story.reached)
     page.goto(f"{story.reached.url}/new")
-    page.get_by_label("URDF and meshes").set_input_files(sorted(tmp_path.iterdir()))
+    page.get_by_label("or the folder that they are in").set_input_files(tmp_path / "crane")
     expect(page.get_by_label("Name of the arm")).to_have_value("threelink")
     page.get_by_label("Name of the arm").fill("crane")
     page.get_by_role("button", name="Describe").click()
     expect(page.locator("#describe-status")).to_contain_text("Described", timeout=60_000)
     assert "name: crane" in page.locator("#description").input_value()
-    expect(page.locator("#with-files")).to_contain_text("threelink.urdf, arm.obj, boom.dae, column.stl")
+    expect(page.locator("#with-files")).to_contain_text("threelink.urdf, column.stl, arm.obj, boom.dae")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/arms/crane")
     expect(page.locator(".badges")).to_contain_text("simulated")

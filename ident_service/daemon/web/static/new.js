@@ -30,33 +30,54 @@ function base64(bytes) {
 const plain = (name) => name.replace(/[^A-Za-z0-9_.-]/g, "_").replace(/^[_.-]+/, "");
 
 const size = (list) => list.reduce((sum, file) => sum + file.size, 0);
-const named = (elements) => new Set(elements.map((mesh) => (mesh.getAttribute("filename") || "").split(/[/\\]/).pop()));
 const content = async (file) => base64(new Uint8Array(await file.arrayBuffer()));
+const parts = (name) => name.split(/[/\\]/);
+
+// The URDF that is chosen by itself, else the one in the folder.
+function urdfAmong(single, folder) {
+  const alone = single.find((file) => /\.(urdf|xml)$/i.test(file.name));
+  const there = folder.filter((file) => /\.urdf$/i.test(file.name));
+  if (!alone && there.length > 1) throw new Error(`The folder has several URDFs; choose one of them as a file: ${there.map((file) => file.name).join(", ")}.`);
+  return alone || there[0];
+}
+
+// Of files with the name of a mesh the one whose folders are most like those that the URDF names.
+function fileOf(mesh, list) {
+  const named = parts(mesh.getAttribute("filename") || "").reverse();
+  const alike = (file) => {
+    const place = parts(file.webkitRelativePath || file.name).reverse();
+    const differs = place.findIndex((part, k) => part !== named[k]);
+    return differs < 0 ? place.length : differs;
+  };
+  const found = list.filter((file) => file.name === named[0]);
+  return found.reduce((best, file) => (best && alike(best) >= alike(file) ? best : file), undefined);
+}
 
 // What pages draw: of each link its visual meshes, else those of its collision; those that are chosen.
 async function drawn(list, robot) {
   const meshes = [...robot.querySelectorAll("link")].flatMap((link) => [...link.querySelectorAll(link.querySelector("visual") ? "visual mesh" : "collision mesh")]);
-  const names = named(meshes);
-  const sent = list.filter((file) => names.has(file.name) && plain(file.name) === file.name && /\.(stl|obj|dae)$/i.test(file.name));
+  const found = new Set(meshes.map((mesh) => fileOf(mesh, list)));
+  const sent = [...found].filter((file) => file && plain(file.name) === file.name && /\.(stl|obj|dae)$/i.test(file.name));
   if (size(sent) > MOST) return [{}, ["its meshes are larger than 11 MiB; pages show capsules instead"]];
-  const found = {};
-  for (const file of sent) found[file.name] = await content(file);
-  return [found, []];
+  const made = {};
+  for (const file of sent) made[file.name] = await content(file);
+  return [made, []];
 }
 
-// Meshes that are drawn only are not sent: collision is what a description is about.
-async function chosen(list) {
-  const urdf = list.find((file) => /\.(urdf|xml)$/i.test(file.name));
-  if (!urdf) throw new Error("Choose a URDF among the files.");
+// For the description meshes of collisions are sent, for pages those that are drawn.
+async function chosen(single, folder) {
+  const urdf = urdfAmong(single, folder);
+  if (!urdf) throw new Error("Choose a URDF among the files, or a folder that has one.");
+  const list = [...single, ...folder];
   const robot = new DOMParser().parseFromString(await urdf.text(), "text/xml");
-  const needed = named([...robot.querySelectorAll("collision mesh")]);
-  const sent = list.filter((file) => file === urdf || needed.has(file.name));
-  const missing = [...needed].filter((name) => !list.some((file) => file.name === name));
+  const needed = [...robot.querySelectorAll("collision mesh")];
+  const missing = new Set(needed.filter((mesh) => !fileOf(mesh, list)).map((mesh) => parts(mesh.getAttribute("filename") || "").pop()));
+  const sent = [...new Set([urdf, ...needed.map((mesh) => fileOf(mesh, list)).filter(Boolean)])];
   if (size(sent) > MOST) throw new Error("The URDF and its collision meshes are larger than 11 MiB; use ident new.");
   const files = {};
   for (const file of sent) files[file === urdf ? plain(file.name) : file.name] = await content(file);
   const [toDraw, remarks] = await drawn(list, robot);
-  return { urdf: plain(urdf.name), files, meshes: toDraw, remarks: [...missing.map((name) => `the mesh ${name} was not chosen`), ...remarks] };
+  return { urdf: plain(urdf.name), files, meshes: toDraw, remarks: [...[...missing].map((name) => `the mesh ${name} was not chosen`), ...remarks] };
 }
 
 function showFiles() {
@@ -64,10 +85,12 @@ function showFiles() {
   byId("with-files").textContent = names.length ? `It goes up with ${names.join(", ")}.` : "";
 }
 
-byId("urdf-files").addEventListener("change", () => {
-  const urdf = [...byId("urdf-files").files].find((file) => /\.(urdf|xml)$/i.test(file.name));
-  if (urdf && !byId("urdf-name").value) byId("urdf-name").value = plain(urdf.name).replace(/\.[^.]*$/, "").slice(0, 64);
-});
+for (const name of ["urdf-files", "urdf-folder"]) {
+  byId(name).addEventListener("change", () => {
+    const urdf = [...byId(name).files].find((file) => /\.urdf$/i.test(file.name));
+    if (urdf && !byId("urdf-name").value) byId("urdf-name").value = plain(urdf.name).replace(/\.[^.]*$/, "").slice(0, 64);
+  });
+}
 
 byId("files").addEventListener("change", async () => {
   for (const file of byId("files").files) files.set(file.name, await file.text());
@@ -82,7 +105,7 @@ byId("describe").addEventListener("submit", (event) => {
   status.textContent = "Reading it; this takes some seconds …";
   byId("guessed").replaceChildren();
   (async () => {
-    const sent = await chosen([...byId("urdf-files").files]);
+    const sent = await chosen([...byId("urdf-files").files], [...byId("urdf-folder").files]);
     const told = await asked("/api/v1/descriptions/new", { name: byId("urdf-name").value, urdf: sent.urdf, files: sent.files });
     byId("description").value = told.description;
     files.clear();
