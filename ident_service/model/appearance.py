@@ -18,7 +18,7 @@ from ident_service.errors import ModelError, UsageError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.collision import link_bodies
-from ident_service.model.mechanism import read_mechanism
+from ident_service.model.mechanism import parse_xml, read_mechanism
 from ident_service.model.solids import Body, Capsule
 from ident_service.model.urdf import origin_of
 
@@ -147,8 +147,7 @@ def placed_links(urdf: TextFile, kinematics: Kinematics, chain: Chain) -> Iterat
         ModelError: not a URDF.
     """
     mechanism = read_mechanism(urdf, "urdf", kinematics)
-    # Entities were refused when the mechanism was read from the same text.
-    for element in ET.fromstring(urdf.text).iterfind("link"):  # noqa: S314
+    for element in parse_xml(urdf.text).iterfind("link"):
         if (frame := mechanism.frames.get(element.get("name", ""))) is not None:
             joint, rotation, translation = frame
             carrier = "" if joint == WORLD else mechanism.names[joint]

@@ -152,14 +152,11 @@ def _require_own_meshes(source: Path) -> None:
         ModelError: not a URDF, or larger than one is.
     """
     from ident_service.model.drawn_meshes import SAFE_MESHES
-    from ident_service.model.mechanism import count_mechanism
+    from ident_service.model.mechanism import count_mechanism, parse_xml
 
     text = source.read_text(encoding="utf-8")
     count_mechanism(TextFile(name=source.name, text=text), "urdf")
-    try:
-        robot = ET.fromstring(text)  # noqa: S314 - counted just now
-    except ET.ParseError as error:
-        raise ModelError(f"{source.name}: not well-formed XML: {error}") from None
+    robot = parse_xml(text)
     for mesh in robot.iter("mesh"):
         name = re.split(r"[/\\]", mesh.get("filename", ""))[-1]
         mesh.set("filename", name if Path(name).suffix.lower() in SAFE_MESHES else "")

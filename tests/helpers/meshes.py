@@ -56,6 +56,7 @@ def threelink(name: str = "threelink") -> tuple[str, str, dict[str, bytes]]:
         "tool": PLAIN.format("boom.dae"),
     }.items():
         urdf = urdf.replace(f'<link name="{link}">', f'<link name="{link}">{part}</geometry></visual>')
+    urdf = urdf.replace("<robot ", '<robot drake:version="1" ')  # of a simulator's tool, which declares no prefix
     obj = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS * (0.12, 0.03, 0.03))
     obj += "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in FACES)
     points = " ".join(map(str, (CORNERS * 0.02).ravel()))

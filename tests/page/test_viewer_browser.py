@@ -112,6 +112,11 @@ def test_a_motion_is_seen_before_it_is_made(shown: tuple[Browser, Reached, str],
     page.locator("#viewer-controls").wait_for()
     expect(page.get_by_label("Type the arm's name")).to_be_focused()  # the viewer takes nothing from the question
     assert drawn(page) > 50
+    picture, slider = (page.locator(f"#viewer-{name}").bounding_box() for name in ("canvas", "controls"))
+    assert picture is not None
+    assert slider is not None
+    assert picture["width"] == pytest.approx(slider["width"], abs=2)  # as wide as the page lets it be
+    assert picture["height"] > 300
     view = page.evaluate(f"fetch('/api/v1/arms/{ARM}/view?motion=own').then((answer) => answer.json())")
     end, near = view["time"][-1], view["clearance"]["itself"]["distance"]
     at = page.locator("#viewer-at")

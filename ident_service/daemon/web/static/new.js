@@ -110,8 +110,8 @@ byId("describe").addEventListener("submit", (event) => {
     byId("description").value = told.description;
     files.clear();
     for (const [name, text] of Object.entries(told.files)) files.set(name, text);
-    showFiles();
     meshes = sent.meshes;
+    showFiles();
     const remarks = [...told.guessed, ...sent.remarks];
     byId("guessed").replaceChildren(...remarks.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
     status.textContent = remarks.length ? "Described. Look at what was guessed, correct it below, then add it." : "Described. Read it below, then add it.";

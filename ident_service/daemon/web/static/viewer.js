@@ -87,6 +87,7 @@ class Arm {
     const made = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color, side: THREE.DoubleSide }));
     made.userData = { owner: mesh.owner, color };
     const under = this.solids.filter((solid) => solid.parent === this.frameOf(mesh.joint) && solid.userData.owner === mesh.owner);
+    if (under.length) made.material.color.copy(under[0].material.color); // which may be marked already
     this.frameOf(mesh.joint).add(made);
     this.solids.push(made);
     this.covers.push({ made, under });
