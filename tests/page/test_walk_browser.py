@@ -209,6 +209,21 @@ def test_the_pages_of_a_motion_are_whole_before_and_while_the_arm_moves(browser:
     assert found == []
 
 
+def test_the_report_has_no_findings_with_all_unfolded(browser: Browser, story: Story) -> None:
+    page = log_in(browser, story.reached)
+    told, found = heard(page), list[str]()
+    run = story.pages["simulation"].rpartition("/")[2]
+    page.goto(f"{story.reached.url}/api/v1/runs/{run}/report.html")
+    page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    axe = Axe()
+    for width, scheme, options in ((400, "dark", {"resultTypes": ["violations"]}), (1280, "light", COLOURS)):
+        page.set_viewport_size({"width": width, "height": 860})
+        page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        found += [f"{width} px, {scheme}: {one}" for one in violations(axe, page, options)]
+    assert found + told.words == []
+
+
 def test_pages_without_a_login_are_whole(browser: Browser, state: Path) -> None:
     with listening(state) as reached:
         page = browser.new_context().new_page()

@@ -69,7 +69,9 @@ async function chosen(single, folder) {
   const urdf = urdfAmong(single, folder);
   if (!urdf) throw new Error("Choose a URDF among the files, or a folder that has one.");
   const list = [...single, ...folder];
-  const robot = new DOMParser().parseFromString(await urdf.text(), "text/xml");
+  // Tools of simulators often do not declare the prefixes of what they add (`drake:...`), which ends a browser's parser.
+  const text = (await urdf.text()).replace(/(<\/?|\s)([A-Za-z_][\w.-]*):(?=[\w.-]+[\s=>/])/g, "$1$2-");
+  const robot = new DOMParser().parseFromString(text, "text/xml");
   const needed = [...robot.querySelectorAll("collision mesh")];
   const missing = new Set(needed.filter((mesh) => !fileOf(mesh, list)).map((mesh) => parts(mesh.getAttribute("filename") || "").pop()));
   const sent = [...new Set([urdf, ...needed.map((mesh) => fileOf(mesh, list)).filter(Boolean)])];
