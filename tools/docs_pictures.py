@@ -67,6 +67,7 @@ def main() -> None:
         document(page, work / "first" / "report.html", "tutorial-report", height=720)
         document(page, work / "result" / "report.html", "tutorial-identify", "Measured and predicted torque")
         terminal(page, done.stdout, "ident preflight planar2", "tutorial-preflight")
+        terminal(page, done.stdout, "ident export", "tutorial-export")
         terminal(page, done.stdout, "ident compare", "tutorial-compare")
         browser.close()
         shutil.copy(work / "motion" / "joints.svg", IMAGES / "tutorial-motion.svg")

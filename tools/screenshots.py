@@ -133,7 +133,7 @@ def reidentify(client: IdentClient) -> None:
 
 def views(client: IdentClient) -> dict[str, str]:
     """Return the address of each view that is only looked at, by its name."""
-    runs = {(run["arm"], run["kind"]): run["id"] for run in reversed(list(client.runs()))}
+    *_, validated = (run["id"] for run in client.runs(arm=ARM) if run["kind"] == "identification")
     faulted = next(run["id"] for run in client.runs(arm=FAILING) if run["kind"] == "motion" and run["ending"] != "done")
     again = client.get("/api/v1/reidentifications")[0]["id"]
     check = next(job.id for job in client.jobs(arm=ARM) if job.kind == "check")
@@ -145,14 +145,15 @@ def views(client: IdentClient) -> dict[str, str]:
         "runs": "/runs",
         "reidentification": f"/reidentifications/{again}",
         "maintenance": f"/arms/{ARM}/maintenance",
-        "report": f"/api/v1/runs/{runs[ARM, 'identification']}/report.html",
+        "report": f"/api/v1/runs/{validated}/report.html",
     }
 
 
 def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
     """Write a picture of every view."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL by software
+        browser = playwright.chromium.launch(executable_path=chromium(), args=switches)
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, timezone_id="UTC", color_scheme="light")
         page.set_default_timeout(120_000)
         page.goto(url)
@@ -172,6 +173,10 @@ def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
         page.get_by_role("heading", name=f"Run {ARM}?").wait_for()
         page.wait_for_load_state("networkidle")
         save(page, "confirm", out)
+        page.locator("#viewer-controls").wait_for()
+        page.evaluate("document.getElementById('viewer').scrollIntoView()")
+        save(page, "view", out)
+        page.evaluate("window.scrollTo(0, 0)")
         page.get_by_label("Type the arm's name").fill(ARM)
         page.keyboard.press("Enter")
         page.locator("#live .uplot canvas").first.wait_for()

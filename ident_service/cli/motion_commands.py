@@ -352,6 +352,7 @@ def add(verbs: VerbList) -> None:
     )
     sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
     sub.add_argument("--seconds", type=seconds, default=2.0)
+    sub.add_argument("--tell-samples", action="store_true", help=argparse.SUPPRESS)  # of a daemon
     sub = verbs.add(
         "preflight",
         _check,
@@ -453,7 +454,7 @@ def _watch(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import controlling_pid
     from ident_service.motion.read_only_monitor import watch
-    from ident_service.operations.arm_checks import watch_document, watch_text
+    from ident_service.operations.arm_checks import SampleLines, watch_document, watch_text
     from ident_service.registry.state_folder import control_path
 
     config = described_arm(arguments)
@@ -462,7 +463,8 @@ def _watch(arguments: argparse.Namespace) -> Answer:
     stopping = StopOnSignal()
     step_of(arguments)("watching", left=arguments.seconds)
     with stopping:
-        seen = watch(make_arm(config), arguments.seconds, stop_requested=stopping.requested)
+        tell = SampleLines() if arguments.tell_samples else lambda described, sample: None
+        seen = watch(make_arm(config), arguments.seconds, tell, stop_requested=stopping.requested)
     return DONE, watch_text(seen), watch_document(seen)
 
 

@@ -6,6 +6,7 @@ import hashlib
 import re
 import threading
 import time
+from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -185,20 +186,30 @@ class IdentClient(Connection):
         """Return a handle on an arm; no request is sent yet."""
         return RemoteArm(self, name)
 
-    def add_arm(self, description: str, files: Mapping[str, str] = NOTHING, *, replace: bool = False) -> RemoteArm:
+    def add_arm(
+        self,
+        description: str,
+        files: Mapping[str, str] = NOTHING,
+        *,
+        replace: bool = False,
+        meshes: Mapping[str, bytes] | None = None,
+    ) -> RemoteArm:
         """Add an arm.
 
         Args:
             description: the YAML.
             files: name to content of the files that it names.
             replace: whether it may take the place of another of its name.
+            meshes: name to content of the STL, OBJ or DAE files that its URDF names, for pages to draw; 11 MiB in all.
 
         Raises:
             AlreadyThere: another arm has its name.
             ConfigError: its mistakes, each with line and column.
             UsageError: the files have no plain names, or are too many or too large.
         """
-        body = {"description": description, "files": dict(files), "replace": replace}
+        body: dict[str, Any] = {"description": description, "files": dict(files), "replace": replace}
+        if meshes:
+            body["meshes"] = {name: b64encode(content).decode() for name, content in meshes.items()}
         return self.arm(str(self.post(f"{_API}/arms", body)["name"]))
 
     def stop(self) -> dict[str, list[str]]:

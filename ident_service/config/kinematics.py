@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -23,6 +24,7 @@ _LONGEST_LINK = 20.0  # m; the largest arms that move torque-controlled joints a
 
 _SNAPPED_TO = math.pi / 12.0
 _ROUNDED = 2e-3  # rad; 3.14 for pi is 1.6e-3
+_BARELY, _EXACT = 1e-5, 1e-13  # rad; digits of a number that a person shortened, and of a floating-point one
 _RPY = re.compile(r"""(\brpy\s*=\s*)(["'])([^"']*)\2""")
 
 
@@ -42,6 +44,16 @@ def snap_angles(urdf: str) -> str:
         return f"{start}{quote}{' '.join(angle(value) for value in values.split())}{quote}"
 
     return _RPY.sub(attribute, urdf)
+
+
+def angles_barely_rounded(angles: Iterable[float]) -> bool:
+    """Return whether angles [rad] near multiples of 15 degrees differ from them, and by 1e-5 at most.
+
+    So 1.5708 is a rounded pi/2, and a calibrated 1.5703 beside it shows that nothing is to be taken as exact.
+    """
+    off = [abs(angle - round(angle / _SNAPPED_TO) * _SNAPPED_TO) for angle in angles]
+    near = [one for one in off if one <= _ROUNDED]
+    return any(one > _EXACT for one in near) and max(near) <= _BARELY
 
 
 class DHRow(Section):

@@ -1,4 +1,4 @@
-"""Stream a running job as server-sent events: its state and log, and samples of the run that it records."""
+"""Stream a job as server-sent events: state, log, and samples of the run that it records or the arm that it reads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from ident_service.daemon.dependencies import Service
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import said
+from ident_service.daemon.jobs.outcome import said, told_samples
 from ident_service.daemon.live import LiveRuns
 from ident_service.daemon.routes import jobs
 from ident_service.registry import jobs as rows
@@ -19,6 +19,7 @@ from ident_service.registry.database import Row
 from ident_service.registry.runs import RUNS
 
 RECORDED: Final = frozenset({"run", "rehearse", "home"})
+READ: Final = "watch"  # the kind of job that reads an arm at rest
 _LOOK = 0.1  # s between news
 _STATE = 0.5  # s between reads of the job itself
 _BREATH = 10.0  # s without news, after which a comment shows that the connection is up
@@ -37,17 +38,20 @@ def _shown(service: Service, row: Row) -> str:
 
 
 async def live_events(service: Service, live: LiveRuns, row: Row) -> AsyncIterator[str]:
-    """Yield events until the job ends: `job`, and `samples` and `doubt` of a run that is recorded."""
+    """Yield events until the job ends: `job`, and `samples` and `doubt` of a run that is recorded or an arm at rest."""
     run = None
     if row["kind"] in RECORDED and row["run"] is not None and row["state"] in rows.LIVE:
         run = live.run(row["id"], service.state / RUNS / str(row["run"]))
-    told, number, silent, since = "", 0, 0.0, _STATE
+    told, number, offset, silent, since = "", 0, 0, 0.0, _STATE
     while True:
         news = []
         if run is not None:
             for frame in await run_in_threadpool(run.since, number):
                 number = frame.number
                 news.append(f"event: {frame.kind}\ndata: {frame.data}\n\n")
+        if row["kind"] == READ:
+            found, offset = await run_in_threadpool(told_samples, service.state / JOBS / row["id"], offset)
+            news += [f"event: samples\ndata: {json.dumps(one)}\n\n" for one in found]
         if since >= _STATE:
             since = 0.0
             row = await run_in_threadpool(rows.known_job, service.db, row["id"])

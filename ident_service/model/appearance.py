@@ -6,6 +6,7 @@ For people who look. What the arm must stay clear of is decided by `collision.py
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from ident_service.errors import ModelError, UsageError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.collision import link_bodies
-from ident_service.model.mechanism import read_mechanism
+from ident_service.model.mechanism import parse_xml, read_mechanism
 from ident_service.model.solids import Body, Capsule
 from ident_service.model.urdf import origin_of
 
@@ -99,33 +100,64 @@ def visual_meshes(file: Path, kinematics: Kinematics, chain: Chain) -> list[Mesh
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{file}: cannot be read: {error}") from None
-    mechanism = read_mechanism(TextFile(name=str(file), text=text), "urdf", kinematics)
     meshes = []
-    # Entities were refused when the mechanism was read from the same text.
-    for link in ET.fromstring(text).iterfind("link"):  # noqa: S314
-        frame = mechanism.frames.get(link.get("name", ""))
-        for visual in link.iterfind("visual"):
-            mesh = visual.find("geometry/mesh")
-            if mesh is None or frame is None:
+    for link in placed_links(TextFile(name=str(file), text=text), kinematics, chain):
+        for visual in link.element.iterfind("visual"):
+            if (mesh := visual.find("geometry/mesh")) is None:
                 continue
-            where = f"{file}: link {link.get('name')!r}"
-            joint, rotation, translation = frame
-            if joint != WORLD and mechanism.names[joint] not in chain.names:
-                raise UsageError(f"{where} hangs on joint {mechanism.names[joint]!r}, which the arm does not have")
-            own_rotation, own_translation = origin_of(visual.find("origin"), where)
-            meshes.append(
-                Mesh(
-                    joint if joint == WORLD else chain.names.index(mechanism.names[joint]),
-                    _mesh_file(file, mesh.get("filename", ""), where),
-                    rotation @ own_rotation,
-                    rotation @ own_translation + translation,
-                    _scale(mesh.get("scale", "1 1 1"), where),
-                )
-            )
+            if link.joint is None:
+                raise UsageError(f"{link.where} hangs on joint {link.carrier!r}, which the arm does not have")
+            rotation, translation = link.place(visual)
+            found = _mesh_file(file, mesh.get("filename", ""), link.where)
+            scale = mesh_scale(mesh.get("scale", "1 1 1"), link.where)
+            meshes.append(Mesh(link.joint, found, rotation, translation, scale))
     return meshes
 
 
-def _scale(text: str, where: str) -> Array:
+@dataclass(frozen=True, eq=False)
+class PlacedLink:
+    """Link of a URDF and where it stands still.
+
+    Attributes:
+        where: file and link, for messages.
+        element: of the file.
+        joint: index of the arm's joint whose frame it stands still in, or WORLD; None where the arm has no such joint.
+        carrier: name of that joint in the file; empty for the world.
+        rotation: of the link's frame in the joint's, shape (3, 3).
+        translation: likewise [m], shape (3,).
+    """
+
+    where: str
+    element: ET.Element
+    joint: int | None
+    carrier: str
+    rotation: Array
+    translation: Array
+
+    def place(self, part: ET.Element) -> tuple[Array, Array]:
+        """Return rotation and translation [m] of a visual or collision element in the joint's frame."""
+        rotation, translation = origin_of(part.find("origin"), self.where)
+        return self.rotation @ rotation, self.rotation @ translation + self.translation
+
+
+def placed_links(urdf: TextFile, kinematics: Kinematics, chain: Chain) -> Iterator[PlacedLink]:
+    """Yield the links of a URDF that are part of the arm or of what it stands on.
+
+    Raises:
+        ModelError: not a URDF.
+    """
+    mechanism = read_mechanism(urdf, "urdf", kinematics)
+    for element in parse_xml(urdf.text).iterfind("link"):
+        if (frame := mechanism.frames.get(element.get("name", ""))) is not None:
+            joint, rotation, translation = frame
+            carrier = "" if joint == WORLD else mechanism.names[joint]
+            known = WORLD if joint == WORLD else chain.names.index(carrier) if carrier in chain.names else None
+            where = f"{urdf.name}: link {element.get('name')!r}"
+            yield PlacedLink(where, element, known, carrier, rotation, translation)
+
+
+def mesh_scale(text: str, where: str) -> Array:
+    """Return the `scale` of a mesh, shape (3,); UsageError where it is not three numbers."""
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:

@@ -1,7 +1,7 @@
 """Read what a first description takes from a URDF, an MJCF or a DH table: the branch that is the arm, limits, capsules.
 
-Meshes are read by coal (assimp) and never again: what a description says of bodies are capsules, which people can check
-and correct. An MJCF, with its meshes, is read in a process of its own, as everywhere (`mechanism.py`).
+Meshes are read by coal (assimp): what a description says of bodies are capsules, which people can check and correct. An
+MJCF, with its meshes, is read in a process of its own, as everywhere (`mechanism.py`).
 
 `python -m ident_service.model.outline FILE` prints the outline of an MJCF as one JSON object.
 """
@@ -393,10 +393,25 @@ def _hull(points: Array) -> Array:
 def _mesh_file(mesh: ET.Element, folder: Path) -> Array | None:
     """Return the triangles of a mesh file [m], shape (triangles, 3, 3); None where it cannot be read."""
     path = _find(mesh.get("filename", ""), folder)
-    if path is None or path.stat().st_size > MOST_MESH_BYTES:
+    if path is None:
         return None
     try:
         scale = np.array([float(value) for value in (mesh.get("scale") or "1 1 1").split()])
+    except ValueError:
+        return None
+    return mesh_triangles(path, scale)
+
+
+def mesh_triangles(path: Path, scale: Array) -> Array | None:
+    """Return the triangles of a mesh file [m], shape (triangles, 3, 3); None where it is too large or cannot be read.
+
+    Args:
+        path: of the file; its ending says how it is read.
+        scale: of its coordinates, shape (3,).
+    """
+    if path.stat().st_size > MOST_MESH_BYTES:
+        return None
+    try:
         return _triangles(coal.MeshLoader().load(str(path), scale))
     except (ValueError, RuntimeError):  # what assimp cannot read
         return None

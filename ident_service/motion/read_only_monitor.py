@@ -99,7 +99,7 @@ class _Sums:
 def watch(
     arm: Arm,
     seconds: float = 5.0,
-    tell: Callable[[Sample], None] = lambda sample: None,
+    tell: Callable[[ArmDescription, Sample], None] = lambda described, sample: None,
     *,
     cycles: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -109,7 +109,7 @@ def watch(
     Args:
         arm: not open.
         seconds: how long.
-        tell: called with every sample.
+        tell: called with what the arm says of itself and every sample.
         cycles: how many, instead of `seconds`.
         stop_requested: asked every cycle; True ends it with what has been seen.
 
@@ -130,11 +130,11 @@ def watch(
         wanted = max(1, round(seconds * described.rate)) if cycles is None else cycles
         sample = arm.exchange(None)
         sums.add(sample)
-        tell(sample)
+        tell(described, sample)
         while sums.cycles < wanted and not stop_requested():
             sample = arm.exchange(None)
             sums.add(sample)
-            tell(sample)
+            tell(described, sample)
     finally:
         arm.close()
     return _summary(described, sums, sample)

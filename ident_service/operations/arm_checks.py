@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -15,7 +16,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.arm import Arm
+from drivers.arm import Arm, ArmDescription, Sample
 from drivers.axis_status import AxisStatus
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError, UsageError
@@ -24,6 +25,7 @@ from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile
 from ident_service.motion.read_only_monitor import Watched
 from ident_service.motion.ticket import Check, Measure, Ticket, Verdict, ticket_values
+from ident_service.registry.jobs import SAMPLES
 from ident_service.registry.state_folder import arm_folder, control_path
 from ident_service.results.manifest import write_atomically
 
@@ -42,6 +44,7 @@ TITLES: Final = {
     "watchdog": "drives stop when the host is silent",
 }
 """Titles of the preflight's checks, by their codes."""
+_TOLD_NS: Final = 100_000_000  # between samples of an arm at rest that viewers are told
 _WORDS = {
     Verdict.PASSED: "ok",
     Verdict.FAILED: "FAILED",
@@ -129,6 +132,27 @@ def watch_text(seen: Watched) -> str:
             f"{_drive(seen, k)}"
         )
     return "\n".join([*lines, *(f"  {words}" for words in seen.drives), ""])
+
+
+class SampleLines:
+    """Print positions of an arm at rest to stderr, one line of JSON every tenth of a second, for a daemon's viewers."""
+
+    def __init__(self) -> None:
+        """Create one that prints the first sample that it is told."""
+        self._first_ns: int | None = None
+        self._next_ns = 0
+
+    def __call__(self, described: ArmDescription, sample: Sample) -> None:
+        """Print a sample if it is time for one; positions [rad or m] of axes that did not answer are null."""
+        if self._first_ns is None:
+            self._first_ns = sample.stamp_ns
+        if (at := sample.stamp_ns - self._first_ns) < self._next_ns:
+            return
+        self._next_ns = at + _TOLD_NS
+        known = zip(sample.position.tolist(), sample.valid.tolist(), strict=True)
+        position = [[round(value, 6) if valid and isfinite(value) else None] for value, valid in known]
+        told = {"joints": list(described.joint_names), "time": [round(at * 1e-9, 3)], "position": position}
+        print(SAMPLES + json.dumps(told), file=sys.stderr, flush=True)
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Judge an uploaded description, or write one from an uploaded URDF, as a separate program within limits.
+"""Judge or draw an uploaded description, or write one from an uploaded URDF, as a separate program within limits.
 
 The daemon has loaded a description by then, within the limits of size; this process does the computations on its
 model. Of a URDF it has looked at nothing.
@@ -6,6 +6,7 @@ model. Of a URDF it has looked at nothing.
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 import xml.etree.ElementTree as ET
@@ -15,13 +16,14 @@ from typing import Any, Final
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, IdentError, ModelError, Problem
 from ident_service.model.limited_process import answer_within, run_limited_process
+from ident_service.registry.arms import DRAWN_LIST
 
 MOST_MEMORY: Final = 2 * 2**30  # bytes of address space
 MOST_SECONDS: Final = 20  # s of CPU time; ordinary arms take one
 _NEW_SECONDS: Final = 60  # s of CPU time; ordinary arms take five
 _DEADLINE = 60.0  # s
 _MODULE: Final = "ident_service.operations.description_process"
-_NEW = "new"  # the word for the second thing
+_NEW, _DRAW = "new", "draw"  # the words for the second thing, and the third
 
 
 def judge_apart(path: Path) -> dict[str, Any]:
@@ -67,6 +69,47 @@ def describe_apart(path: Path, name: str) -> dict[str, Any]:
     return answer
 
 
+def draw_apart(path: Path, meshes: Path, out: Path) -> None:
+    """Make triangles of an uploaded arm's meshes in a separate process: `OUT/JOINT.f32`, and `drawn.json` beside them.
+
+    Args:
+        path: of the description.
+        meshes: folder of its meshes.
+        out: folder that is made.
+
+    Raises:
+        ModelError: it takes too long or crashes.
+    """
+    try:
+        answer = run_limited_process(_MODULE, path, 3.0 * _DEADLINE, _DRAW, str(meshes), str(out))
+    except ModelError as error:
+        raise ModelError(f"the meshes: {error}") from None
+    if (error_text := answer.get("error")) is not None:
+        raise ModelError(error_text)
+
+
+def _drawn_document(path: Path, meshes: Path, out: Path) -> dict[str, Any]:
+    """Write triangles as little-endian 32-bit floats, nine each, in the frames of joints."""
+    from ident_service.config.load import load_arm
+    from ident_service.model.arm_model import arm_model
+    from ident_service.model.chain import Array
+    from ident_service.model.drawn_meshes import joint_triangles
+
+    try:
+        config = load_arm(path, upload=True)
+        drawn, left = dict[int, Array](), ["meshes are drawn of a URDF only"]
+        if (urdf := config.kinematics.urdf) is not None:
+            drawn, left = joint_triangles(urdf, config.kinematics, arm_model(config).chain, meshes)
+        out.mkdir()
+        for joint, corners in drawn.items():
+            (out / f"{joint}.f32").write_bytes(corners.astype("<f4").tobytes())
+        told = {"joints": {str(joint): len(corners) for joint, corners in drawn.items()}, "notes": left}
+        (out / DRAWN_LIST).write_text(json.dumps(told), encoding="utf-8")
+    except (IdentError, OSError, UnicodeError) as error:
+        return {"error": str(error).replace(f"{path.parent}/", "")}
+    return {}
+
+
 def _document(path: str) -> dict[str, Any]:
     from ident_service.operations.description_check import check_description, description_text
 
@@ -110,23 +153,24 @@ def _require_own_meshes(source: Path) -> None:
     Raises:
         ModelError: not a URDF, or larger than one is.
     """
-    from ident_service.model.mechanism import count_mechanism
+    from ident_service.model.drawn_meshes import SAFE_MESHES
+    from ident_service.model.mechanism import count_mechanism, parse_xml
 
     text = source.read_text(encoding="utf-8")
     count_mechanism(TextFile(name=source.name, text=text), "urdf")
-    try:
-        robot = ET.fromstring(text)  # noqa: S314 - counted just now
-    except ET.ParseError as error:
-        raise ModelError(f"{source.name}: not well-formed XML: {error}") from None
+    robot = parse_xml(text)
     for mesh in robot.iter("mesh"):
-        mesh.set("filename", re.split(r"[/\\]", mesh.get("filename", ""))[-1])
+        name = re.split(r"[/\\]", mesh.get("filename", ""))[-1]
+        mesh.set("filename", name if Path(name).suffix.lower() in SAFE_MESHES else "")
     source.write_text(ET.tostring(robot, encoding="unicode"), encoding="utf-8")
 
 
 def main(words: list[str]) -> int:
-    """Judge the description file that the first argument names, or describe the URDF there."""
+    """Judge or draw the description file that the first argument names, or describe the URDF there."""
     if words[1:2] == [_NEW]:
         return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _new_document(Path(words[0]), words[2]))
+    if words[1:2] == [_DRAW]:
+        return answer_within(MOST_MEMORY, _NEW_SECONDS, lambda: _drawn_document(*map(Path, (words[0], *words[2:]))))
     return answer_within(MOST_MEMORY, MOST_SECONDS, lambda: _document(words[0]))
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ident_service.config.kinematics import angles_barely_rounded
 from ident_service.config.load import load_arm
 from ident_service.config.motion_design import BASE
 from ident_service.config.motion_limits import motion_limits
+from ident_service.config.quantities import TextFile
 from ident_service.config.yaml_source import MODELINE, SCHEMA, arm_schema_file
 from ident_service.errors import ModelError, MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
@@ -29,7 +31,7 @@ from ident_service.model.base_parameters import base_parameters, remarks_on_angl
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
 from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_file_bodies
-from ident_service.model.mechanism import read_mechanism
+from ident_service.model.mechanism import parse_xml, read_mechanism
 from ident_service.model.outline import FileLimits, Source, arm_capsules, arm_part, read_source
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
@@ -349,6 +351,12 @@ def _part_remark(model: ArmModel, draft: Draft) -> list[str]:
     return [f"the arm: {ends}{more} (change it with --base and --tip)"]
 
 
+def _joint_angles(urdf: TextFile) -> Iterator[float]:
+    """Yield the angles [rad] of the joints' frames of a URDF that was read."""
+    for origin in parse_xml(urdf.text).iterfind("joint/origin"):
+        yield from (float(angle) for angle in origin.get("rpy", "").split())
+
+
 def _joints(draft: Draft, model: ArmModel, said: Mapping[str, FileLimits]) -> None:
     """Set the limits of every joint: the file's, else guesses; torque limits that can hold the arm."""
     chain = model.chain
@@ -362,7 +370,10 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, FileLimits]) -> No
     model = replace(model, prior=likely.delta)
     masses = [float(likely.delta[model.layout.inertial(link)][-1]) for link in range(chain.joints)]
     draft.total_mass = short(2.0 * sum(masses), 3)
-    if model.config.kinematics.urdf is not None and remarks_on_angles(base_parameters(chain, model.layout)):
+    urdf = model.config.kinematics.urdf
+    if urdf is not None and (
+        angles_barely_rounded(_joint_angles(urdf)) or remarks_on_angles(base_parameters(chain, model.layout))
+    ):
         draft.part["snap"] = True
         draft.remarks.append(
             "kinematics: the URDF's angles are rounded multiples of 15 degrees; they are taken as exact"

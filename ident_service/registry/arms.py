@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
@@ -26,8 +26,10 @@ from ident_service.results.manifest import atomic_folder
 
 DESCRIPTIONS: Final = "descriptions"
 ARM_FILE: Final = "arm.yaml"
+DRAWN_LIST: Final = "drawn.json"  # `joints`: number of triangles by the number of the joint; `notes`: what has none
 MOST_BYTES: Final = 8 * 2**20  # of a description and its files together
 _MOST_FILES = 16
+_DRAWN = "drawn"  # folder of a description
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -120,6 +122,7 @@ def add_arm(
     *,
     replace: bool = False,
     judge: Callable[[Path], object] = lambda _: None,
+    draw: Callable[[Path, Path], object] | None = None,
 ) -> KnownArm:
     """Add an uploaded description; a replaced one of the same name stays on the disk.
 
@@ -131,6 +134,7 @@ def add_arm(
         by: who.
         replace: whether it may take the place of another of its name, a shipped one included.
         judge: raises where something is wrong with the arm of a description that was not known; it takes seconds.
+        draw: makes, of a description, the folder with what viewers draw of it (`drawn_meshes`); None without meshes.
 
     Raises:
         AlreadyThere: its name is taken by another description.
@@ -140,15 +144,22 @@ def add_arm(
     with uploaded(state, text, files) as path:
         config = load_arm(path, upload=True)
         _require_free(db, config, replace=replace)
-        folder = state / DESCRIPTIONS / f"{config.name}-{config.sha256[:16]}"
+        folder = _description_folder(state, config.name, config.sha256)
         if not folder.exists():
             judge(path)
+        drawn = path.parent / _DRAWN
+        if draw is not None:
+            draw(path, drawn)
         with db.transaction():  # so that deleting or adding the same arm happens before or after
             _require_free(db, config, replace=replace)
             if not folder.exists():
                 with atomic_folder(folder) as built:
                     for part in path.parent.iterdir():
-                        shutil.copyfile(part, built / part.name)
+                        if part.is_file():
+                            shutil.copyfile(part, built / part.name)
+            if draw is not None:
+                shutil.rmtree(folder / _DRAWN, ignore_errors=True)
+                drawn.rename(folder / _DRAWN)
             db.write(
                 "INSERT INTO arms VALUES (?, ?, ?, 'uploaded', ?, ?, 0, ?, ?) ON CONFLICT (name) DO UPDATE SET "
                 "sha256 = excluded.sha256, description = excluded.description, source = excluded.source, "
@@ -159,6 +170,38 @@ def add_arm(
             )
             note(db, by, "arm added", config.name, sha256=config.sha256)
     return KnownArm(config.name, folder / ARM_FILE, config, "uploaded")
+
+
+def _description_folder(state: Path, name: str, sha256: str) -> Path:
+    return state / DESCRIPTIONS / f"{name}-{sha256[:16]}"
+
+
+def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
+    """Return what can be drawn of an arm by `mesh_file`: `joints` and `notes`, empty where no meshes came with it."""
+    try:
+        text = (_description_folder(state, config.name, config.sha256) / _DRAWN / DRAWN_LIST).read_text("utf-8")
+    except FileNotFoundError:
+        return {"joints": {}, "notes": []}
+    told: dict[str, Any] = json.loads(text)
+    return told
+
+
+def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:
+    """Return the triangles that stand still in a joint's frame [m]: nine 32-bit floats each, little-endian.
+
+    Args:
+        state: the state folder.
+        arm: its name.
+        sha256: of its description; the first 16 digits count.
+        joint: its number; -1 for the base.
+
+    Raises:
+        UnknownId: there are none.
+    """
+    try:
+        return (_description_folder(state, arm, sha256) / _DRAWN / f"{joint}.f32").read_bytes()
+    except FileNotFoundError:
+        raise UnknownId(f"no meshes of {arm} and its joint {joint} are known; see the arm's view") from None
 
 
 def _require_free(db: Database, config: ArmConfig, *, replace: bool) -> None:

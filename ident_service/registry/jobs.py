@@ -24,6 +24,7 @@ from ident_service.registry.database import Database, Row
 STATES: Final = ("queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted")
 KEY_SECONDS: Final = 24 * 3600.0
 LIVE: Final = ("queued", "running")
+SAMPLES: Final = "\x1e"  # before a line of a job's log that is a sample, as JSON text sequences have it (RFC 7464)
 
 
 def add_job(

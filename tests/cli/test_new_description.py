@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -17,12 +19,14 @@ from model.test_locked_joints import PANDA, joint, link
 
 from ident_service.cli import main
 from ident_service.config.arm import ArmConfig
+from ident_service.config.kinematics import angles_barely_rounded
 from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.errors import ModelError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model, control_model
+from ident_service.model.base_parameters import base_parameters
 from ident_service.model.likely_bodies import perturbed_body
 from ident_service.model.outline import (
     Outline,
@@ -369,12 +373,30 @@ def test_all_that_no_urdf_says_is_told_and_written(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
-def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rounded = BARS.replace('xyz="0.4 0 0" rpy="0 0 0"', 'xyz="0.4 0 0" rpy="1.5708 0 0"')
+@pytest.mark.parametrize("angle", ["1.5708", "1.570796327"])  # a base parameter more; coefficients of 1e-10
+def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str], angle: str) -> None:
+    rounded = BARS.replace('xyz="0.4 0 0" rpy="0 0 0"', f'xyz="0.4 0 0" rpy="{angle} 0 0"')
     assert rounded != BARS
     config, said = described(tmp_path, rounded, capsys)
     assert config.kinematics.snap == ("rounded multiples" in said)
     assert config.kinematics.snap
+    model = arm_model(config)
+    assert not any(re.search(r"\de-\d", one) for one in base_parameters(model.chain, model.layout).expressions)
+
+
+@pytest.mark.parametrize(
+    ("angles", "rounded"),
+    [
+        ((math.pi / 2, 0.0, -3.0 * math.pi / 4, 0.4), False),  # exact already
+        ((1.570796327, 0.0, 0.4), True),
+        ((3.1416, -0.261799), True),
+        ((1.570796327, 0.0004), False),  # the second is calibrated, so the first may be, too
+        ((0.4, 1.0), False),
+        ((), False),
+    ],
+)
+def test_angles_are_called_rounded_where_all_of_them_may_be(angles: tuple[float, ...], rounded: bool) -> None:
+    assert angles_barely_rounded(angles) == rounded
 
 
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import os
@@ -15,8 +16,10 @@ from daemon.conftest import Asked, checked_before, known_arm, patient_text, quic
 from daemon.verbs_bench import with_run
 
 from ident_service.daemon.dependencies import Service
+from ident_service.daemon.jobs.outcome import told_samples
 from ident_service.daemon.jobs.queue import Progress
 from ident_service.daemon.jobs.requests import Run
+from ident_service.daemon.live_stream import live_events
 from ident_service.daemon.routes.jobs import job_answer_document
 from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.registry import jobs as rows
@@ -206,6 +209,44 @@ def test_what_only_looks_needs_no_word(
     ended = daemon.follow(job["id"])
     assert ended["state"] == state_of_it, ended
     assert key in daemon.get(f"/api/v1/jobs/{job['id']}/result").json()["answer"]
+
+
+def test_positions_of_an_arm_at_rest_are_told_while_they_are_read(daemon: Asked, arm: str, tmp_path: Path) -> None:
+    job = daemon.begin({"kind": "watch", "arm": arm, "seconds": 0.5})
+    assert daemon.follow(job["id"])["state"] == "done"
+    row = rows.known_job(daemon.service.db, job["id"])
+
+    async def events() -> list[str]:
+        return [one async for one in live_events(daemon.service, daemon.app.state.live, row)]
+
+    told = [json.loads(one.partition("data: ")[2]) for one in asyncio.run(events()) if one.startswith("event: samples")]
+    assert [one["time"] for one in told] == [[pytest.approx(0.1 * k, abs=1e-3)] for k in range(5)]
+    joints = daemon.get(f"/api/v1/jobs/{job['id']}/result").json()["answer"]["joints"]
+    for one in told:
+        assert one["joints"] == [joint["joint"] for joint in joints]
+        for (position,), joint in zip(one["position"], joints, strict=True):
+            assert joint["lowest"] - 1e-6 <= position <= joint["highest"] + 1e-6
+    assert "position" not in daemon.get(f"/api/v1/jobs/{job['id']}/log").text
+    # A line that is being written is told when it is whole.
+    log = (daemon.service.state / "jobs" / job["id"] / "log").read_bytes()
+    (tmp_path / "log").write_bytes(log[:-10])
+    first, offset = told_samples(tmp_path, 0)
+    (tmp_path / "log").write_bytes(log)
+    rest, end = told_samples(tmp_path, offset)
+    assert (first, rest, end) == (told[:-1], told[-1:], len(log))
+
+
+def test_why_an_arm_could_not_be_read_stands_on_its_page(daemon: Asked, arm: str) -> None:
+    for state, detail in (("done", ""), ("failed", "the drive of elbow does not answer"), ("queued", "")):
+        name = f"j-{state}"
+        rows.add_job(daemon.service.db, name, "watch", arm, {}, [], "me", motion=False, run=None)
+        if state != "queued":
+            rows.ended(daemon.service.db, name, state, detail, 1)
+    assert "It could not be read at" in (page := daemon.get(f"/arms/{arm}").text)
+    assert "the drive of elbow does not answer" in page
+    rows.add_job(daemon.service.db, "j-later", "watch", arm, {}, [], "me", motion=False, run=None)
+    rows.ended(daemon.service.db, "j-later", "done", "", 0)
+    assert "It could not be read" not in daemon.get(f"/arms/{arm}").text
 
 
 @pytest.mark.timeout(300)

@@ -43,9 +43,9 @@ def blocks(page: str, language: str = "") -> list[str]:
 
 def commands() -> Iterator[list[str]]:
     """The words of each `ident ...` in a block, without what a shell makes of the rest."""
-    for block in blocks("service.md"):
+    for block in blocks("service.md", "sh"):
         for line in block.replace("\\\n", " ").splitlines():
-            words = shlex.split(line, comments=True)
+            words = shlex.split(line.replace(" &", ""), comments=True)
             while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
                 words.pop(0)
             if words[:3] == ["sudo", "-u", "ident"]:

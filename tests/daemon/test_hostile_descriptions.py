@@ -105,15 +105,22 @@ def test_few_descriptions_are_checked_at_a_time(daemon: Asked) -> None:
 
 
 @pytest.mark.parametrize(
-    "named", ["/etc/passwd", "../../secret.stl", "package://robot/meshes/arm.stl", "C:\\m\\arm.stl"]
+    ("named", "read"),
+    [
+        ("/etc/passwd", ""),
+        ("arm.gltf", ""),  # which may take its corners from any file
+        ("../../secret.stl", "secret.stl"),
+        ("package://robot/meshes/arm.STL", "arm.STL"),
+        ("C:\\m\\arm.obj", "arm.obj"),
+    ],
 )
-def test_meshes_of_an_uploaded_urdf_are_those_beside_it(tmp_path: Path, named: str) -> None:
+def test_meshes_of_an_uploaded_urdf_are_those_beside_it(tmp_path: Path, named: str, read: str) -> None:
     urdf = tmp_path / "robot.urdf"
     mesh = f'<collision><geometry><mesh filename="{named}"/></geometry></collision>'
     urdf.write_text(f'<robot name="r"><link name="base">{mesh}</link></robot>')
     _require_own_meshes(urdf)
     (found,) = ET.fromstring(urdf.read_text()).iter("mesh")  # noqa: S314 - written above
-    assert found.get("filename") == named.replace("\\", "/").rpartition("/")[2]
+    assert found.get("filename") == read
 
 
 def test_a_urdf_that_could_break_its_parser_is_refused(tmp_path: Path) -> None:

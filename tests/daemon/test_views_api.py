@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from daemon.conftest import Asked
+from helpers.meshes import threelink
 
 from ident_service.config.load import load_arm
 from ident_service.daemon.routes.views import ViewAnswer
@@ -95,6 +97,52 @@ def test_a_recording_is_thinned_and_keeps_its_ends(wam: ArmModel, tmp_path: Path
     assert time[0] == 0.0
     assert time[-1] == pytest.approx(0.01 * (count - 1), abs=0.02)
     np.testing.assert_allclose(position, np.outer(1e-2 * time, np.ones(7)), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_meshes_that_came_with_an_arm_are_drawn(daemon: Asked, viewer: str) -> None:
+    text, urdf, meshes = threelink("crane")
+    sent = {"description": text, "files": {"threelink.urdf": urdf}}
+    assert daemon.post("/api/v1/arms", sent).json()["objections"] == []
+    view = "/api/v1/arms/crane/view"
+    assert daemon.get(view).json()["figure"]["meshes"] == []
+    # The same description again, now with its meshes.
+    coded = {name: b64encode(content).decode() for name, content in meshes.items()}
+    again = daemon.post("/api/v1/arms", {**sent, "meshes": coded})
+    assert (again.status_code, again.json()["objections"]) == (201, None), again.text
+    told = ViewAnswer.model_validate(daemon.get(view).json())
+    assert [(one.owner, one.joint, one.triangles) for one in told.figure.meshes] == [
+        ("waist", 0, 12),
+        ("shoulder", 1, 12),
+        ("slide", 2, 24),
+    ]
+    assert told.notes == ["threelink.urdf: link 'base' has parts without a mesh; capsules are shown"]
+    assert {one.joint for one in told.figure.bodies} == {-1, 0, 1, 2}  # distances are of these still
+    daemon.as_token(viewer)
+    for one in told.figure.meshes:
+        answer = daemon.get(one.source)
+        assert (answer.status_code, answer.headers["content-type"]) == (200, "application/octet-stream")
+        corners = np.frombuffer(answer.content, "<f4").reshape(one.triangles, 3, 3)
+        assert 0.01 < np.ptp(corners.reshape(-1, 3), axis=0).min() <= np.ptp(corners.reshape(-1, 3), axis=0).max() < 0.5
+    place, _, sha256 = told.figure.meshes[0].source.removesuffix("/0").rpartition("/")
+    for path, status in (
+        (f"{place}/{sha256}/-1", 404),
+        (f"{place}/{sha256}/drawn.json", 422),
+        (f"{place}/{64 * 'a'}/0", 422),
+        (f"{place}/..%2F..%2F{sha256}/0", 404),
+        (f"/api/v1/arms/planar2/meshes/{sha256}/0", 404),
+    ):
+        assert daemon.get(path).status_code == status, path
+
+
+def test_an_arm_is_not_stored_where_its_meshes_are_none(daemon: Asked) -> None:
+    text, urdf, _ = threelink("crane")
+    sent = {"description": text, "files": {"threelink.urdf": urdf}, "meshes": {"column.stl": "no base 64"}}
+    answer = daemon.post("/api/v1/arms", sent)
+    assert (answer.status_code, answer.json()["error"]["message"]) == (400, "'column.stl': its content is not base 64")
+    for name in ("../column.stl", "a/b.stl", ".stl"):
+        assert daemon.post("/api/v1/arms", {**sent, "meshes": {name: ""}}).status_code == 422
+    assert daemon.get("/api/v1/arms/crane").status_code == 404
 
 
 def test_answers_of_the_routes(daemon: Asked, wam: ArmModel, commissioned: Path) -> None:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from documents.walk import PORT, ROOT, Block, blocks, script, walk
+from documents.walk import BLOCK, PORT, ROOT, Block, blocks, script, walk
 
 from ident_service.motion.faults import FAULTS, HOLD, LOWER, LOWER_AFTER, Reaction
 from ident_service.motion.state_machine import TRANSITIONS
@@ -24,7 +24,12 @@ WALKS = (
         "reference/command-line.md",
     ),
     ("your-own-arm.md", "commissioning.md"),
+    (
+        *("tutorial.md", "identify-recordings.md", "recordings.md", "ros.md", "service.md", "fleet.md"),
+        "extending.md",
+    ),
 )
+NIGHTLY = WALKS[2:]  # the first pages of it are walked with the others
 REACTIONS = {
     "Warning": Reaction.WARN,
     "Controlled stop": Reaction.CONTROLLED_STOP,
@@ -40,7 +45,13 @@ def text(page: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("pages", WALKS, ids=lambda pages: Path(pages[0]).stem)
+@pytest.mark.parametrize(
+    "pages",
+    [
+        pytest.param(pages, marks=pytest.mark.campaign if pages in NIGHTLY else (), id=Path(pages[-1]).stem)
+        for pages in WALKS
+    ],
+)
 def test_the_commands_of_the_pages_run(pages: tuple[str, ...], tmp_path: Path) -> None:
     done = walk([DOCS / page for page in pages], tmp_path)
     assert done.returncode == 0, done.stdout[-3000:]
@@ -66,16 +77,28 @@ def test_every_page_with_commands_is_walked() -> None:
     assert with_commands <= {page for pages in WALKS for page in pages}
 
 
+def test_commands_stand_in_blocks_that_are_walked() -> None:
+    command = re.compile(r"(?m)^(?:ident|make|pip|sudo|systemctl|podman|ros2|dask|ip) .*")
+    for path in sorted(DOCS.rglob("*.md")):
+        for found in BLOCK.finditer(path.read_text(encoding="utf-8")):
+            if found["language"] != "sh":
+                assert command.findall(found["text"]) == [], path
+    skipped = re.findall(r"walk: skip, (?:needs|the test) ", "".join(map(Path.read_text, DOCS.rglob("*.md"))))
+    assert len(skipped) == "".join(map(Path.read_text, DOCS.rglob("*.md"))).count("walk: skip")  # each says why
+
+
 def test_a_walk_ends_at_the_first_command_that_does_not_end_as_its_page_says(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(
         "```sh\ntrue\nfalse # exit code 1: no\n(exit 3) # exit code 0 or 3\n```\n\n"
-        "<!-- walk: skip, it is for people -->\n```sh\nexit 9\n```\n\n```yaml\n# a.yaml\nb: 1\n```\n\n"
+        "<!-- walk: skip, it is for people -->\n```sh\nexit 9\n```\n\n"
+        "<!-- walk: first echo made -->\n```yaml\n# a.yaml\nb: 1\n```\n\n"
         "<!-- file: c.json -->\n```json\n{}\n```\n\n```sh\ncat a.yaml \\\n  c.json\nfalse\necho not reached\n```\n"
     )
     done = subprocess.run(["bash", "-c", script([page])], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 1
-    assert done.stderr == "page.md:25: false: exit code 1 instead of 0\n"
+    assert done.stderr == "page.md:26: false: exit code 1 instead of 0\n"
+    assert "made\n" in done.stdout
     assert "# a.yaml\nb: 1\n{}\n" in done.stdout
     assert "not reached" not in done.stdout
     assert list(blocks("```text\nx\n```\n```yaml\nkey: 1\n```\n")) == []

@@ -5,8 +5,9 @@
 
 A page is a script. Blocks of `sh` and Python are run in their order. A block whose first line is a comment with the
 name of a file, or that stands behind `<!-- file: NAME -->`, is that file. `# exit code 3` behind a command says what it
-ends with, `0 or 3` that both are right. A block behind `<!-- walk: skip, WHY -->` is for people only. `make` makes the
-environment, so its lines are left to `--clean`. A URDF, `robot.urdf`, is at hand, as a newcomer's is.
+ends with, `0 or 3` that both are right. A block behind `<!-- walk: skip, WHY -->` is for people only; before one behind
+`<!-- walk: first COMMAND -->`, that command makes what a reader has already. `make` makes the environment, so its lines
+are left to `--clean`. A URDF, `robot.urdf`, is at hand, as a newcomer's is.
 """
 
 from __future__ import annotations
@@ -40,12 +41,13 @@ PORT = "8470"  # of the daemon in the documents
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a document: its language, its text, and the line that it begins in."""
+    """A block of a document: its language, its text, the line that it begins in, its file, and what is done before."""
 
     language: str
     text: str
     line: int
     file: str | None = None
+    first: str = ""
 
 
 def blocks(page: str) -> Iterator[Block]:
@@ -56,7 +58,8 @@ def blocks(page: str) -> Iterator[Block]:
             continue
         named = re.match(r"file: (\S+)$", mark) or re.match(r"# ([\w-]+\.(?:yaml|csv|json))\n", text)
         if named or language in ("sh", "python"):
-            yield Block(language, text, page.count("\n", 0, found.start("text")) + 1, named[1] if named else None)
+            line, first = page.count("\n", 0, found.start("text")) + 1, mark.partition("walk: first ")[2]
+            yield Block(language, text, line, named[1] if named else None, first)
 
 
 def lines_of(text: str) -> Iterator[tuple[int, str]]:
@@ -87,6 +90,8 @@ def script(pages: Sequence[Path]) -> str:
 
 def _commands(block: Block, page: str) -> Iterator[str]:
     """Yield the commands of one block."""
+    if block.first:
+        yield f"{block.first}\nended $? 0 {shlex.quote(f'{page}:{block.line}: {block.first}')}"
     if block.file is not None or block.language == "python":
         name = block.file or f"{page}-{block.line}.py"
         yield f"cat > {shlex.quote(name)} <<'END_OF_BLOCK'\n{block.text}END_OF_BLOCK"

@@ -10,9 +10,11 @@ import pytest
 from daemon.conftest import commissioned as commissioned
 from daemon.conftest import quick_text
 from helpers.browser import chromium_program
+from helpers.meshes import threelink
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
 
+from ident_service.operations.description_process import _drawn_document
 from ident_service.operations.run_archive import import_run
 from ident_service.registry.arms import add_arm
 
@@ -40,6 +42,13 @@ async () => {
 """
 
 
+LOOK = """() => {
+  const canvas = document.getElementById("viewer-canvas");
+  for (const key of ["ArrowLeft", "ArrowRight"]) canvas.dispatchEvent(new KeyboardEvent("keydown", { key }));
+  return canvas.toDataURL();
+}"""
+
+
 @pytest.fixture(scope="module")
 def shown(
     browser: Browser, tmp_path_factory: pytest.TempPathFactory, commissioned: Path
@@ -64,8 +73,8 @@ def page(shown: tuple[Browser, Reached, str]) -> Iterator[Page]:
     said = list[str]()
 
     def hear(message: ConsoleMessage) -> None:
-        # Chromium warns of its own slowness when pixels are read, and names the answer that a test refuses.
-        if message.type in ("error", "warning") and not any(one in message.text for one in ("GPU stall", "409")):
+        # Chromium warns of its own slowness when pixels are read, and names the answers that tests refuse.
+        if message.type in ("error", "warning") and not any(one in message.text for one in ("GPU stall", "409", "404")):
             said.append(message.text)
 
     page.on("console", hear)
@@ -80,9 +89,9 @@ def drawn(page: Page) -> int:
     return int(page.evaluate(PIXELS))
 
 
-def confirm_page(page: Page, reached: Reached, kind: str = "run") -> None:
+def confirm_page(page: Page, reached: Reached, kind: str = "run", arm: str = ARM) -> None:
     """Ask for a motion as the page of the arm does, whichever of its steps comes next."""
-    page.goto(f"{reached.url}/arms/{ARM}")
+    page.goto(f"{reached.url}/arms/{arm}")
     with page.expect_navigation():
         page.evaluate(
             """([address, kind]) => {
@@ -92,7 +101,7 @@ def confirm_page(page: Page, reached: Reached, kind: str = "run") -> None:
               document.body.append(form);
               form.submit();
             }""",
-            [f"/arms/{ARM}/confirm", kind],
+            [f"/arms/{arm}/confirm", kind],
         )
     page.get_by_label("Type the arm's name").wait_for()
 
@@ -103,6 +112,11 @@ def test_a_motion_is_seen_before_it_is_made(shown: tuple[Browser, Reached, str],
     page.locator("#viewer-controls").wait_for()
     expect(page.get_by_label("Type the arm's name")).to_be_focused()  # the viewer takes nothing from the question
     assert drawn(page) > 50
+    picture, slider = (page.locator(f"#viewer-{name}").bounding_box() for name in ("canvas", "controls"))
+    assert picture is not None
+    assert slider is not None
+    assert picture["width"] == pytest.approx(slider["width"], abs=2)  # as wide as the page lets it be
+    assert picture["height"] > 300
     view = page.evaluate(f"fetch('/api/v1/arms/{ARM}/view?motion=own').then((answer) => answer.json())")
     end, near = view["time"][-1], view["clearance"]["itself"]["distance"]
     at = page.locator("#viewer-at")
@@ -148,7 +162,7 @@ def test_distances_are_told_while_the_arm_is_on_its_way(shown: tuple[Browser, Re
       joints, time: [1.5], position: posture.map((value) => [0, value]) } }))"""
     joints = [joint["name"] for joint in view["figure"]["joints"]]
     page.evaluate(tell, [joints, posture])
-    expect(page.locator("#viewer-status")).to_have_text("As measured, 1.5 s after the recording began.")
+    expect(page.locator("#viewer-status")).to_have_text("As measured, 1.5 s after the beginning.")
     pair = view["clearance"]["pairs"][near["pair"][row]]
     expect(page.locator("#viewer-itself")).to_have_text(f"{1000 * near['distance'][row]:.0f} mm, {pair}")
     expect(page.locator("#viewer-distances")).to_be_visible()
@@ -191,6 +205,34 @@ def test_the_browser_places_joints_as_the_service_does(shown: tuple[Browser, Rea
         matrix = np.array(entries).reshape(4, 4).T
         np.testing.assert_allclose(matrix[:3, :3], turns[0, k], atol=1e-4)
         np.testing.assert_allclose(matrix[:3, 3], places[0, k], atol=1e-4)
+
+
+def test_meshes_cover_the_capsules_that_distances_are_of(
+    shown: tuple[Browser, Reached, str], page: Page, tmp_path: Path
+) -> None:
+    _, reached, _ = shown
+    text, urdf, meshes = threelink("crane")
+    for name, content in meshes.items():
+        (tmp_path / name).write_bytes(content)
+    add_arm(
+        *(reached.service.db, reached.service.state, text, {"threelink.urdf": urdf}, "test"),
+        draw=lambda path, out: _drawn_document(path, tmp_path, out),
+    )
+    confirm_page(page, reached, arm="crane")
+    box = page.get_by_label("Show what distances are of")
+    expect(page.locator("#viewer-status")).to_contain_text("link 'base' has parts without a mesh; capsules are shown")
+    expect(box).not_to_be_checked()
+    looks = []
+    for wanted in (False, True, False):
+        box.set_checked(wanted)
+        looks.append(page.evaluate(LOOK))
+    assert looks[0] == looks[2] != looks[1]
+    # An arm without meshes does not offer them; one whose meshes do not come keeps its capsules.
+    page.route("**/meshes/**", lambda route: route.fulfill(status=404, json={}))
+    confirm_page(page, reached, arm="crane")
+    expect(page.locator("#viewer-status")).to_contain_text("base")
+    assert page.evaluate(LOOK) == looks[1]
+    expect(box).to_be_hidden()
 
 
 def test_without_webgl_times_and_distances_stay(shown: tuple[Browser, Reached, str], page: Page) -> None:

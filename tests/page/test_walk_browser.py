@@ -18,6 +18,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.conftest import commissioned as commissioned
+from helpers.meshes import threelink
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, Response, expect
 
@@ -208,6 +209,21 @@ def test_the_pages_of_a_motion_are_whole_before_and_while_the_arm_moves(browser:
     assert found == []
 
 
+def test_the_report_has_no_findings_with_all_unfolded(browser: Browser, story: Story) -> None:
+    page = log_in(browser, story.reached)
+    told, found = heard(page), list[str]()
+    run = story.pages["simulation"].rpartition("/")[2]
+    page.goto(f"{story.reached.url}/api/v1/runs/{run}/report.html")
+    page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    axe = Axe()
+    for width, scheme, options in ((400, "dark", {"resultTypes": ["violations"]}), (1280, "light", COLOURS)):
+        page.set_viewport_size({"width": width, "height": 860})
+        page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        found += [f"{width} px, {scheme}: {one}" for one in violations(axe, page, options)]
+    assert found + told.words == []
+
+
 def test_pages_without_a_login_are_whole(browser: Browser, state: Path) -> None:
     with listening(state) as reached:
         page = browser.new_context().new_page()
@@ -330,20 +346,29 @@ def test_runs_are_sorted_filtered_and_overlaid(browser: Browser, story: Story) -
 
 
 def test_a_urdf_becomes_an_arm(browser: Browser, story: Story, tmp_path: Path) -> None:
-    from ident_service.config.load import shipped_arms
-
-    urdf = shipped_arms()["threelink"].with_name("threelink.urdf")
+    _, urdf, meshes = threelink()
+    # As makers lay them out: files of one name for collisions and for looks, of which the URDF names the folder.
+    for name, content in {
+        "threelink.urdf": urdf.encode(),
+        "meshes/collision/column.stl": b"",
+        **{f"meshes/visual/{name}": content for name, content in meshes.items()},
+    }.items():
+        (tmp_path / "crane" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "crane" / name).write_bytes(content)
     page = log_in(browser, story.reached)
     page.goto(f"{story.reached.url}/new")
-    page.get_by_label("URDF and meshes").set_input_files(urdf)
+    page.get_by_label("or the folder that they are in").set_input_files(tmp_path / "crane")
     expect(page.get_by_label("Name of the arm")).to_have_value("threelink")
     page.get_by_label("Name of the arm").fill("crane")
     page.get_by_role("button", name="Describe").click()
     expect(page.locator("#describe-status")).to_contain_text("Described", timeout=60_000)
     assert "name: crane" in page.locator("#description").input_value()
+    expect(page.locator("#with-files")).to_contain_text("threelink.urdf, column.stl, arm.obj, boom.dae")
     page.get_by_role("button", name="Add", exact=True).click()
     page.wait_for_url("**/arms/crane")
     expect(page.locator(".badges")).to_contain_text("simulated")
+    view = page.evaluate("fetch('/api/v1/arms/crane/view').then((answer) => answer.json())")
+    assert [one["owner"] for one in view["figure"]["meshes"]] == ["waist", "shoulder", "slide"]
     page.goto(f"{story.reached.url}/new")
     page.locator("#description").fill("format: ident-arm\nnonsense: 1\n")
     page.get_by_role("button", name="Add", exact=True).click()

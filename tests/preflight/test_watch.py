@@ -91,7 +91,7 @@ def test_it_says_what_it_saw() -> None:
 
 def test_every_sample_is_told_and_watching_ends_when_asked() -> None:
     told: list[int] = []
-    seen = watch(OnlyLooked(), 60.0, lambda sample: told.append(sample.cycle), stop_requested=lambda: len(told) == 7)
+    seen = watch(OnlyLooked(), 60.0, lambda _, sample: told.append(sample.cycle), stop_requested=lambda: len(told) == 7)
     assert told == list(range(7))
     assert seen.cycles == 7
 

@@ -87,6 +87,12 @@ def test_the_top_is_the_assessment(good: Made) -> None:
     assert ["open" in attributes for attributes in folds] == [True, *[False] * (len(ORDER) - 2)]
 
 
+def test_no_two_columns_of_a_table_have_one_name(good: Made) -> None:
+    tables = [[cell.words for cell in one.one("thead").all("th")] for one in parsed(good.page).all("table")]
+    assert any("fitted, moving [%]" in heads and "unseen, moving [%]" in heads for heads in tables)
+    assert [heads for heads in tables if len(set(heads)) < len(heads)] == []
+
+
 def test_three_rows_and_figures_are_shown_and_the_others_folded(good: Made) -> None:
     table = sections(good.page)["parameters"]
     shown, folded = table.all("table")

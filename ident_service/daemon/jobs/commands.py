@@ -184,7 +184,7 @@ def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
     if isinstance(asked, LeaveLimit):
         return [path, "--leave-limit"]
     if isinstance(asked, Watch):
-        return [path, f"--seconds={asked.seconds!r}"]
+        return [path, f"--seconds={asked.seconds!r}", "--tell-samples"]
     if isinstance(asked, Check | Run | Rehearse | Preview):
         motion = [] if asked.motion is None else [str(motion_path(db, state, asked.motion))]
         if isinstance(asked, Check):

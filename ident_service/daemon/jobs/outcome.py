@@ -59,7 +59,7 @@ class ProcessOutput:
 
     Attributes:
         answer: its one JSON object; empty where it had none.
-        log: the end of its output.
+        log: the end of its output, without samples (`told_samples`).
     """
 
     answer: dict[str, Any] = field(default_factory=dict)
@@ -82,7 +82,24 @@ def said(folder: Path, most: int = _LAST) -> ProcessOutput:
             log = stream.read(most).decode("utf-8", "replace")
     except OSError:
         log = ""
-    return ProcessOutput(answer, log)
+    # Not by `splitlines`, which takes the mark of samples for the end of a line.
+    return ProcessOutput(answer, "\n".join(line for line in log.split("\n") if not line.startswith(rows.SAMPLES)))
+
+
+def told_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
+    """Return the samples that a job's process has told since an offset in its log, and the offset to go on from.
+
+    Each has `joints`, `time` [s] and `position` [rad or m] as the samples of a run have (`live.Thinned`).
+    """
+    try:
+        with (folder / LOG).open("rb") as stream:
+            stream.seek(offset)
+            piece = stream.read(_LAST)
+    except OSError:
+        return [], offset
+    whole = piece[: piece.rfind(b"\n") + 1]
+    marked = (line for line in whole.decode("utf-8", "replace").split("\n") if line.startswith(rows.SAMPLES))
+    return [json.loads(line.removeprefix(rows.SAMPLES)) for line in marked], offset + len(whole)
 
 
 def outcome(heard: ProcessOutput, exit_code: int | None, asked_to_end: str) -> Outcome:

@@ -121,7 +121,7 @@ class Watch(BaseJobRequest):
 
     kind: Literal["watch"]
     arm: ArmName
-    seconds: Annotated[float, Field(gt=0, le=60)] = 2.0
+    seconds: Annotated[float, Field(gt=0, le=600)] = 2.0
 
 
 class BusLoad(BaseJobRequest):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from base64 import b64decode
 from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 from fastapi import APIRouter
@@ -28,11 +31,11 @@ from ident_service.daemon.responses import (
     MotionAnswer,
     Page,
 )
-from ident_service.errors import MotionRefused
+from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
-from ident_service.operations.description_process import judge_apart
+from ident_service.operations.description_process import draw_apart, judge_apart
 from ident_service.registry import arms as known
 from ident_service.registry import motions
 from ident_service.registry.database import note
@@ -64,10 +67,12 @@ class Support(_Body):
 class NewArm(Description):
     """Description of an arm to be stored.
 
-    `replace` says that it may take the place of another one of its name; without it that is answered 409.
+    `replace` says that it may take the place of another one of its name; without it that is answered 409. `meshes` are
+    files that its URDF names, by the last part of their names: STL, OBJ or DAE in base 64, which only viewers draw.
     """
 
     replace: bool = False
+    meshes: Annotated[dict[FileName, str], Field(max_length=64)] = {}
 
 
 class MotionUpload(_Body):
@@ -105,13 +110,28 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> AddedArmAnswer:
     """
     text, files = body.description, body.files
     judged: dict[str, Any] = {}
-    with service.checks.place():
+    with service.checks.place(), TemporaryDirectory(prefix="ident-meshes-") as place:
+        write_files(Path(place), body.meshes)
         added = known.add_arm(
             *(service.db, service.state, text, files, who.name),
             replace=body.replace,
             judge=lambda path: judged.update(judge_apart(path)),
+            draw=(lambda path, out: draw_apart(path, Path(place), out)) if body.meshes else None,
         )
     return AddedArmAnswer(**_arm(service, added.name).model_dump(), objections=judged.get("objections"))
+
+
+def write_files(place: Path, files: dict[str, str]) -> None:
+    """Write files that came in base 64, by name.
+
+    Raises:
+        UsageError: the content of one is not base 64.
+    """
+    for name, content in files.items():
+        try:
+            (place / name).write_bytes(b64decode(content, validate=True))
+        except ValueError:
+            raise UsageError(f"{name!r}: its content is not base 64") from None
 
 
 @router.get("/arms/{arm}")

@@ -5,7 +5,6 @@ Modules that compute with mechanisms are imported only in the request, so that t
 
 from __future__ import annotations
 
-from base64 import b64decode
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,7 +17,7 @@ from ident_service.config.load import load_arm
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
 from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName
-from ident_service.daemon.routes.arms import Description
+from ident_service.daemon.routes.arms import Description, write_files
 from ident_service.errors import UsageError
 from ident_service.operations.description_process import describe_apart, judge_apart
 from ident_service.registry.arms import known_arm, uploaded
@@ -75,11 +74,7 @@ def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescript
     if body.urdf not in body.files:
         raise UsageError(f"{body.urdf!r} is not among the files; send the URDF with its meshes")
     with service.checks.place(), TemporaryDirectory(prefix="ident-new-") as place:
-        for name, content in body.files.items():
-            try:
-                (Path(place) / name).write_bytes(b64decode(content, validate=True))
-            except ValueError:
-                raise UsageError(f"{name!r}: its content is not base 64") from None
+        write_files(Path(place), body.files)
         return NewDescriptionAnswer(**describe_apart(Path(place) / body.urdf, body.name))
 
 

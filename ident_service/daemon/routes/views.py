@@ -13,10 +13,12 @@ from collections.abc import Callable
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as PathParameter
 from pydantic import BaseModel
 
+from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json, load_recording_format
-from ident_service.daemon.dependencies import Serving, Viewer
+from ident_service.daemon.dependencies import Service, Serving, Viewer
 from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.live import ARM
@@ -33,6 +35,11 @@ _MOST_BYTES: Final = 256 * 2**20  # of a recording: half a minute of reading
 OWN: Final = "own"
 Numbers = list[float]
 Speed = Annotated[float, Query(gt=0.0, le=1.0)]
+ShortHash = Annotated[str, PathParameter(pattern=r"^[0-9a-f]{16}$")]
+JointNumber = Annotated[int, PathParameter(ge=-1, lt=256)]
+_BINARY: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The triangles."},
+}
 
 
 class ViewedJoint(BaseModel):
@@ -70,12 +77,26 @@ class ViewedSolid(BaseModel):
     offset: float | None = None
 
 
+class ViewedMesh(BaseModel):
+    """Triangles to draw instead of the solids of a joint, or of the base where `joint` is -1.
+
+    `source` answers with them, in the frame of the joint [m]: nine 32-bit floats each, little-endian. Distances are
+    those of the solids.
+    """
+
+    owner: str
+    joint: int
+    triangles: int
+    source: str
+
+
 class ViewedFigure(BaseModel):
     """Arm with its surroundings; `up` is the direction against gravity, `home` a position of all joints."""
 
     arm: str
     joints: list[ViewedJoint]
     bodies: list[ViewedSolid]
+    meshes: list[ViewedMesh]
     surroundings: list[ViewedSolid]
     up: Numbers
     home: Numbers
@@ -153,7 +174,14 @@ def view_arm(
 
         return view_at_rest(config) if motion is None else view_of_motion(config, path, speed)
 
-    return _answer(request, key, make)
+    return _answer(service, request, config, key, make)
+
+
+@router.get("/arms/{arm}/meshes/{sha256}/{joint}", response_class=Response, responses=_BINARY)
+def get_mesh(service: Serving, _: Viewer, arm: ArmName, sha256: ShortHash, joint: JointNumber) -> Response:
+    """Show the triangles of a joint, or of the base (-1); `figure.meshes` of a view has the address."""
+    triangles = known.mesh_file(service.state, arm, sha256, joint)
+    return Response(triangles, media_type="application/octet-stream", headers={"Cache-Control": "private, max-age=600"})
 
 
 @router.get("/runs/{run}/view", response_model=ViewAnswer)
@@ -178,8 +206,29 @@ def view_run(service: Serving, _: Viewer, request: Request, run: Id, name: FileN
 
         return view_of_recording(config, path, form)
 
-    return _answer(request, (config.sha256, sha256), make)
+    return _answer(service, request, config, (config.sha256, sha256), make)
 
 
-def _answer(request: Request, key: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> Response:
-    return Response(request.app.state.views.document(key, make), media_type="application/json")
+def _answer(
+    service: Service, request: Request, config: ArmConfig, key: tuple[str, ...], make: Callable[[], dict[str, Any]]
+) -> Response:
+    drawn = known.drawn_meshes(service.state, config)
+
+    def whole() -> dict[str, Any]:
+        view = make()
+        names = [joint["name"] for joint in view["figure"]["joints"]]
+        place = f"/api/v1/arms/{config.name}/meshes/{config.sha256[:16]}"
+        view["figure"]["meshes"] = [
+            {
+                "owner": "base" if joint < 0 else names[joint],
+                "joint": joint,
+                "triangles": triangles,
+                "source": f"{place}/{joint}",
+            }
+            for joint, triangles in ((int(joint), triangles) for joint, triangles in drawn["joints"].items())
+        ]
+        view["notes"] = [*view["notes"], *drawn["notes"]]
+        return view
+
+    text = request.app.state.views.document((*key, json.dumps(drawn)), whole)
+    return Response(text, media_type="application/json")

@@ -387,6 +387,7 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
         facts=facts_of(config),
         joints=joint_facts(config),
         seen=_last_look(service, answer.name),
+        unread=_failed_look(service, answer.name),
         rungs=ladder(service.db, service.state, config),
         motions=known_motions.motions(service.db, answer.name),
         alarms=_alarms(service, answer.name),
@@ -493,6 +494,19 @@ def _last_look(service: Service, arm: str) -> dict[str, Any] | None:
     return {"at": job["ended"], "job": job["id"], **said(service.state / JOBS / job["id"]).answer}
 
 
+def _failed_look(service: Service, arm: str) -> dict[str, Any] | None:
+    """Return when and why the arm could not be read, if that is the newest attempt that has ended; else None."""
+    found = service.db.row(
+        "SELECT id, state, ended, detail FROM jobs WHERE arm = ? AND kind = 'watch' AND state IN ('done', 'failed') "
+        "ORDER BY number DESC LIMIT 1",
+        arm,
+    )
+    if found is None or found["state"] == "done":
+        return None
+    row = rows.known_job(service.db, found["id"])
+    return {"at": row["ended"], "job": row["id"], "why": jobs.job_answer_document(service, row).detail}
+
+
 def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
     """Return the open drift alarms of an arm, or of all, each with its comparison, a fleet's with its job."""
     return [
@@ -532,7 +546,7 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "run": ("motion", "speed", "until"),
     "identify": ("recording", "validation", "method"),
     "simulate": ("motion",),
-    "watch": (),
+    "watch": ("seconds",),
     "report": ("run",),
     "export": ("run",),
 }

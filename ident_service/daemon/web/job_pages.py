@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse
 
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.jobs.requests import FileName, Id
-from ident_service.daemon.live_stream import RECORDED, log_of
+from ident_service.daemon.live_stream import READ, RECORDED, log_of
 from ident_service.daemon.routes import jobs
 from ident_service.daemon.web.arm_facts import joint_facts
 from ident_service.daemon.web.forms import Form, PageRoute, seen
@@ -51,6 +51,7 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
         live=live,
         lease="keep" if attends else "",
         recorded=row["kind"] in RECORDED,
+        read=row["kind"] == READ,
         log=log_of(service, row),
         entered=entered,
         exports=_exported(service, row),
@@ -63,8 +64,8 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
 
 
 def live_joints(service: Service, row: Row) -> list[dict[str, Any]]:
-    """Return the joints of a job that is recorded, with units and limits for its plots; none of others."""
-    if row["state"] not in rows.LIVE or row["kind"] not in RECORDED:
+    """Return the joints of a job that tells samples, with units and limits for its plots; none of others."""
+    if row["state"] not in rows.LIVE or row["kind"] not in {*RECORDED, READ}:
         return []
     try:
         return joint_facts(known_arm(service.db, service.state, str(row["arm"])).config)

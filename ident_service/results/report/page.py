@@ -45,8 +45,8 @@ def assessment_table(found: Assessment) -> Table | None:
     if not found.joints:
         return None
     unseen = any(one.unseen is not None for one in found.joints)
-    heads = ["joint", "verdict", "fitted [%]", "moving [%]"]
-    heads += ["unseen [%]", "moving [%]"] if unseen else []
+    heads = ["joint", "verdict", "fitted [%]", "fitted, moving [%]"]
+    heads += ["unseen [%]", "unseen, moving [%]"] if unseen else []
     heads += ["residual rms", "torque rms"]
     rows = []
     for one in found.joints:

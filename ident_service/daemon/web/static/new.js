@@ -4,6 +4,7 @@
 
 const byId = (name) => document.getElementById(name);
 const files = new Map(); // name to text, of what the description names
+let meshes = {}; // name to base 64, of what pages draw of it
 const MOST = 11 * 2 ** 20; // bytes of a URDF and its meshes
 
 byId("describe").hidden = false;
@@ -28,28 +29,70 @@ function base64(bytes) {
 
 const plain = (name) => name.replace(/[^A-Za-z0-9_.-]/g, "_").replace(/^[_.-]+/, "");
 
-// Meshes that are drawn only are not sent: collision is what a description is about.
-async function chosen(list) {
-  const urdf = list.find((file) => /\.(urdf|xml)$/i.test(file.name));
-  if (!urdf) throw new Error("Choose a URDF among the files.");
-  const robot = new DOMParser().parseFromString(await urdf.text(), "text/xml");
-  const needed = new Set([...robot.querySelectorAll("collision mesh")].map((mesh) => (mesh.getAttribute("filename") || "").split(/[/\\]/).pop()));
-  const sent = list.filter((file) => file === urdf || needed.has(file.name));
-  const missing = [...needed].filter((name) => !list.some((file) => file.name === name));
-  if (sent.reduce((sum, file) => sum + file.size, 0) > MOST) throw new Error("The URDF and its collision meshes are larger than 11 MiB; use ident new.");
-  const content = {};
-  for (const file of sent) content[file === urdf ? plain(file.name) : file.name] = base64(new Uint8Array(await file.arrayBuffer()));
-  return { urdf: plain(urdf.name), files: content, missing };
+const size = (list) => list.reduce((sum, file) => sum + file.size, 0);
+const content = async (file) => base64(new Uint8Array(await file.arrayBuffer()));
+const parts = (name) => name.split(/[/\\]/);
+
+// The URDF that is chosen by itself, else the one in the folder.
+function urdfAmong(single, folder) {
+  const alone = single.find((file) => /\.(urdf|xml)$/i.test(file.name));
+  const there = folder.filter((file) => /\.urdf$/i.test(file.name));
+  if (!alone && there.length > 1) throw new Error(`The folder has several URDFs; choose one of them as a file: ${there.map((file) => file.name).join(", ")}.`);
+  return alone || there[0];
+}
+
+// Of files with the name of a mesh the one whose folders are most like those that the URDF names.
+function fileOf(mesh, list) {
+  const named = parts(mesh.getAttribute("filename") || "").reverse();
+  const alike = (file) => {
+    const place = parts(file.webkitRelativePath || file.name).reverse();
+    const differs = place.findIndex((part, k) => part !== named[k]);
+    return differs < 0 ? place.length : differs;
+  };
+  const found = list.filter((file) => file.name === named[0]);
+  return found.reduce((best, file) => (best && alike(best) >= alike(file) ? best : file), undefined);
+}
+
+// What pages draw: of each link its visual meshes, else those of its collision; those that are chosen.
+async function drawn(list, robot) {
+  const meshes = [...robot.querySelectorAll("link")].flatMap((link) => [...link.querySelectorAll(link.querySelector("visual") ? "visual mesh" : "collision mesh")]);
+  const found = new Set(meshes.map((mesh) => fileOf(mesh, list)));
+  const sent = [...found].filter((file) => file && plain(file.name) === file.name && /\.(stl|obj|dae)$/i.test(file.name));
+  if (size(sent) > MOST) return [{}, ["its meshes are larger than 11 MiB; pages show capsules instead"]];
+  const made = {};
+  for (const file of sent) made[file.name] = await content(file);
+  return [made, []];
+}
+
+// For the description meshes of collisions are sent, for pages those that are drawn.
+async function chosen(single, folder) {
+  const urdf = urdfAmong(single, folder);
+  if (!urdf) throw new Error("Choose a URDF among the files, or a folder that has one.");
+  const list = [...single, ...folder];
+  // Tools of simulators often do not declare the prefixes of what they add (`drake:...`), which ends a browser's parser.
+  const text = (await urdf.text()).replace(/(<\/?|\s)([A-Za-z_][\w.-]*):(?=[\w.-]+[\s=>/])/g, "$1$2-");
+  const robot = new DOMParser().parseFromString(text, "text/xml");
+  const needed = [...robot.querySelectorAll("collision mesh")];
+  const missing = new Set(needed.filter((mesh) => !fileOf(mesh, list)).map((mesh) => parts(mesh.getAttribute("filename") || "").pop()));
+  const sent = [...new Set([urdf, ...needed.map((mesh) => fileOf(mesh, list)).filter(Boolean)])];
+  if (size(sent) > MOST) throw new Error("The URDF and its collision meshes are larger than 11 MiB; use ident new.");
+  const files = {};
+  for (const file of sent) files[file === urdf ? plain(file.name) : file.name] = await content(file);
+  const [toDraw, remarks] = await drawn(list, robot);
+  return { urdf: plain(urdf.name), files, meshes: toDraw, remarks: [...[...missing].map((name) => `the mesh ${name} was not chosen`), ...remarks] };
 }
 
 function showFiles() {
-  byId("with-files").textContent = files.size ? `It goes up with ${[...files.keys()].join(", ")}.` : "";
+  const names = [...files.keys(), ...Object.keys(meshes)];
+  byId("with-files").textContent = names.length ? `It goes up with ${names.join(", ")}.` : "";
 }
 
-byId("urdf-files").addEventListener("change", () => {
-  const urdf = [...byId("urdf-files").files].find((file) => /\.(urdf|xml)$/i.test(file.name));
-  if (urdf && !byId("urdf-name").value) byId("urdf-name").value = plain(urdf.name).replace(/\.[^.]*$/, "").slice(0, 64);
-});
+for (const name of ["urdf-files", "urdf-folder"]) {
+  byId(name).addEventListener("change", () => {
+    const urdf = [...byId(name).files].find((file) => /\.urdf$/i.test(file.name));
+    if (urdf && !byId("urdf-name").value) byId("urdf-name").value = plain(urdf.name).replace(/\.[^.]*$/, "").slice(0, 64);
+  });
+}
 
 byId("files").addEventListener("change", async () => {
   for (const file of byId("files").files) files.set(file.name, await file.text());
@@ -64,13 +107,14 @@ byId("describe").addEventListener("submit", (event) => {
   status.textContent = "Reading it; this takes some seconds …";
   byId("guessed").replaceChildren();
   (async () => {
-    const sent = await chosen([...byId("urdf-files").files]);
+    const sent = await chosen([...byId("urdf-files").files], [...byId("urdf-folder").files]);
     const told = await asked("/api/v1/descriptions/new", { name: byId("urdf-name").value, urdf: sent.urdf, files: sent.files });
     byId("description").value = told.description;
     files.clear();
     for (const [name, text] of Object.entries(told.files)) files.set(name, text);
+    meshes = sent.meshes;
     showFiles();
-    const remarks = [...told.guessed, ...sent.missing.map((name) => `the mesh ${name} was not chosen`)];
+    const remarks = [...told.guessed, ...sent.remarks];
     byId("guessed").replaceChildren(...remarks.map((words) => Object.assign(document.createElement("li"), { textContent: words })));
     status.textContent = remarks.length ? "Described. Look at what was guessed, correct it below, then add it." : "Described. Read it below, then add it.";
     byId("description").scrollIntoView({ block: "center" });
@@ -86,6 +130,7 @@ byId("add").addEventListener("submit", (event) => {
   const body = {
     description: byId("description").value.replaceAll("\r\n", "\n"),
     files: Object.fromEntries(files),
+    meshes,
     replace: byId("add").elements.replace.checked,
   };
   asked("/api/v1/arms", body)

@@ -59,6 +59,7 @@ class Arm {
     for (const solid of figure.surroundings) {
       this.solids.push(this.add(solid, COLORS.around, solid.shape === "half_space" ? 0.18 : 0.4));
     }
+    this.covers = [];
     this.pose(figure.home);
   }
 
@@ -73,6 +74,30 @@ class Arm {
     made.userData = { owner: solid.owner, color };
     this.frameOf(solid.joint).add(made);
     return made;
+  }
+
+  // In place of the solids of a joint, which stay what distances are about.
+  async cover(mesh) {
+    const answer = await fetch(mesh.source);
+    if (!answer.ok) throw new Error(`the service answered ${answer.status}`);
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(await answer.arrayBuffer()), 3));
+    geometry.computeVertexNormals();
+    const color = mesh.joint < 0 ? COLORS.base : COLORS.link;
+    const made = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color, side: THREE.DoubleSide }));
+    made.userData = { owner: mesh.owner, color };
+    const under = this.solids.filter((solid) => solid.parent === this.frameOf(mesh.joint) && solid.userData.owner === mesh.owner);
+    if (under.length) made.material.color.copy(under[0].material.color); // which may be marked already
+    this.frameOf(mesh.joint).add(made);
+    this.solids.push(made);
+    this.covers.push({ made, under });
+  }
+
+  uncover(bare) {
+    for (const { made, under } of this.covers) {
+      made.visible = !bare;
+      for (const solid of under) solid.visible = bare;
+    }
   }
 
   // Positions in rad or m, one per joint.
@@ -307,6 +332,21 @@ class Player {
   }
 }
 
+// Meshes come after the picture, which can do without.
+async function dress(arm, view, draw) {
+  const came = await Promise.allSettled(view.figure.meshes.map((mesh) => arm.cover(mesh)));
+  if (!arm.covers.length) return;
+  const box = byId("bare");
+  const show = () => {
+    arm.uncover(box.checked);
+    draw();
+  };
+  box.addEventListener("change", show);
+  box.closest("[hidden]").hidden = false;
+  if (came.some(({ status }) => status === "rejected")) byId("status").append(" Some meshes did not come; capsules are shown.");
+  show();
+}
+
 async function begin() {
   const answer = await fetch(root.dataset.source, { headers: { Accept: "application/json" } });
   const view = await answer.json();
@@ -329,6 +369,7 @@ async function begin() {
   const player = view.time.length ? new Player(view, arm, draw) : null;
   draw();
   byId("status").textContent = view.notes.join(". ");
+  if (picture) dress(arm, view, draw);
   if (!("live" in root.dataset)) return;
   document.addEventListener("samples", ({ detail }) => {
     if (player) player.pause();
@@ -343,7 +384,7 @@ async function begin() {
     byId("distances").hidden = true;
     if (player) player.showLive(newest);
     byId("clearance").setAttribute("hidden", "");
-    byId("status").textContent = `As measured, ${detail.time[detail.time.length - 1].toFixed(1)} s after the recording began.`;
+    byId("status").textContent = `As measured, ${detail.time[detail.time.length - 1].toFixed(1)} s after the beginning.`;
     draw();
   });
 }
