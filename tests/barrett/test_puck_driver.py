@@ -414,6 +414,7 @@ def test_a_puck_that_does_not_answer_or_is_none_is_named() -> None:
         changed(2, ROLE=2).arm.open()
 
 
+@pytest.mark.slow
 def test_after_an_emergency_stop_each_thing_to_do_is_said_once(tmp_path: Path) -> None:
     bench = Bench(wam())
     bench.behind.inject(DriveFault("emergency_stop"))

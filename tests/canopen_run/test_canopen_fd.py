@@ -95,6 +95,7 @@ def multicast() -> dict[str, Any]:
     return {"interface": "udp_multicast", "channel": "239.74.163.3", "options": {"port": port, "hop_limit": 0}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ident_wire", "paced", "udp_multicast"])
 def test_drives_answer_in_frames_of_fd(tmp_path: Path, kind: str) -> None:
     bus = multicast() if kind == "udp_multicast" else {"interface": "ident_wire", "channel": channel()}

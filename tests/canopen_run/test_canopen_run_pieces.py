@@ -97,6 +97,7 @@ def test_the_drives_are_enabled_when_they_can_tell_it_at_once(tmp_path: Path) ->
         assert len(moved) <= 2
 
 
+@pytest.mark.slow
 def test_one_loop_hosts_several_wires(tmp_path: Path) -> None:
     names = [channel() + f"-{k}" for k in range(2)]
     tree = canopen(described("two", 250.0, 225.0, 30.0), {"interface": "ident_wire", "channel": names[0]}, 1)

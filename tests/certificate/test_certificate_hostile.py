@@ -62,6 +62,7 @@ def test_numbers_that_are_none_or_too_large_fail(bad: object) -> None:
     assert verify(text(document)).verdict == "failed"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "bad"),
     [

@@ -110,6 +110,7 @@ def test_every_coefficient_of_an_expression_counts(kind: str, request: pytest.Fi
             _fails(document, lambda d, r=row, c=flipped: d["base_parameters"]["expressions"].__setitem__(r, c))
 
 
+@pytest.mark.slow
 def test_every_digit_of_the_witness_counts_where_an_expression_names_it(witness: Document) -> None:
     named = set(re.findall(r"[A-Za-z]+\d+", " ".join(witness["base_parameters"]["expressions"])))
     for name, number in witness["feasibility"]["certificate"]["delta"].items():
@@ -126,6 +127,7 @@ def test_an_impossible_body_is_no_witness_even_where_no_expression_tells(witness
         assert "link 1: a mass distribution exists" in message
 
 
+@pytest.mark.slow
 def test_every_digit_of_a_dual_counts(dual: Document) -> None:
     certificate = dual["feasibility"]["certificate"]
     for name, row in certificate["multipliers"].items():

@@ -16,6 +16,7 @@ from ident_service.model.base_parameters import base_from_expressions, base_para
 from ident_service.model.parameter_layout import INERTIAL
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5), square=st.booleans())
 def test_real_bodies_are_proven_feasible(seed: int, joints: int, square: bool) -> None:
@@ -33,6 +34,7 @@ def test_real_bodies_are_proven_feasible(seed: int, joints: int, square: bool) -
             assert verification.verdict == "feasible", verification.message
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), square=st.booleans())
 def test_impossible_bodies_are_proven_infeasible(seed: int, square: bool) -> None:

@@ -35,6 +35,7 @@ def gram(factor: Matrix) -> Matrix:
     return [[sum((a * b for a, b in zip(x, y, strict=True)), Fraction(0)) for y in factor] for x in factor]
 
 
+@pytest.mark.slow
 @given(matrices(4, 2))
 def test_a_gram_matrix_of_low_rank_is_semidefinite_and_not_definite(factor: Matrix) -> None:
     assert is_positive_semidefinite(gram(factor))
@@ -91,6 +92,7 @@ def test_equations_that_contradict_each_other_are_not_repaired() -> None:
     assert repair([{"a": one}, {"a": one}], [one, 2 * one], {"a": one}, lambda _: 1.0) is None
 
 
+@pytest.mark.slow
 @given(st.fractions() | st.floats(allow_nan=False, allow_infinity=False).map(lambda x: Fraction(repr(x))))
 def test_numbers_are_written_and_read_without_loss(value: Fraction) -> None:
     assert rational(rational_text(value)) == value

@@ -89,6 +89,7 @@ def offered(kept: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[
     return {key: (folder / str(number)).read_text().splitlines() for number, key in enumerate(asked)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("line", "words"), CASES, ids=[line for line, _ in CASES])
 def test_words_that_can_follow_are_offered(
     line: str, words: set[str], offered: dict[tuple[str, str], list[str]]

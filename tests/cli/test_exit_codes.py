@@ -120,6 +120,7 @@ def test_the_table_has_every_verb() -> None:
     assert set(TABLE) | NOTHING_GIVEN == set(verbs())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", TABLE)
 def test_what_cannot_be_used_is_exit_code_2(
     verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ident: Ident

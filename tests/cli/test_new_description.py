@@ -243,6 +243,7 @@ def test_a_table_in_yaml_is_the_same_table(tmp_path: Path) -> None:
         assert (csv.limits[name].velocity or 0.0) == pytest.approx(yml.limits[name].velocity or 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
@@ -474,6 +475,7 @@ def test_a_torso_that_carries_a_head_beside_the_arm_is_no_part_of_it() -> None:
     assert arm_part(tree(torso[0], *ARM), "t", None, None) == {}
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1))
 def test_a_drawn_body_is_real_and_near(seed: int) -> None:
     rng = np.random.default_rng(seed)

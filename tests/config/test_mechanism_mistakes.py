@@ -175,6 +175,7 @@ TAKEN = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "said"), REFUSED)
 @pytest.mark.parametrize("verb", [("config", "check"), ("base",), ("new",)])
 def test_what_a_urdfs_parser_refuses_is_told_with_its_line_and_in_our_words(

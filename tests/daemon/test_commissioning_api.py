@@ -51,7 +51,13 @@ def patient(daemon: Asked) -> str:
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("asked", ["by a person", "by a person who paused", "by its target"])
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "by a person who paused",
+        *(pytest.param(one, marks=pytest.mark.campaign) for one in ("by a person", "by its target")),
+    ],
+)
 def test_a_run_ends_early(daemon: Asked, patient: str, state: Path, asked: str) -> None:
     until = {"until": {"share": 0.3, "parameters": ["fv1", "fc1"]}} if asked == "by its target" else {}
     job = daemon.begin({"kind": "run", "arm": ARM, **until}, confirmed=True)["id"]
@@ -167,6 +173,7 @@ def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, state: Pa
     assert wrong.status_code == 400
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_check_run_identify(daemon: Asked, arm: str) -> None:
     # Without a ticket the run is refused, by the same words as at a terminal.

@@ -293,6 +293,7 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is
         assert "OSError" not in text
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_fault_of_an_arm_that_is_held_is_told_before_it_is_supported(

@@ -363,6 +363,7 @@ def test_a_recording_that_is_deleted_while_it_is_completed_is_unknown(
     assert list((state / "runs").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_added_while_it_is_deleted_is_whole(daemon: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
     known_arm(daemon, quick_text())
     know, adding = deletion.know_shipped, list[threading.Thread]()

@@ -159,6 +159,7 @@ def commission(machine: Machine, client: IdentClient) -> None:
             assert not path.lstat().st_mode & 0o077 or path.is_symlink(), path
 
 
+@pytest.mark.campaign
 def test_the_images_command_serves(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     pem, key = machine.certificate()
     words = [*json.loads(last("ENTRYPOINT")), *json.loads(last("CMD"))]

@@ -140,6 +140,7 @@ def test_a_name_that_is_taken_is_replaced_where_that_is_asked_for(daemon: Asked)
     assert len([line for line in audit_log(daemon.service.db) if line["what"] == "arm added"]) == 5
 
 
+@pytest.mark.slow
 def test_a_name_that_no_address_can_have_is_refused_with_its_place(daemon: Asked) -> None:
     assert daemon.post("/api/v1/arms", {"description": quick_text("a" * 64)}).status_code == 201
     assert daemon.get(f"/api/v1/arms/{'a' * 64}").status_code == 200

@@ -60,6 +60,7 @@ VERBS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [0o755, 0o711, 0o710, 0o770])
 def test_a_folder_that_others_can_enter_is_refused_with_the_remedy(
     entered: Path, mode: int, capsys: pytest.CaptureFixture[str]

@@ -125,6 +125,7 @@ def request(rng: random.Random, number: int) -> tuple[bytes, bytes]:
     return data, path + b" " + hashlib.sha256(read).hexdigest().encode()
 
 
+@pytest.mark.slow
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_every_request_is_answered_in_its_order(seed: int) -> None:

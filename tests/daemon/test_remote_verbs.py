@@ -84,6 +84,7 @@ def test_verbs_of_this_machine_say_why(state: Path, capsys: pytest.CaptureFixtur
         assert next(why for word, why in LOCAL_ONLY.items() if " ".join(words).startswith(word)) in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [

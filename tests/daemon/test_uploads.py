@@ -365,6 +365,7 @@ def test_a_failed_upload_names_the_file_and_no_id(state: Path, tmp_path: Path) -
             client.upload("planar2", tmp_path / "mine.csv")
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_parameters_are_identified_from_ones_own_data(

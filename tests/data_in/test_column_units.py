@@ -166,6 +166,7 @@ columns:
 """
 
 
+@pytest.mark.slow
 def test_counts_and_currents_with_their_signs_identify_as_si_does(tmp_path: Path) -> None:
     model = arm_model(load_arm("planar2"))
     delta, motion = model.prior, waves(4, 2)

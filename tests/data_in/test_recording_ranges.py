@@ -170,6 +170,7 @@ def test_a_columns_file_for_one_recording(tmp_path: Path) -> None:
         own_formats({theirs: columns}, named, model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("general", ["", "recording: {trim: [0.5, 0.25]}\n"])
 def test_what_is_trimmed_of_one_recording_is_what_is_trimmed_of_all(tmp_path: Path, general: str) -> None:
     path, columns = written(tmp_path / "run.csv", header="time,a,b,c,d", still=(700, 460)), tmp_path / "own.yaml"
@@ -183,6 +184,7 @@ def test_what_is_trimmed_of_one_recording_is_what_is_trimmed_of_all(tmp_path: Pa
     assert wanted.estimate.samples < 4160 - 3.5 / PERIOD
 
 
+@pytest.mark.slow
 def test_others_keep_the_trim_of_the_description(tmp_path: Path) -> None:
     ours, theirs = written(tmp_path / "ours.csv"), written(tmp_path / "theirs.csv", header="time,a,b,c,d")
     columns = tmp_path / "own.yaml"

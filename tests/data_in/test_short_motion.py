@@ -37,6 +37,7 @@ def cut_short() -> Estimate:
     return identify(ARM, [moved(2.5)])
 
 
+@pytest.mark.slow
 def test_little_motion_that_leaves_much_unknown_is_no_yes(cut_short: Estimate) -> None:
     (reason,) = reasons_in_length(cut_short, 2.5)
     unknown = cut_short.verdicts.count("unidentified")
@@ -66,6 +67,7 @@ def test_enough_motion_is_not_objected_to() -> None:
     assert reasons_in_length(identify(ARM, [moved(20.0)]), 20.0) == ()
 
 
+@pytest.mark.slow
 def test_what_another_motion_validates_is_judged_there() -> None:
     estimate = identify(ARM, [moved(2.5)], [moved(20.0, seed=2)])
     assert reasons_in_length(estimate, 2.5) == ()

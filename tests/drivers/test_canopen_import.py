@@ -135,6 +135,7 @@ def test_drives_store_and_restore_what_they_hold() -> None:
     assert held(bench, 0x3001, 1) == factory
 
 
+@pytest.mark.slow
 def test_opening_never_stores() -> None:
     for name in (EPOS4, "e35.eds", "elmo_gold_V002.dcf"):
         bench = Bench(arm_of(name))

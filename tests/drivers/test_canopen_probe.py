@@ -136,6 +136,7 @@ def test_a_drive_that_is_silent_is_foretold() -> None:
     assert "no proper answer" in text
 
 
+@pytest.mark.slow
 def test_a_drive_that_says_nonsense_gets_a_report() -> None:
     """Answers of every kind but good ones; a seed each."""
     config = weightless_config()

@@ -61,6 +61,7 @@ def test_the_table_is_the_figure_and_no_more() -> None:
     assert {(int(s), names[c]): int(t) for (s, c), t in TRANSITIONS.items()} == FIGURE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("option", "end"), [(0, 0x40), (2, 0x40), (6, 0x07)])
 def test_where_a_quick_stop_ends(enabled: Host, option: int, end: int) -> None:
     for node in (1, 2):
@@ -237,6 +238,7 @@ def test_how_far_an_arm_falls_after_its_host_has_died(
     assert least <= abs(before - body.plant.position[0]) <= most
 
 
+@pytest.mark.slow
 def test_a_drive_that_nobody_asks_stops_an_arm_by_itself(tmp_path: Path) -> None:
     """The host dies: torques stop, and the arm sinks and comes to rest."""
     enabled = Host.on(drives_config(tmp_path, emulation={"windings_off": "shorted"}))

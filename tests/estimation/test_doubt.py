@@ -106,6 +106,7 @@ def test_no_deviation_is_below_that_of_white_residuals() -> None:
         assert (deviations >= fit.standard_deviations * (1.0 - 1e-12)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [4, 12, pytest.param(24, marks=pytest.mark.campaign)])
 def test_degrees_of_freedom_are_those_of_the_variances(blocks: int) -> None:
     """The variance of a variance is 2 V^2 / degrees where errors are white, as it is of a chi-squared variable."""

@@ -100,6 +100,7 @@ def second_nearest(
     return beta, float(np.linalg.norm(metric @ beta - target))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("solver", "accuracy"), [("SCS", 1e-5), ("CLARABEL", 1e-6)])
 def test_margin_is_that_of_a_second_formulation(kind: FeasibleSetName, solver: str, accuracy: float) -> None:
@@ -191,6 +192,7 @@ def test_a_finger_of_three_grams_keeps_its_torques(wam7: ArmModel, kind: Feasibl
     assert errors[6] < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_results_are_members_and_consistent(kind: FeasibleSetName) -> None:
     for seed in range(5):

@@ -60,6 +60,7 @@ def test_a_recording_that_is_shorter_than_its_reflection_is_refused() -> None:
         low_pass(walk(10), 3, 5.0, 100.0, 10)
 
 
+@pytest.mark.slow
 def test_slow_packages_are_not_loaded() -> None:
     program = "import sys, ident_service.estimation.identify; print(*sys.modules)"
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

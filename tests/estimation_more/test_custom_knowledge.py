@@ -86,6 +86,7 @@ def ident_json(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, 
 # The documented example.
 
 
+@pytest.mark.slow
 def test_the_documented_example(setting: Setting, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"```(?:python)?\n# ([a-z_]+\.(?:yaml|py))[^\n]*\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     assert [name for name, _ in blocks] == ["arm.yaml", "known_bodies.py"]
@@ -147,6 +148,7 @@ def test_a_custom_bound_is_the_declared_one(setting: Setting) -> None:
     assert found.margin > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["euclidean", "entropic"])
 def test_a_custom_penalty_counts_as_a_prior_does(setting: Setting, kind: Any) -> None:
     import cvxpy as cp  # loads for a second, which every worker that collects this file would pay

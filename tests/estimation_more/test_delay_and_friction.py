@@ -291,6 +291,7 @@ def test_a_drive_without_presliding_is_given_little_or_none() -> None:
     assert second == pytest.approx(0.03, rel=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("terms", [TERMS, TERMS[:4]])
 def test_nothing_to_fit_leaves_the_numbers(terms: tuple[str, ...]) -> None:
     shape = plain_friction(presliding=0.01, stribeck_velocity=tuple(STRIBECK))

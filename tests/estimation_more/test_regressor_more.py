@@ -176,6 +176,7 @@ def test_memory_of_the_wrong_shape_is_refused() -> None:
         joint_regressor(chain, layout, *random_states(rng, 5, 3), [0, 1], few)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity", [0.02, 0.1, 1.0])
 def test_base_parameters_with_every_term(velocity: float) -> None:
     chain = serial_chain(11, 3)

@@ -114,6 +114,7 @@ def test_nor_in_the_ramps(seed: int) -> None:
     assert_bounds(demands(path, model), sampled(path, model, 1000))
 
 
+@pytest.mark.slow
 @settings(max_examples=4)
 @given(seed=SEEDS)
 def test_nor_on_ways_between_postures(seed: int) -> None:

@@ -69,6 +69,7 @@ def test_the_documented_lines_know_drives_that_move_several_joints(tmp_path: Pat
     assert np.abs(alone - meant).max() > 1e-3 * np.abs(meant).max()
 
 
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5))
 def test_random_trees_with_every_term_are_written(seed: int, joints: int) -> None:

@@ -127,6 +127,7 @@ def test_another_grouping_is_refused(run: Path, tmp_path: Path) -> None:
         load_model(changed(run, tmp_path, base_parameters={"expressions": expressions}))
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5))
 def test_random_trees_with_every_friction_term(seed: int, joints: int) -> None:

@@ -63,6 +63,7 @@ def test_no_weight_is_no_prior_and_a_small_one_is_nearly_none(kind: Kind) -> Non
     assert without.objective - off < light.objective < without.objective * (1 + 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_large_weight_is_the_prior_itself(kind: Kind) -> None:
     case = random_case(5, joints=3, noise=0.2)

@@ -294,6 +294,7 @@ def read_apart(data: bytes, read: Callable[[Path], Any]) -> None:
 _QUIET = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LIMITS)
 def test_a_spoiled_file_is_read_or_refused(readers: dict[str, Reader], kind: str) -> None:
     # A process reads each MJCF.
@@ -361,6 +362,7 @@ LARGEST: dict[str, Callable[[], tuple[str, str]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LARGEST)
 def test_a_large_file_is_read_or_refused(readers: dict[str, Reader], name: str) -> None:
     kind, text = LARGEST[name]()

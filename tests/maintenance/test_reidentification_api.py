@@ -99,6 +99,7 @@ def test_a_lease_that_nobody_renews_ends_it(daemon: Asked) -> None:
     assert [job["kind"] for job in daemon.get("/api/v1/jobs").json()] == ["check"]
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_a_person_asks_by_the_command_and_a_drier_joint_is_found(
     accepted: str, state: Path, capsys: pytest.CaptureFixture[str]
@@ -170,7 +171,9 @@ def test_a_person_asks_by_the_command_and_a_drier_joint_is_found(
 
 
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("step", [pytest.param("check", marks=pytest.mark.campaign), "run", "identify"])
+@pytest.mark.parametrize(
+    "step", ["run", *(pytest.param(step, marks=pytest.mark.campaign) for step in ("check", "identify"))]
+)
 def test_a_kill_in_the_midst_is_told_and_nothing_moves_by_itself(accepted: str, state: Path, step: str) -> None:
     path = "/api/v1/reidentifications"
     with daemon_process(state) as (process, client):

@@ -61,6 +61,7 @@ def test_slowly_begun_freezes_of_all_joints_are_found(arm: str, joints: int, spe
         assert sum(end.code is not None for end in ends[4 * joint : 4 * joint + 4]) >= 2, joint
 
 
+@pytest.mark.slow
 def test_a_branch_of_a_run_is_the_run_with_its_fault_from_the_start() -> None:
     which = subject("bench")
     faults: list[Fault] = []

@@ -343,6 +343,7 @@ def test_a_fault_that_says_what_failed_is_passed_on_with_its_own_remedy(
     assert "sign" not in check.remedy
 
 
+@pytest.mark.slow
 def test_an_encoder_that_freezes_while_the_joint_moves_is_noticed() -> None:
     check = only_failure(Flight(faults=(Fault(1000, FaultKind.FROZEN_ENCODER, 0, FOREVER),)).ticket(), "direction")
     assert check.reason.startswith("frozen_encoder: shoulder: ")
@@ -451,6 +452,7 @@ def beating(shift: float) -> tuple[Flight, Beating]:
     return flight, arm
 
 
+@pytest.mark.slow
 def test_while_drives_miss_a_heartbeat_the_loop_goes_on_holding_the_arm() -> None:
     flight, arm = beating(0.004)
     ticket = flight.ticket()
@@ -463,6 +465,7 @@ def test_while_drives_miss_a_heartbeat_the_loop_goes_on_holding_the_arm() -> Non
     assert after[-1, 1] > after[:, 1].min() + 0.03
 
 
+@pytest.mark.slow
 def test_an_arm_that_goes_astray_while_drives_miss_a_heartbeat_is_let_go_at_once() -> None:
     flight, arm = beating(0.2)
     reason = only_failure(flight.ticket(), "watchdog").reason
@@ -473,6 +476,7 @@ def test_an_arm_that_goes_astray_while_drives_miss_a_heartbeat_is_let_go_at_once
     assert len(arm.torques) - arm.silent_from < 5
 
 
+@pytest.mark.slow
 def test_an_emergency_stop_ends_the_proof_at_once() -> None:
     flight, arm = beating(0.0)
     pressed = AxisStatus.POWERED | AxisStatus.EMERGENCY_STOP

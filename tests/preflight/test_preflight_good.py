@@ -25,6 +25,7 @@ from ident_service.preflight.preflight import preflight
 from ident_service.preflight.session import trace_of
 
 
+@pytest.mark.slow
 def test_a_good_arm_passes_all_that_virtual_time_can_tell(good: Flown) -> None:
     ticket = good.ticket
     assert verdicts(ticket) == {code: Verdict.SKIPPED if code == "rate" else Verdict.PASSED for code in CODES}

@@ -26,6 +26,7 @@ from ident_service.results.report.page import report_html
 ORDER = ["verdict", "torque", "parameters", "residual", "friction", "doubt", "bodies", "timing", "files"]
 
 
+@pytest.mark.slow
 def test_sections_come_in_order_under_one_heading_each(good: Made, bare: Made) -> None:
     for page in (good.page, bare.page):
         found = sections(page)
@@ -300,6 +301,7 @@ def test_an_axis_around_zero_has_three_numbers_or_more(size: float, height: floa
 EVIL = "<script>alert(1)</script>\"'&</style>]]>--"
 
 
+@pytest.mark.slow
 def test_names_cannot_break_into_the_page(good: Made) -> None:
     recordings = tuple(replace(one, name=EVIL) for one in good.evidence.recordings)
     evidence = replace(

@@ -189,6 +189,7 @@ def test_a_rate_at_which_more_than_a_twentieth_of_a_second_is_late_is_not_held()
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_is_measured_is_what_the_clock_did() -> None:
     class Stalling:
         lock_step, utc_offset_ns = False, 0
@@ -218,6 +219,7 @@ def test_rates_are_measured_at_a_whole_multiple(rate: float, measured: float) ->
     assert measuring_rate(rate) == measured
 
 
+@pytest.mark.slow
 def test_the_verb_says_whether_the_described_rate_can_be_held(tmp_path: Path) -> None:
     path = tmp_path / "arm.yaml"
     # No computer wakes a process within a nanosecond of when it asked for it.

@@ -68,6 +68,7 @@ def another_loop(settings: str = "") -> Iterator[str]:
             other.communicate("\n")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")
 def test_two_loops_never_share_a_core_of_their_own() -> None:
     with another_loop(f"cores={tuple(CORES)}") as first:
@@ -90,6 +91,7 @@ def test_the_priority_is_the_described_one() -> None:
     assert said in (["True", "7"], ["False", "0"])
 
 
+@pytest.mark.slow
 def test_cores_are_kept_awake_for_as_long_as_the_loop_runs() -> None:
     if not os.access(LATENCY, os.W_OK):
         assert f"{LATENCY} refused" in asking("", "print(granted.sentence())")
@@ -118,6 +120,7 @@ def test_heap_and_stack_have_their_pages_before_the_loop_begins() -> None:
     assert int(faults) < 100  # 50 blocks of 2 MiB have 25,600 pages
 
 
+@pytest.mark.slow
 def test_what_was_asked_for_a_while_is_given_back() -> None:
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     for _ in range(2):  # its core is free again
