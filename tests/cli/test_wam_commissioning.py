@@ -1,6 +1,6 @@
 """The whole job on the simulated WAM, scored: one command from nothing to parameters proven feasible.
 
-At a quarter of the rate, which takes a third of the time; `make campaign` runs it as shipped.
+At half the rate, which takes half the time; `make campaign` runs it as shipped.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ class WamRun:
     rate: int
 
 
-# The wrist's shipped gains are not stable at this rate.
-COARSE = "control: {rate: 250}\njoints: {" + ", ".join(f"j{k}: {{kp: 1600, kd: 60}}" for k in (5, 6, 7)) + "}\n"
+# The slowest rate at which the wrist's shipped gains are stable. With softer ones it stands still against more than the
+# friction guess, which looks like a frozen encoder on one processor and not on another (decision 0008).
+COARSE = "control: {rate: 500}\n"
 
 
-@pytest.fixture(scope="module", params=[250, pytest.param(1000, marks=pytest.mark.campaign)])
+@pytest.fixture(scope="module", params=[500, pytest.param(1000, marks=pytest.mark.campaign)])
 def wam_run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> WamRun:
     rate = int(request.param)
 
@@ -63,7 +64,7 @@ def wam_run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         arm.write_text(f"extends: {shipped_arms()['wam7_sim']}\n{COARSE}")
         out = io.StringIO()
         with contextlib.redirect_stdout(out):
-            code = run_main("simulate", arm if rate == 250 else "wam7_sim", "--out", folder / "run", "--json")
+            code = run_main("simulate", arm if rate == 500 else "wam7_sim", "--out", folder / "run", "--json")
         assert code == 0, out.getvalue()
         (folder / "out").write_text(out.getvalue())
 
