@@ -11,7 +11,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from daemon.test_image import ROOT, Machine, asked, commission, instructions, last
+from daemon.test_image import ROOT, Machine, asked, instructions, last
 from daemon.test_image import machine as machine
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
@@ -50,7 +50,6 @@ def test_the_images_command_needs_no_checkout(machine: Machine, monkeypatch: pyt
     process = machine.start(["-m", "ident_service", *words, "--port", "0"])
     monkeypatch.setenv("SSL_CERT_FILE", pem)
     with asked(machine, process, "https", "localhost") as client:
-        commission(machine, client)
         assert len(client.arms()) == len(list((ROOT / "configs").glob("*.yaml")))
         page = client.content("/api/docs").decode()
         for file in re.findall(r'(?:src|href)="(/static/[^"]+)"', page):

@@ -122,6 +122,7 @@ def test_what_is_due_is_seen_and_done(browser: Browser, reached: Reached) -> Non
     assert problems == []
 
 
+@pytest.mark.campaign
 def test_a_drier_joint_raises_an_alarm_that_a_person_acknowledges(browser: Browser, reached: Reached) -> None:
     page = log_in(browser, reached)
     plant(reached, 42, drier=1.3)
