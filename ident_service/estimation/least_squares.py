@@ -57,9 +57,7 @@ def weighted_least_squares(information: Information) -> LeastSquares:
     Raises:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
     """
-    products = tuple(factor.T @ factor for factor in information.factors)
-    # Products settle nearly all of it, at a tenth of a round's cost.
-    weights = Moments(information.supports, products, information.rows, information.base).weights(settled=_SETTLED)
+    weights = np.ones(information.joints)
     floor = least_deviations(information)
     for _ in range(_MOST_ROUNDS):
         beta = _solution(information, weights).beta
@@ -210,12 +208,11 @@ class Moments:
             right[support] += weight**2 * product[:-1, -1]
         return total, right
 
-    def weights(self, start: Array | None = None, settled: float = _STEP_SETTLED) -> Array:
+    def weights(self, start: Array | None = None) -> Array:
         """Return the factors of the joints' equations that make their residuals alike, shape (joints,).
 
         Args:
             start: factors to begin with, such as those of other columns; ones when None.
-            settled: relative change at which to end.
         """
         floor = least_deviations(self)
         weights = np.ones(len(self.products)) if start is None else start
@@ -223,7 +220,7 @@ class Moments:
             left = np.sqrt(self.squared_residuals(self.solved(weights)) / _degrees(self))
             deviations = np.maximum(left, floor)
             before, weights = weights, np.exp(np.mean(np.log(deviations))) / deviations
-            if np.all(np.abs(weights - before) <= settled * weights):
+            if np.all(np.abs(weights - before) <= _STEP_SETTLED * weights):
                 break
         return weights
 
