@@ -21,6 +21,7 @@ from ident_service.model.information import Information
 RANK_TOLERANCE = 1e-10
 _LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
 _SETTLED = 1e-9
+_START_DECIMALS = 5  # of the weights' logarithms; products settle to a tenth of that
 _MOST_ROUNDS = 500
 
 
@@ -57,7 +58,10 @@ def weighted_least_squares(information: Information) -> LeastSquares:
     Raises:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
     """
-    weights = np.ones(information.joints)
+    products = tuple(factor.T @ factor for factor in information.factors)
+    near = Moments(information.supports, products, information.rows, information.base).weights()
+    # Rounded, so that rounds begin at the same weights, and end at them, whatever a processor made of the products.
+    weights = np.exp(np.round(np.log(near), _START_DECIMALS))
     floor = least_deviations(information)
     for _ in range(_MOST_ROUNDS):
         beta = _solution(information, weights).beta
