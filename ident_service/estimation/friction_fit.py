@@ -299,7 +299,8 @@ class FrictionTrials:
         )
         values: dict[JointTerm, Array] = {
             "coulomb": direction,
-            "stribeck": direction * np.exp(-((self._rate / stribeck_velocity) ** 2)),
+            "stribeck": direction
+            * np.where(stribeck_velocity > NO_STRIBECK, np.exp(-((self._rate / stribeck_velocity) ** 2)), 0.0),
         }
         return {term: self._filtered(values[term]) for term in self._columns}
 
@@ -422,7 +423,7 @@ _GRIDS: dict[str, Array] = {
     "presliding": np.array([0.0, *np.geomspace(3e-4, 0.05, 8)]),
     "stribeck_velocity": np.geomspace(0.02, 0.8, 8),
 }
-# Values that stand for absence: Stribeck friction with this velocity vanishes at any recorded speed.
+# Values that stand for absence.
 _NONE = {"presliding": 0.0, "stribeck_velocity": NO_STRIBECK}
 _FINER = np.array([0.6, 0.8, 1.0, 1.25, 1.6])
 _ROUNDS = 2

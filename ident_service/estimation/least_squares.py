@@ -21,6 +21,7 @@ from ident_service.model.information import Information
 RANK_TOLERANCE = 1e-10
 _LEAST_COLUMN = 1e-14  # share of the longest column's length; a shorter column is rounding
 _SETTLED = 1e-9
+_START_DECIMALS = 5  # of the weights' logarithms; products settle to a tenth of that
 _MOST_ROUNDS = 500
 
 
@@ -58,8 +59,9 @@ def weighted_least_squares(information: Information) -> LeastSquares:
         ModelError: the weights do not settle, which means that some joint's residual vanishes.
     """
     products = tuple(factor.T @ factor for factor in information.factors)
-    # Products settle nearly all of it, at a tenth of a round's cost.
-    weights = Moments(information.supports, products, information.rows, information.base).weights(settled=_SETTLED)
+    near = Moments(information.supports, products, information.rows, information.base).weights()
+    # Rounded, so that rounds begin at the same weights, and end at them, whatever a processor made of the products.
+    weights = np.exp(np.round(np.log(near), _START_DECIMALS))
     floor = least_deviations(information)
     for _ in range(_MOST_ROUNDS):
         beta = _solution(information, weights).beta
@@ -210,12 +212,11 @@ class Moments:
             right[support] += weight**2 * product[:-1, -1]
         return total, right
 
-    def weights(self, start: Array | None = None, settled: float = _STEP_SETTLED) -> Array:
+    def weights(self, start: Array | None = None) -> Array:
         """Return the factors of the joints' equations that make their residuals alike, shape (joints,).
 
         Args:
             start: factors to begin with, such as those of other columns; ones when None.
-            settled: relative change at which to end.
         """
         floor = least_deviations(self)
         weights = np.ones(len(self.products)) if start is None else start
@@ -223,7 +224,7 @@ class Moments:
             left = np.sqrt(self.squared_residuals(self.solved(weights)) / _degrees(self))
             deviations = np.maximum(left, floor)
             before, weights = weights, np.exp(np.mean(np.log(deviations))) / deviations
-            if np.all(np.abs(weights - before) <= settled * weights):
+            if np.all(np.abs(weights - before) <= _STEP_SETTLED * weights):
                 break
         return weights
 

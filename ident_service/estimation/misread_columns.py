@@ -35,7 +35,7 @@ from ident_service.recordings.adapters import RangeRecording
 from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid
 
-SUSPECTED_FROM, CONCERNED_FROM = 10.0, 5.0  # percent of a joint's torque: to search at all, and to try a joint
+SUSPECTED_FROM, CONCERNED_FROM = 10.0, 2.5  # percent of a joint's torque: to search at all, and to try a joint
 NO_ERROR = 1.0  # percent of a joint's torque; smaller errors count as this one
 BETTER = 3.0  # by which the product of the joints' errors must shrink; real arms with right columns reach 1.7
 NONE_WORSE = 2.0  # by which the error of no joint may grow; that of one whose torque is noise may

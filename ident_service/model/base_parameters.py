@@ -8,7 +8,7 @@ others' coefficients come from least squares and are rounded to decimals that th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ident_service import certificate_verifier
 from ident_service.errors import ParameterError
 from ident_service.model.chain import Array, Chain
-from ident_service.model.parameter_layout import Layout
+from ident_service.model.parameter_layout import NO_STRIBECK, Layout
 from ident_service.model.regressor import joint_regressor
 
 
@@ -91,6 +91,7 @@ def parameter_matrix(expressions: Sequence[str], names: Sequence[str]) -> NDArra
     return K
 
 
+_ANY_STRIBECK = 0.1  # rad/s or m/s
 _RANK_TOLERANCE = 1e-8
 _DECIMALS = 11
 _FAINT = 0.01  # of a column's length; of the shipped arms' none is below 0.4
@@ -145,8 +146,11 @@ def base_parameters(chain: Chain, layout: Layout) -> BaseParameters:
     samples = max(8, -(-4 * layout.size // chain.joints))
     states = rng.uniform(-np.pi, np.pi, size=(3, samples, chain.joints))
     if "stribeck" in layout.terms:
-        # Also at the speeds where this term differs from Coulomb friction.
-        states[1, ::2] *= np.array(layout.stribeck_velocity) / np.pi
+        # Also at the speeds where this term differs from Coulomb friction; one that is left out stays a parameter.
+        velocities = np.array(layout.stribeck_velocity)
+        velocities[velocities <= NO_STRIBECK] = _ANY_STRIBECK
+        layout = replace(layout, stribeck_velocity=tuple(velocities.tolist()))
+        states[1, ::2] *= velocities / np.pi
     H = joint_regressor(chain, layout, *states).transpose(0, 2, 1).reshape(-1, layout.size)
     return grouping(H, layout.names, layout.units)
 

@@ -89,7 +89,7 @@ class Information:
             weights: per joint, what its equations are multiplied by, shape (joints,); ones when None.
 
         Returns:
-            Upper triangular, shape (base + 1, base + 1).
+            Upper triangular, shape (base + 1, base + 1); rows and columns of parameters that nothing sees are zero.
         """
         rows = []
         for joint, (support, factor) in enumerate(zip(self.supports, self.factors, strict=True)):
@@ -97,8 +97,13 @@ class Information:
             full[:, support] = factor[:, :-1]
             full[:, -1] = factor[:, -1]
             rows.append(full if weights is None else weights[joint] * full)
-        R = triangle(np.vstack(rows))
-        return np.vstack([R, np.zeros((self.base + 1 - R.shape[0], self.base + 1))])
+        every = np.vstack(rows)
+        # A column of zeros would leave it to rounding which rows are mixed.
+        seen = np.append(np.flatnonzero(every[:, :-1].any(axis=0)), self.base)
+        R = triangle(every[:, seen])
+        whole = np.zeros((self.base + 1, self.base + 1))
+        whole[seen[: len(R), None], seen] = R
+        return whole
 
     def squared_residuals(self, beta: Array) -> Array:
         """Return per joint the sum of squared torque errors of `beta` [N^2 m^2 or N^2], shape (joints,)."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from ident_service.config.arm import JointTerm
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.parameter_layout import INERTIAL, Layout
+from ident_service.model.parameter_layout import INERTIAL, NO_STRIBECK, Layout
 from ident_service.model.symbolic import ExpressionGraph, Symbol, Value
 
 Vector = list[Value]
@@ -200,6 +200,8 @@ def _friction_factor(
         return rate
     if term == "coulomb":
         return tape.apply("sign", rate) if direction is None else direction
+    if term == "stribeck" and layout.stribeck_velocity[drive] <= NO_STRIBECK:
+        return 0.0
     if term == "stribeck":
         ratio = rate * (1.0 / layout.stribeck_velocity[drive])
         bell = -(ratio * ratio)

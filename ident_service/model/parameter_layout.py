@@ -35,7 +35,7 @@ TERM_SYMBOLS: dict[JointTerm, str] = {
     "viscous_asymmetry": "fa",
 }
 _TERM_ORDER: tuple[JointTerm, ...] = tuple(TERM_SYMBOLS)
-# [rad/s or m/s] At any speed that is ever recorded nothing is left of Stribeck friction with this velocity.
+# [rad/s or m/s] With this velocity there is no Stribeck friction.
 NO_STRIBECK = 1e-6
 _REVOLUTE_UNITS = {
     "Ia": "kg m^2",

@@ -30,7 +30,7 @@ from ident_service.config.arm import JointTerm
 from ident_service.errors import ModelError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.newton_euler import ZERO, Rotation, Vector, add, cross, dot, rotate, scaled, to_vector, turned
-from ident_service.model.parameter_layout import INERTIAL, Layout
+from ident_service.model.parameter_layout import INERTIAL, NO_STRIBECK, Layout
 from ident_service.model.symbolic import Differentiable, ExpressionGraph, Program, Symbol, Value
 
 _Screw = tuple[Vector, Vector]
@@ -165,7 +165,9 @@ def _joint_terms(
             "quadratic": rate * tape.apply("abs", rate),
             "viscous_asymmetry": tape.apply("abs", rate),
         }
-        if "stribeck" in layout.terms:
+        if "stribeck" in layout.terms and layout.stribeck_velocity[drive] <= NO_STRIBECK:
+            values["stribeck"] = 0.0  # at rest, too, where its curve is one whatever the velocity
+        elif "stribeck" in layout.terms:
             ratio = rate * (1.0 / layout.stribeck_velocity[drive])
             values["stribeck"] = direction[drive] * _exp(tape, -(ratio * ratio))
         for term in layout.terms:

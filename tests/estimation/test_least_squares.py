@@ -138,3 +138,15 @@ def test_exact_equations_leave_no_doubt(arm: ArmModel, base: BaseParameters) -> 
     beta = base.K @ delta
     np.testing.assert_allclose(fit.beta, beta, rtol=0, atol=1e-9 * np.abs(beta).max())
     assert fit.standard_deviations.max() < 1e-9
+
+
+def test_what_nothing_sees_has_no_part_in_the_factor() -> None:
+    rng = np.random.default_rng(3)
+    W, omega = rng.normal(size=(40, 5)), rng.normal(size=40)
+    W[:, [1, 3]] = 0.0
+    R = one_joint_information(W, omega).stacked()
+    assert not R[[1, 3]].any()
+    assert not R[:, [1, 3]].any()
+    np.testing.assert_array_equal(R, np.triu(R))
+    together = np.column_stack([W, omega])
+    np.testing.assert_allclose(R.T @ R, together.T @ together, atol=1e-12)

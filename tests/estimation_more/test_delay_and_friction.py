@@ -259,6 +259,17 @@ def test_friction_that_is_not_there_is_left_out_and_said() -> None:
     assert at_search_bounds(with_none.model.config.identification.friction, ("a", "b"), ("coulomb", "stribeck")) == ()
 
 
+def test_no_row_has_stribeck_friction_that_is_left_out() -> None:
+    model, base, _ = rubbing(plain_friction(presliding=0.0, stribeck_velocity=NO_STRIBECK))
+    # At rest, where the curve of any velocity is one, and at 10 microradians a second.
+    velocity = np.array([[0.0, 0.0], [1e-5, -1e-5], [1.0, 1.0]])
+    states = (np.zeros((3, 2)), velocity, np.zeros((3, 2)))
+    H = joint_regressor(model.chain, model.layout, *states, base.base, direction=np.ones((3, 2)))
+    friction = {name[:2]: k for k, name in enumerate(base.expressions) if name[:2] in ("fc", "fs")}
+    assert not H[:, friction["fs"]].any()
+    assert H[:, friction["fc"]].any(axis=0).all()
+
+
 @pytest.mark.slow
 def test_pre_sliding_and_stribeck_friction_that_are_there_are_kept() -> None:
     model, base, delta = rubbing(FIT)
