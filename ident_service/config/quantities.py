@@ -44,7 +44,7 @@ class LocatedStr(str):
 class Section(BaseModel):
     """Frozen part of a configuration that refuses unknown keys."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class ExtendedSection(Section):
