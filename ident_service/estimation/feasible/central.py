@@ -145,7 +145,7 @@ def centre(
 
 
 def _least_squares(J: Array, r: Array) -> Array:
-    """Return the x that minimises |J x - r|, the smallest one where several do; columns of J have unit length, or none."""
+    """Return the x that minimises |J x - r|, the smallest where several do; columns of J have unit length or none."""
     size = J.shape[1]
     R = triangle(np.column_stack([J, r]))
     if len(R) > size and np.abs(np.diag(R)[:size]).min(initial=1.0) > _RANK:
