@@ -226,7 +226,7 @@ def test_positions_of_an_arm_at_rest_are_told_while_they_are_read(daemon: Asked,
         assert one["joints"] == [joint["joint"] for joint in joints]
         for (position,), joint in zip(one["position"], joints, strict=True):
             assert joint["lowest"] - 1e-6 <= position <= joint["highest"] + 1e-6
-    assert "position" not in daemon.get(f"/api/v1/jobs/{job['id']}/log").text
+    assert daemon.get(f"/api/v1/jobs/{job['id']}/log").text == "reading for 0.5 s, without torque\n"
     # A line that is being written is told when it is whole.
     log = (daemon.service.state / "jobs" / job["id"] / "log").read_bytes()
     (tmp_path / "log").write_bytes(log[:-10])
