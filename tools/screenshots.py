@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from ident_service.client.client import IdentClient, RemoteMotion
 from ident_service.config.load import load_arm, shipped_arms
@@ -152,14 +152,8 @@ def views(client: IdentClient) -> dict[str, str]:
 def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
     """Write a picture of every view."""
     with sync_playwright() as playwright:
-        switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL by software
-        browser = playwright.chromium.launch(executable_path=chromium(), args=switches)
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, timezone_id="UTC", color_scheme="light")
-        page.set_default_timeout(120_000)
-        page.goto(url)
-        page.get_by_label("Token").fill(token)
-        page.get_by_role("button", name="Log in").click()
-        page.get_by_role("heading", name="Arms", level=1).wait_for()
+        browser = playwright.chromium.launch(executable_path=chromium(), args=["--no-sandbox"])
+        page = logged_in(browser, url, token)
         for name, address in views(client).items():
             page.goto(url + address)
             if page.locator("#series").count():
@@ -168,15 +162,18 @@ def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
             page.wait_for_load_state("networkidle")
             save(page, name, out)
         _move(client.arm(ARM).check(confirm=ARM))
-        page.goto(f"{url}/arms/{ARM}")
-        page.locator("#step-run").get_by_role("button", name="Run", exact=True).click()
-        page.get_by_role("heading", name=f"Run {ARM}?").wait_for()
-        page.wait_for_load_state("networkidle")
+        # By software, which is too slow for plots beside it.
+        drawing = playwright.chromium.launch(
+            executable_path=chromium(), args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        )
+        seen = logged_in(drawing, url, token)
+        ask(seen, url)
+        seen.locator("#viewer-controls").wait_for()
+        seen.evaluate("document.getElementById('viewer').scrollIntoView()")
+        save(seen, "view", out)
+        drawing.close()
+        ask(page, url)
         save(page, "confirm", out)
-        page.locator("#viewer-controls").wait_for()
-        page.evaluate("document.getElementById('viewer').scrollIntoView()")
-        save(page, "view", out)
-        page.evaluate("window.scrollTo(0, 0)")
         page.get_by_label("Type the arm's name").fill(ARM)
         page.keyboard.press("Enter")
         page.locator("#live .uplot canvas").first.wait_for()
@@ -190,6 +187,25 @@ def shoot(client: IdentClient, url: str, token: str, out: Path) -> None:
     for job in client.jobs(arm=ARM):  # until the arm has been lowered
         if job.live:
             client.wait(job.id)
+
+
+def logged_in(browser: Browser, url: str, token: str) -> Page:
+    """Return a page of the browser, logged in."""
+    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, timezone_id="UTC", color_scheme="light")
+    page.set_default_timeout(120_000)
+    page.goto(url)
+    page.get_by_label("Token").fill(token)
+    page.get_by_role("button", name="Log in").click()
+    page.get_by_role("heading", name="Arms", level=1).wait_for()
+    return page
+
+
+def ask(page: Page, url: str) -> None:
+    """Ask for a run, which the page then wants to be confirmed."""
+    page.goto(f"{url}/arms/{ARM}")
+    page.locator("#step-run").get_by_role("button", name="Run", exact=True).click()
+    page.get_by_role("heading", name=f"Run {ARM}?").wait_for()
+    page.wait_for_load_state("networkidle")
 
 
 def save(page: Page, name: str, out: Path) -> None:

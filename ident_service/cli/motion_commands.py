@@ -463,6 +463,8 @@ def _watch(arguments: argparse.Namespace) -> Answer:
     stopping = StopOnSignal()
     step_of(arguments)("watching", left=arguments.seconds)
     with stopping:
+        if arguments.tell_samples:
+            print(f"reading for {arguments.seconds:g} s, without torque", file=sys.stderr, flush=True)
         tell = SampleLines() if arguments.tell_samples else lambda described, sample: None
         seen = watch(make_arm(config), arguments.seconds, tell, stop_requested=stopping.requested)
     return DONE, watch_text(seen), watch_document(seen)

@@ -171,6 +171,13 @@ def test_the_figure_of_the_states_is_that_of_the_code() -> None:
         assert re.search(rf"[>\s]{one.value}: {' '.join(to.value for to in many)}[;<]", drawn), "make docs-figures"
 
 
+def test_every_picture_is_shown_and_small() -> None:
+    shown = set(re.findall(r"images/([\w-]+\.(?:png|svg))", "".join(map(Path.read_text, DOCS.rglob("*.md")))))
+    there = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
+    assert sorted(there) == sorted(shown)
+    assert max(there.values()) <= 150_000
+
+
 def test_every_page_has_its_place_in_the_site() -> None:
     nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("\nnav:")[2]
     named = re.findall(r"[\w/-]+\.md", nav)
