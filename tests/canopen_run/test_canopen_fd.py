@@ -46,6 +46,7 @@ def tree(name: str, bus: dict[str, Any], rate: float = RATE, **driver: Any) -> d
     return canopen(described(name, rate, KP, KD), bus, 1, **driver)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_run_in_virtual_time_has_every_answer_in_its_cycle(tmp_path: Path) -> None:
     section = tree("fd", {"interface": "lock_step"})

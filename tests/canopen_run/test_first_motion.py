@@ -38,6 +38,7 @@ def test_every_command_of_the_page_is_one(tmp_path: Path) -> None:
             parser().parse_args(one)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.skipif(not SHEETS.is_dir(), reason="the makers' data sheets are not beside this checkout")
 def test_the_pages_pendulum_is_commissioned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

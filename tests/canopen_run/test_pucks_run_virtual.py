@@ -50,6 +50,7 @@ def test_an_arm_of_pucks_is_checked_run_and_identified(tmp_path: Path, firmware:
     assert np.abs(z).max() < 5.0, z
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_velocity_fault_in_the_middle_of_a_run_is_latched_and_its_recording_can_be_read(
     tmp_path: Path, capsys: Any

@@ -78,6 +78,7 @@ def deviations_off(document: dict[str, Any]) -> np.ndarray:
     return (np.array(found["values"]) - true) / np.array(found["standard_deviations"])
 
 
+@pytest.mark.campaign
 def test_they_are_identified_with_the_parameters(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     load = "--payload", "loaded.mcap=load.yaml"
     assert identify(*FILES, *load, "--torque-constants", "--out", "found") == 0

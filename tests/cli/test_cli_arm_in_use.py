@@ -110,6 +110,7 @@ def test_home_leads_an_arm_that_another_process_holds(ident: Ident, state: Path,
         assert stops == [False]
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_check_comes_after_the_faults(ident: Ident, state: Path) -> None:
     fault_file(state, "planar2").latch("lease_lost", "nobody was there")

@@ -79,6 +79,7 @@ def short(samples: Samples, tmp_path: Path) -> Path:
     return Samples(samples.time[::2], samples.position[::2], samples.torque[::2]).write(tmp_path / "short.csv")
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_state_folder_is_the_option_s_then_the_variable_s_then_the_user_s(
     quick: Commissioned, short: Path, ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -106,6 +107,7 @@ def test_runs_of_the_same_second_get_folders_of_their_own(
     assert {str(path) for path in (state / "runs").iterdir()} == folders
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_seed_gives_the_same_numbers_again(ident: Ident, tmp_path: Path) -> None:
     arm = quick_arm(tmp_path, *COARSE, ("periods: 2", "periods: 1"))  # whose description says seed 1

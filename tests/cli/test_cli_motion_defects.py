@@ -64,6 +64,7 @@ def test_a_design_is_not_written_over(tmp_path: Path, ident: Ident) -> None:
     assert (tmp_path / "motion.json").read_text() == "mine"
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_search_without_time_says_so_and_is_no_success(tmp_path: Path, ident: Ident) -> None:
     ended = ident("design", quick_arm(tmp_path), "--seconds", 1e-9, "--workers", 1, "--out", tmp_path / "m", "--json")
@@ -71,6 +72,7 @@ def test_a_search_without_time_says_so_and_is_no_success(tmp_path: Path, ident: 
     assert "before its first start was complete" in ended.json["warnings"][0]
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_blanks_in_an_expression_do_not_matter(tmp_path: Path, ident: Ident) -> None:
     words = ("--parameter", "Lzz2-0.25*m2", "--out", tmp_path / "m", "--json")

@@ -273,6 +273,7 @@ def test_ctrl_c_ends_a_search_with_what_it_has(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "m").iterdir()) == FILES
 
 
+@pytest.mark.campaign
 def test_the_length_is_the_motion_s_and_the_search_s_time_has_its_own_name(tmp_path: Path, ident: Ident) -> None:
     arm = quick_arm(tmp_path, *COARSE)
     ended = ident(

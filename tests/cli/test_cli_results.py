@@ -118,6 +118,7 @@ def test_figures(folder: Path, ident: Ident, tmp_path: Path, form: str) -> None:
     assert all(path.read_bytes().startswith(start) for path in out.iterdir())
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_letters_are_in_a_png(folder: Path, ident: Ident, tmp_path: Path) -> None:
     resvg = pytest.importorskip("resvg_py")

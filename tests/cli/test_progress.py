@@ -109,6 +109,7 @@ def test_a_terminal_shows_what_is_being_done_and_then_the_answer_alone(quick: Co
     assert STYLE.search(shown)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_nothing_is_drawn_in_pipes_and_without_colours_where_they_are_not_wanted(
     quick: Commissioned, tmp_path: Path

@@ -129,6 +129,7 @@ def state(tmp_path: Path) -> Path:
     return tmp_path / "state"
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_a_run_is_followed_from_afar_through_a_restart(state: Path) -> None:

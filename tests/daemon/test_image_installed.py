@@ -32,6 +32,7 @@ def installed(place: Path) -> Path:
     return place
 
 
+@pytest.mark.campaign
 def test_the_images_command_needs_no_checkout(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     site = installed(machine.place / "site")
     machine.environment["PYTHONPATH"] = str(site)

@@ -285,6 +285,7 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
     assert ("home is set, until its drives lose power" in heard.out) == (said is None)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_a_rehearsal_elsewhere_ends_with_the_key_here(

@@ -14,6 +14,7 @@ from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.base_parameters import base_parameters
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_they_hold_the_truth_and_end_at_a_bound() -> None:
     arm = model_around(random_chain(np.random.default_rng(2), 2, branches=False, prismatic=False))

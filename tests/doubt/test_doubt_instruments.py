@@ -65,6 +65,7 @@ def test_least_squares_is_biased_in_a_noisy_loop_and_instruments_are_not(given: 
     assert np.all(ratio < 5.0)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_of_noise_that_biases_least_squares_is_warned_and_instruments_hold_their_deviations() -> None:
     """Noise of 3e-4 rad, of which a cut-off of 20 Hz lets more pass than the acceleration bears."""

@@ -53,6 +53,7 @@ def test_combinations_are_the_parameters_of_other_coordinates() -> None:
         np.testing.assert_allclose(one, another, rtol=1e-8)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_it_is_calibrated_where_neighbours_are_alike() -> None:
     rng = np.random.default_rng(5)

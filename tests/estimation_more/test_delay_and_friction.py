@@ -360,6 +360,7 @@ def test_degrees_of_freedom_of_both_parts_are_joined() -> None:
     np.testing.assert_allclose(joined, [16.0 / (1.0 / 8.0 + 9.0 / 2.0), 5.0, 8.0])
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("slower", "noise", "seconds"), [(1.0, 0.3, 12.0), pytest.param(0.5, 0.05, 24.0, marks=pytest.mark.campaign)]

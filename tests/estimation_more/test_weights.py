@@ -221,6 +221,7 @@ def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: 
     assert identify(model, [with_noise(0.02)], method="huber").remarks == ()
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_instruments_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
     model, _, _ = three_links()

@@ -65,6 +65,7 @@ def test_a_motion_begins_and_ends_at_rest() -> None:
             np.testing.assert_array_equal(rate, 0.0)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_motion() -> None:
     one, other = (designed_once("planar2", "d_optimal", 1, seed) for seed in (0, 4))
@@ -131,6 +132,7 @@ def test_an_arm_whose_torque_hardly_holds_it_moves(share: float) -> None:
     assert_good(model, torque_margin=0.0)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.parametrize("torque", [pytest.param(3.0, marks=pytest.mark.campaign), 0.5])
 def test_an_arm_that_can_only_hang_moves_about_hanging(torque: float) -> None:
@@ -159,6 +161,7 @@ def test_a_narrow_box_leaves_room_for_a_small_motion() -> None:
     assert_good(model)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_supply_that_hardly_feeds_the_drives_slows_the_motion_down() -> None:
     model = small(supply={"power": 3.0, "standby": 2.0})

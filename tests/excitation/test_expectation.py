@@ -117,6 +117,7 @@ def test_noise_is_the_simulated_driver_s_else_a_hundredth_of_the_torque() -> Non
     np.testing.assert_allclose(described_noise(other, limits).deviation, 0.01 * limits.torque)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.campaign), 1])
 def test_a_motion_designed_with_earlier_information_teaches_more_of_the_rest(seed: int) -> None:

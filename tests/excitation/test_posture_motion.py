@@ -35,6 +35,7 @@ def test_static_parameters_are_what_standing_and_creeping_can_show() -> None:
     assert STATIC.size < base_parameters(TINY.chain, TINY.layout).size
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_few_postures_in_a_tiny_workspace_teach_all_static_parameters_and_everything_is_proven() -> None:
     basis = PostureBasis(4, (1.0,) * 3 + (1.5,) * 3, 0.2)

@@ -69,6 +69,7 @@ def test_however_many_processes_there_are() -> None:
     assert_same(searched(3)[0], starts(3, workers=2))
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_another_seed_is_another_search() -> None:
     one, other = searched(1)[0], starts(1, seed=6)
@@ -166,6 +167,7 @@ def test_time_spent_is_added_up() -> None:
     assert 100.0 < found.seconds < 100.1
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_a_budget_of_work_finds_the_same_however_busy_the_machine_is() -> None:
     """The clock of the budget is the only one that a whole design looks at."""

@@ -32,6 +32,7 @@ def test_a_shipped_motion_may_be_made_from_home(name: str, motion: str) -> None:
     require_clear_from_home(model, excitation(model, motion))  # type: ignore[arg-type]
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_the_arm_with_dry_gears_makes_its_motion_at_its_own_rate(tmp_path: Path) -> None:
     """Its joints stick, and its torque swings by twice its friction wherever they turn round."""

@@ -28,6 +28,7 @@ def recorded(model: ArmModel, purpose: str, path: Path) -> RunReport:
         return run(arm, model, motion, sink)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("planar2", marks=pytest.mark.campaign), "threelink"])
 def test_a_small_arm_moves_and_is_identified(name: str, tmp_path: Path) -> None:

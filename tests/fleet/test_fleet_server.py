@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 RECORDINGS, SINCE = 6, 3
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(300)
 def test_the_registry_of_a_daemon_is_a_fleet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     of, state = kind(rate=100.0, seconds=12.0), tmp_path / "state"

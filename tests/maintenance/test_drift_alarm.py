@@ -20,6 +20,7 @@ DRIER = 1.3
 SEEDS = 20
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_an_unchanged_arm_is_due_no_more_and_raises_nothing(
     db: Database, state: Path, accepted: str, capsys: pytest.CaptureFixture[str]

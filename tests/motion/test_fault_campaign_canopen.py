@@ -44,7 +44,7 @@ def cases(arm: str, times: int, drives: int) -> Iterator[Case]:
 
 
 def sample() -> list[Case]:
-    """One of each kind on the small arm while it moves, one of a differential on the large one, one of its two buses.
+    """One of each kind on the small arm while it moves, one of a differential on the large one.
 
     Pauses and stops are the same for all arms: samples of the simulated arm and of pucks have them.
     """
@@ -56,7 +56,7 @@ def sample() -> list[Case]:
     chosen += rng.sample([case for case in moving if case.kind not in FOREIGN], 5)
     # Early in its motion: simulating the WAM up to the fault is what takes time.
     chosen += [Case("wam canopen", "stuck_torque", State.EXCITING, 0.2 * rng.random(), 1)]
-    return chosen + rng.sample([case for case in two_buses() if case.state is State.EXCITING and case.share < 0.4], 1)
+    return chosen
 
 
 def two_buses() -> Iterator[Case]:

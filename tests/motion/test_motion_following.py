@@ -18,6 +18,7 @@ from ident_service.motion.state_machine import State
 BEFORE = np.array([0.101, 0.077, 0.131, 0.134, 0.040, 0.061, 0.096])
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_the_wam_follows_its_published_motion_twice_as_closely_as_by_its_cad_model_alone() -> None:
     config = load_arm("wam7_sim")

@@ -44,8 +44,8 @@ def slow(which: Subject, joint: int, speed: float, first: int) -> list[Fault]:
 @pytest.mark.parametrize(
     ("arm", "joints", "speed"),
     [
-        *(("bench", 2, 1.0), ("bench", 2, 0.2), ("wam", 7, 1.0)),
-        pytest.param("wam", 7, 0.2, marks=pytest.mark.campaign),
+        *(("bench", 2, 1.0), ("bench", 2, 0.2)),
+        *(pytest.param("wam", 7, speed, marks=pytest.mark.campaign) for speed in (1.0, 0.2)),
     ],
 )
 def test_slowly_begun_freezes_of_all_joints_are_found(arm: str, joints: int, speed: float) -> None:

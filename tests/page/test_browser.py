@@ -241,6 +241,7 @@ def test_a_rehearsal_moves_while_a_key_is_held(browser: Browser, reached: Reache
     assert not in_use(control_path(place, ARM))
 
 
+@pytest.mark.campaign
 def test_a_rehearsal_with_another_name_moves_nothing(browser: Browser, reached: Reached) -> None:
     ready(reached)
     before = len(rows.jobs(reached.service.db, arm=ARM))

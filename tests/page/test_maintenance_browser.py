@@ -77,6 +77,7 @@ def verdict(page: Page) -> str:
     return page.locator(".verdict .state").inner_text()
 
 
+@pytest.mark.campaign
 def test_what_is_due_is_seen_and_done(browser: Browser, reached: Reached) -> None:
     page, problems = log_in(browser, reached), list[str]()
     page.on("pageerror", lambda error: problems.append(str(error)))

@@ -67,6 +67,7 @@ def test_errors_are_as_large_as_their_deviations(scale: float) -> None:
         assert (np.sqrt(np.mean(np.square(noise_alone), axis=0)) > 1.5).all()
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_no_payload_has_uniform_p_and_no_false_alarms() -> None:
     rng = np.random.default_rng(2)
@@ -227,6 +228,7 @@ def test_what_no_motion_shows_of_a_load_is_small_and_said_to_be_chosen(size: flo
     assert all(f"{name} " in line for name in chosen)
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_the_loaded_arm_s_covariance_is_that_of_its_estimate() -> None:
     rng = np.random.default_rng(9)

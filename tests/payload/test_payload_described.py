@@ -28,6 +28,7 @@ def described(folder: Path, name: str, more: str) -> Path:
     return path
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_it_is_held_moved_and_identified_with_its_payload_and_results_say_so(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -50,6 +50,7 @@ def test_some_kills(kill: Kill, virtual: Lane, capsys: pytest.CaptureFixture[str
     assert outcome.status is None or outcome.status.came_to_rest
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_an_arm_whose_runs_were_killed_runs(virtual: Lane) -> None:
     virtual.runs()
