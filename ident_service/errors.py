@@ -125,6 +125,7 @@ _FORMS: tuple[tuple[str, str], ...] = (
     ("^[0-9A-F]{4}:", "an object of the drive and its type, as in 6077:0/i16"),
     (r"^[\x21-\x7e]+", "a word of printable ASCII characters"),
     ("^[0-9a-f]{64}", "a SHA-256 of 64 hexadecimal digits"),
+    ("^[0-9a-f]{16}", "the first 16 hexadecimal digits of a SHA-256"),
 )
 
 

@@ -34,6 +34,8 @@ FILLED = {
     "export": "e",
     "token": "t",
     "upload": "u",
+    "sha256": 16 * "0",
+    "joint": 0,
 }
 MOTION = {"kind": "run", "arm": "planar2"}
 FAR = "203.0.113.9"
