@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -136,10 +137,16 @@ def package_of_module(module: str) -> str | None:
     return package_of("/".join([*parts, "__init__.py"]) if len(parts) == 1 else "/".join(parts) + ".py")
 
 
+@cache
+def nodes_of(source: str) -> list[ast.AST]:
+    """Return the nodes of a source's syntax tree, of each source once."""
+    return list(ast.walk(ast.parse(source)))
+
+
 def imports_in(source: str, file: str) -> Iterator[Import]:
     """Find everything a file imports, inside functions and under conditions too."""
     package = list(Path(file).parent.parts)
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield Import(alias.name, node.lineno)
@@ -250,7 +257,7 @@ def test_few_modules_serve_a_single_other() -> None:
     modules = {file.removesuffix(".py").removesuffix("/__init__").replace("/", "."): file for file in files}
     importers: dict[str, set[str]] = {module: set() for module in modules}
     for module, file in modules.items():
-        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+        for node in nodes_of((ROOT / file).read_text(encoding="utf-8")):
             if isinstance(node, ast.ImportFrom) and node.module:
                 for alias in node.names:
                     name = f"{node.module}.{alias.name}"
@@ -270,7 +277,7 @@ RIDDLES = {"What", "Who", "Whoever", "Whether", "As", "Of", "That", "How", "Wher
 def test_no_docstring_opens_like_a_riddle() -> None:
     found = []
     for file in python_files():
-        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
+        for node in nodes_of((ROOT / file).read_text(encoding="utf-8")):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 words = (ast.get_docstring(node) or "-").split()
                 if words[0].rstrip(",:") in RIDDLES:
