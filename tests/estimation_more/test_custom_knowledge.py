@@ -88,7 +88,8 @@ def ident_json(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, 
 
 @pytest.mark.slow
 def test_the_documented_example(setting: Setting, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    blocks = re.findall(r"```(?:python|yaml)\n# ([a-z_]+\.(?:yaml|py))[^\n]*\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    block = r"```(?:python|yaml)\n# ([a-z_]+\.(?:yaml|py))[^\n]*\n(.*?)```"
+    blocks = re.findall(block, DOCUMENT.read_text(), re.DOTALL)
     assert [name for name, _ in blocks] == ["arm.yaml", "known_bodies.py"]
     for name, text in blocks:
         (tmp_path / name).write_text(text)
