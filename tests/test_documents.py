@@ -75,6 +75,7 @@ def test_a_decision_names_only_decisions_that_exist() -> None:
         assert named <= known, page.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_links_and_files_of_a_document_exist(document: Path) -> None:
     text = document.read_text(encoding="utf-8")

@@ -104,6 +104,7 @@ def test_a_classic_controller_destroys_them_until_their_sender_is_off_the_bus() 
     assert [content(frame) for frame, _ in classic.take() if not frame.error] == [Frame(0x182, b"\1")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wire_is_fd", [False, True])
 def test_a_driver_and_a_wire_that_disagree_end_in_bus_off(name: str, wire_is_fd: bool) -> None:
     with WireThread(CanBusServer(name, SLOW, FAST if wire_is_fd else None)) as thread:

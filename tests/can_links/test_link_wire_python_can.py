@@ -65,6 +65,7 @@ def test_python_can_hears_itself_when_it_asks_for_it(name: str) -> None:
         can.Bus(interface="ident_wire", channel=name)
 
 
+@pytest.mark.slow
 def test_the_canopen_library_reads_an_object_over_the_wire(wire: CanBusServer) -> None:
     dictionary = canopen.ObjectDictionary()
     variable = canopen.objectdictionary.ODVariable("device type", 0x1000)

@@ -315,6 +315,7 @@ def matrix(size: int) -> Document:
     return {"name": "unit", "size": size, "entries": entries}
 
 
+@pytest.mark.slow
 def test_conditions_are_bounded_in_size_and_number() -> None:
     document = feasible()
     certificate = document["feasibility"]["certificate"]

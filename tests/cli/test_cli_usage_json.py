@@ -60,6 +60,7 @@ def test_argparse_s_own_abbreviations_of_json(word: str) -> None:
     assert parser().parse_args(["base", "planar2", word]).json
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [(), ("--",), ("-",), ("json",), ("--jsonl",), ("--state=--json",), ("--", "--json")])
 def test_what_does_not_ask_for_json(words: tuple[str, ...]) -> None:
     assert not asks_for_json(words)

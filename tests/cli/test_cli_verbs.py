@@ -296,6 +296,7 @@ def test_more_delay_in_the_driver_is_more_delay_in_the_check(ident: Ident, tmp_p
     assert far == pytest.approx(near - 19e-3, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
     free = tmp_path / "free"
     run = quick.folder / "identification.mcap"

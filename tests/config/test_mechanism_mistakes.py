@@ -107,6 +107,7 @@ def test_frames_without_a_body_and_urdfs_without_any_are_good(folder: Path, caps
     assert main(["config", "check", str(folder / "arm.yaml")]) == 0
 
 
+@pytest.mark.slow
 def test_a_name_that_no_file_can_have_is_a_mistake(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "arm.yaml").write_text(f"format: ident-arm\nextends: {'y' * 5000}\n")
     assert main(["config", "check", str(folder / "arm.yaml")]) == 2

@@ -168,6 +168,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return (folder / "b.tar").read_bytes()
 
 
+@pytest.mark.slow
 @given(at=st.integers(0, 10**9), how=st.sampled_from(["cut", "flip", "zero"]))
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_damaged_backup_is_refused_and_nothing_changes(good: bytes, tmp_path: Path, at: int, how: str) -> None:
@@ -359,6 +360,7 @@ def tables(registry: Path, folder: Path) -> int:
         return int(copy.execute("SELECT COUNT(*) FROM sqlite_master WHERE type = 'table'").fetchone()[0])
 
 
+@pytest.mark.slow
 def test_the_one_file_has_everything_when_nobody_writes(
     daemon: Asked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -93,6 +93,7 @@ def test_a_registry_that_is_kept_is_busy(daemon: Asked, caplog: pytest.LogCaptur
     assert daemon.post(*MAINTENANCE).status_code == 201
 
 
+@pytest.mark.slow
 def test_who_waits_behind_a_writer_waits_no_longer_than_it(tmp_path: Path) -> None:
     with Database(tmp_path, busy=0.05) as db, ThreadPoolExecutor(1) as thread:
         db.write("CREATE TABLE a (x)")
@@ -211,6 +212,7 @@ def test_a_registry_is_damaged_where_its_bytes_are(tmp_path: Path, capsys: pytes
     assert "ident restore FILE --replace" in said
 
 
+@pytest.mark.slow
 def test_a_stop_that_the_registry_does_not_take_is_entered_later(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,6 +59,7 @@ def figures(daemon: Asked) -> dict[str, set[str]]:
     return found
 
 
+@pytest.mark.slow
 def test_every_figure_and_label_is_there(figures: dict[str, set[str]]) -> None:
     named = [name for expression in expressions() for name in _NAME.findall(expression)]
     assert len(named) > 25

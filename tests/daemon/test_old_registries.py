@@ -63,6 +63,7 @@ def test_an_upgrade_keeps_every_value_and_makes_the_newest_tables(tmp_path: Path
         assert columns(upgraded) == columns(new)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sample", SAMPLES, ids=lambda sample: sample.stem)
 def test_an_upgraded_state_is_served(state: Path, sample: Path) -> None:
     old_state(state, sample)

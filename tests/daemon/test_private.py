@@ -184,6 +184,7 @@ def test_root_leaves_nothing_in_the_folder_of_another_user(
         assert main([*VERBS[0][:2], "bob", *VERBS[0][3:], "--state", str(anothers)]) == 0
 
 
+@pytest.mark.slow
 @as_root
 @pytest.mark.parametrize("arm", [[], ["planar2"]])
 def test_a_stop_by_root_stops_and_leaves_the_owner_what_it_writes(anothers: Path, arm: list[str]) -> None:
@@ -201,6 +202,7 @@ def test_a_stop_by_root_stops_and_leaves_the_owner_what_it_writes(anothers: Path
             pass
 
 
+@pytest.mark.slow
 @as_root
 def test_the_closed_folder_of_another_user_is_told_in_words(
     anothers: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -113,6 +113,7 @@ def test_what_would_be_lost_is_refused(words: list[str], state: Path, capsys: py
     assert "cannot be reached" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["/etc/passwd", "../runs/x", "runs/x", ".hidden", "a b", ""])
 def test_no_run_is_a_path(path: str, state: Path, capsys: pytest.CaptureFixture[str]) -> None:
     server = ["--server", "http://127.0.0.1:1", "--state", str(state)]

@@ -174,6 +174,7 @@ def test_a_stop_at_a_terminal_reaches_what_waits_in_the_daemon(
     capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_acts_at_a_terminal_are_entered_under_a_name(
     daemon: Asked, state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

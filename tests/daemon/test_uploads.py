@@ -234,6 +234,7 @@ def test_columns_are_judged_before_anything_is_sent(daemon: Asked, columns: str,
     assert not (daemon.service.state / ".uploads").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mine.csv", "mine.csv.gz"])
 def test_a_header_is_judged_as_soon_as_it_has_arrived(daemon: Asked, name: str) -> None:
     def pieces(header: str) -> list[bytes]:

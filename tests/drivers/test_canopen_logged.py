@@ -67,6 +67,7 @@ def commands(frames: Sequence[Frame]) -> list[tuple[int, bytes]]:
     return [(frame.identifier, frame.data) for frame in frames if frame.identifier != 0x77F]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("buses", [1, 2])
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
 def test_a_logged_session_gives_the_same_samples_again(tmp_path: Path, suffix: str, buses: int) -> None:

@@ -167,6 +167,7 @@ def test_a_drive_that_says_nonsense_gets_a_report() -> None:
         assert reported(config, bus_probe(config, (), links))
 
 
+@pytest.mark.slow
 @needs_sheets
 def test_a_file_that_is_broken_gets_a_report() -> None:
     config = weightless_config()

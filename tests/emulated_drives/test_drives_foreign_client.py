@@ -52,6 +52,7 @@ def bus(tmp_path: Path) -> Iterator[Bus]:
     assert done[0].unsent == 0
 
 
+@pytest.mark.slow
 def test_sdo_reads_writes_and_refuses(bus: Bus) -> None:
     node = canopen.RemoteNode(1, str(EDS))
     bus.boot(node)
@@ -76,6 +77,7 @@ def test_sdo_reads_writes_and_refuses(bus: Bus) -> None:
         assert refused.value.code == code
 
 
+@pytest.mark.slow
 def test_pdos_states_and_torque(bus: Bus) -> None:
     node = BaseNode402(1, str(EDS))
     bus.boot(node)
@@ -116,6 +118,7 @@ def test_pdos_states_and_torque(bus: Bus) -> None:
         assert node.state == state
 
 
+@pytest.mark.slow
 def test_heartbeat_emergency_and_fault_reset(bus: Bus) -> None:
     node = BaseNode402(2, str(EDS))
     bus.boot(node)

@@ -254,6 +254,7 @@ def tried(name: str, text: str) -> bool:
     return True
 
 
+@pytest.mark.slow
 @needs_sheets
 @settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(st.sampled_from(sorted(CAPABLE)), st.integers(0, 2**32))

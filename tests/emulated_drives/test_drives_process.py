@@ -147,6 +147,7 @@ def test_a_process_of_its_own_outlives_its_host_and_stops_the_arm(tmp_path: Path
     assert document["states"][0].startswith("operational, fault, error 0x")
 
 
+@pytest.mark.slow
 def test_two_interfaces_are_served_at_once(tmp_path: Path) -> None:
     names = [f"drives-{os.getpid()}-{k}" for k in range(2)]
     drives = [{"node": 4, "bus": k, "rated_torque": 1.0, "max_torque": 5.0, "max_speed": 6000.0} for k in range(2)]

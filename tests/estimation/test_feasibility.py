@@ -113,6 +113,7 @@ def test_margin_is_that_of_a_second_formulation(kind: FeasibleSetName, solver: s
         assert (tested.margin > 0.0) is tested.feasible
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("solver", "accuracy"), [("SCS", 1e-4), ("CLARABEL", 1e-5)])
 def test_correction_is_that_of_a_second_formulation(kind: FeasibleSetName, solver: str, accuracy: float) -> None:

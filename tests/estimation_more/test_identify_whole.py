@@ -170,6 +170,7 @@ def test_the_parameter_file_is_valid_and_the_estimate_s(
     assert {*manifest, "manifest.json"} == set(identified.files)
 
 
+@pytest.mark.slow
 def test_verify_proves_it(
     everything: tuple[IdentificationResult, Path, list[str]],
     setting: Setting,

@@ -48,6 +48,7 @@ def identified(recording: SampledRecording) -> Estimate:
     return identify(elbowed()[0], [recording], method="wls")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["torque", "position", "both"])
 @pytest.mark.parametrize("joints", [(0,), (1,), (0, 1)])
 def test_the_wrong_columns_are_named(which: str, joints: tuple[int, ...]) -> None:
@@ -75,6 +76,7 @@ def test_it_is_found_where_both_sides_of_the_equations_are_filtered() -> None:
     assert found.reading == Reading("position", (1,))
 
 
+@pytest.mark.slow
 def test_torques_that_are_all_negated_are_named_as_such() -> None:
     recording = replace(elbowed()[1], torque=-elbowed()[1].torque)
     estimate = identified(recording)
@@ -145,6 +147,7 @@ def test_a_reading_that_no_solver_can_fit_ends_nothing(monkeypatch: pytest.Monke
     assert len(calls) > 1
 
 
+@pytest.mark.slow
 def test_many_short_recordings_are_not_cut_to_nothing() -> None:
     wrong = misread(Reading("torque", (1,)))
     parts = [RangeRecording(wrong, begin, begin + 3.0) for begin in np.arange(56) * 0.3]

@@ -64,6 +64,7 @@ def test_every_term_equals_its_formula() -> None:
     np.testing.assert_allclose(got, drive_torques(layout, delta, dq, ddq, np.sign(dq)), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("term", ALL)
 def test_terms_one_at_a_time(term: JointTerm) -> None:
     chain = serial_chain(3, 3)

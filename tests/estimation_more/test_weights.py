@@ -211,6 +211,7 @@ def test_every_method_finds_the_parameters(estimates: dict[str, np.ndarray]) -> 
     assert off(base.K @ delta) < 1e-9 * whole
 
 
+@pytest.mark.slow
 def test_weights_that_do_not_settle_give_the_best_round_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
     model, _, _ = three_links()
     monkeypatch.setattr("ident_service.estimation.robust_regression._MOST_ROUNDS", 2)

@@ -126,6 +126,7 @@ def test_the_gradient_where_motion_teaches_less_than_the_torque_needs() -> None:
     assert slope == pytest.approx(difference, rel=1e-4, abs=1e-5 * size)
 
 
+@pytest.mark.slow
 @BASES
 def test_variables_and_coefficients_are_the_same_motion(basis: Basis) -> None:
     problem = Problem(random_task(3, 3, "d_optimal", basis), 30)

@@ -110,6 +110,7 @@ def sending(db: Database, url: str, clock: Clock, **words: Any) -> Iterator[Webh
         webhook.close()
 
 
+@pytest.mark.slow
 def test_a_receiver_of_the_convention_verifies_a_notice(receiver: Receiver, db: Database, clock: Clock) -> None:
     with sending(db, receiver.url, clock) as webhook:
         name = webhook.send("arm.due", clock.at, NOTICE)
@@ -134,6 +135,7 @@ def test_a_receiver_of_the_convention_verifies_a_notice(receiver: Receiver, db: 
     assert deliveries(db)[0]["tries"] == 2
 
 
+@pytest.mark.slow
 def test_what_waits_is_sent_after_a_restart(receiver: Receiver, db: Database, clock: Clock) -> None:
     receiver.answers = [503]
     with sending(db, receiver.url, clock) as webhook:
@@ -147,6 +149,7 @@ def test_what_waits_is_sent_after_a_restart(receiver: Receiver, db: Database, cl
     assert len(receiver.heard) == 2
 
 
+@pytest.mark.slow
 def test_it_is_tried_later_and_later_and_given_up_after_days(receiver: Receiver, db: Database, clock: Clock) -> None:
     receiver.answers, began, at = [302], clock.at, list[float]()
     with sending(db, receiver.url, clock) as webhook:
@@ -171,6 +174,7 @@ def test_nothing_more_is_sent_to_who_is_gone(receiver: Receiver, db: Database, c
     assert (deliveries(db)[0]["tries"], audit_log(db)[0]["what"]) == (1, "webhook failed")
 
 
+@pytest.mark.slow
 def test_nobody_there_keeps_nobody_else_waiting(receiver: Receiver, db: Database, clock: Clock) -> None:
     receiver.answers = [500, 204]
     with sending(db, receiver.url, clock) as webhook:

@@ -268,6 +268,7 @@ def test_whatever_is_wanted_what_leaves_is_finite_and_limited(wanted: Array) -> 
         np.testing.assert_array_equal(leaves, 0.0)
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(
     arrays(float, 2, elements=anything()),

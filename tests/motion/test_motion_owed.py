@@ -106,6 +106,7 @@ def test_of_an_arm_that_is_asked_for_no_position_nothing_is_owed() -> None:
     assert cycles_until(owed, NONE) is None
 
 
+@pytest.mark.slow
 def test_what_only_balances_another_joint_is_not_owed() -> None:
     push = 3.0 * STANDING * FRICTION * unit(1)
     for own, found in ((0.0, False), (-1.0, False), (0.3, False), (0.5, True)):

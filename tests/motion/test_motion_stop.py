@@ -42,6 +42,7 @@ FORCED = 0.5 * LIMITS.acceleration**2 / LIMITS.jerk
 SEEDS = st.integers(0, 2**32 - 1)
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(setpoints(LIMITS))
 def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
@@ -109,6 +110,7 @@ def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reach
     close(reference.at(reference.duration + 1e3), end)
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(SEEDS)
 def test_a_stop_that_can_only_just_stay_inside_does(seed: int) -> None:
@@ -156,6 +158,7 @@ def test_a_stop_that_cannot_stay_inside_leaves_by_no_more_than_the_quickest(star
         assert (leaves(within) <= leaves(_unlimited(within)) + 1e-12).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(setpoints(LIMITS, 1.5))
 def test_the_quickest_stop_is_the_one_that_ruckig_finds(start: Setpoint) -> None:
@@ -223,6 +226,7 @@ def test_the_extent_of_the_stops_is_that_of_every_single_one(seed: int) -> None:
     np.testing.assert_allclose(highest, np.max([high for _, high in singles], axis=0), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(SEEDS)
 def test_no_motion_within_its_limits_is_refused_for_its_stops(seed: int) -> None:
@@ -240,6 +244,7 @@ def test_a_long_motion_is_looked_at_in_blocks() -> None:
         np.testing.assert_allclose(highest, points.max(axis=0), atol=1e-3)
 
 
+@pytest.mark.slow
 @settings(max_examples=50)
 @given(SEEDS)
 def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
@@ -253,6 +258,7 @@ def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
     np.testing.assert_allclose(highest, position.max(axis=0), atol=5e-3)
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(SEEDS)
 def test_the_extent_of_a_stop_is_where_it_goes(seed: int) -> None:

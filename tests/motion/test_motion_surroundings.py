@@ -172,6 +172,7 @@ def test_looking_takes_a_bearable_part_of_a_cycle(monkeypatch: pytest.MonkeyPatc
     assert 0 < most <= 9
 
 
+@pytest.mark.slow
 def test_in_a_run_a_way_back_that_is_not_clear_is_none(
     make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:

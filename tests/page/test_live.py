@@ -263,6 +263,7 @@ def test_nothing_is_known_before_the_arm_has_moved() -> None:
     assert doubt is None or not np.isfinite(doubt.deviations).any()
 
 
+@pytest.mark.slow
 def test_a_watched_run_tells_its_doubt(tmp_path: Path) -> None:
     config = load_arm(shipped_arms()["planar2"])
     (tmp_path / "arm.json").write_text(config.model_dump_json())

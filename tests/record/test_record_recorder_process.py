@@ -111,6 +111,7 @@ def test_an_interpreter_that_does_not_start_is_an_error(tmp_path: Path, monkeypa
             process(tmp_path / "run").__enter__()
 
 
+@pytest.mark.slow
 def test_a_killed_recorder_loses_at_most_200_ms(tmp_path: Path) -> None:
     recorder = process(tmp_path / "run")
 
@@ -216,6 +217,7 @@ def test_a_recorder_that_is_held_up(tmp_path: Path) -> None:
     assert "88 records before this were lost: the recorder was overrun" in messages
 
 
+@pytest.mark.slow
 def test_a_recorder_that_does_not_look(tmp_path: Path) -> None:
     """Stopped in its tracks for longer than two seconds it counts as dead, long before the ring is full."""
     with process(tmp_path / "run") as recorder:
@@ -272,6 +274,7 @@ def test_signals_to_the_group_do_not_end_a_recording(tmp_path: Path) -> None:
         assert os.sched_getscheduler(recorder.pid) == os.SCHED_OTHER
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lock_step", [False, True])
 def test_a_killed_writer_leaves_a_finished_file(tmp_path: Path, lock_step: bool) -> None:
     with (
@@ -284,6 +287,7 @@ def test_a_killed_writer_leaves_a_finished_file(tmp_path: Path, lock_step: bool)
     assert check_prefix(tmp_path / "run", False) > 50
 
 
+@pytest.mark.slow
 def test_a_parent_that_dies_leaves_writer_and_recorder_to_end_it(tmp_path: Path) -> None:
     with actor("split", tmp_path / "run", 600) as (parent, (pid, _)), ending(pid):
         await_stream(parent)

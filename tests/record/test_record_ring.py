@@ -308,6 +308,7 @@ class Racing:
         return first + self.target[middle : place.stop]  # type: ignore[index]
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.integers(0, 2**32), st.sampled_from([0, 1, 2, 5, 30]))
 def test_a_reader_that_races_the_writer(seed: int, most: int) -> None:

@@ -144,6 +144,7 @@ def test_the_correlation_matrix_has_names_and_all_values(good: Made) -> None:
     np.testing.assert_allclose(hundredths / 100.0, correlation[np.tril_indices(size, -1)], atol=0.0051)
 
 
+@pytest.mark.slow
 def test_tables_say_what_their_rows_and_columns_are(good: Made, bare: Made) -> None:
     for page in (good.page, bare.page):
         for table in parsed(page).all("table"):

@@ -96,6 +96,7 @@ def test_a_latched_drive_fault_is_reset_when_it_is_acknowledged(
     assert states(behind) == ["pre operational, switch on disabled"] * 2
 
 
+@pytest.mark.slow
 def test_a_cause_that_lasts_is_not_reset_away(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     session(config, behind, DriveFault("drive_fault", 1))
     found = recover(config, state)
