@@ -13,14 +13,16 @@ import numpy as np
 
 from ident_service.config.motion_design import Obstacle as ConfiguredObstacle
 from ident_service.config.motion_limits import motion_limits
+from ident_service.config.quantities import TextFile
 from ident_service.errors import IdentError
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.chain import Array
+from ident_service.model.chain import WORLD, Array
 from ident_service.model.collision import corners, scene
 from ident_service.model.kinematics import branches, frame_origins, joint_poses
-from ident_service.model.solids import HalfSpace
+from ident_service.model.mechanism import Kind, read_mechanism
+from ident_service.model.solids import Body, HalfSpace
 from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
 from ident_service.operations.arm_view import home_position
 from ident_service.results.posture_figure import Box, Closest, Limb, Plane, Postures, Rod, silhouette, stick_figure
@@ -44,9 +46,10 @@ class MotionExtent:
         highest: likewise.
         velocity: largest speed of each joint [rad/s or m/s], shape (joints,).
         limits: of position, shape (joints, 2), and of velocity, shape (joints,).
-        tool_speed: largest speed of any joint's or link's frame [m/s].
-        reach: largest distance of any such frame from the vertical line through the base [m].
-        height: lowest and highest such frame above the base [m].
+        tool_speed: largest speed of any joint, of any link of its file, a tool that is fixed to one too, and of any end
+            of its bodies [m/s].
+        reach: largest distance of any of those, with the bodies' radii, from the vertical line through the base [m].
+        height: lowest and highest of those above the base [m].
     """
 
     name: str
@@ -77,9 +80,10 @@ def motion_extent(model: ArmModel, excitation: Excitation, speed: float = 1.0) -
     limits, path = motion_limits(model.config), excitation.path
     time = np.unique(np.concatenate([np.linspace(begin, end, _SAMPLES) for begin, end in path.distinct]))
     position, velocity, *_ = path.at(time)
-    frames = frame_origins(model.chain, position)
+    fixed = _fixed_points(model)
+    frames, radii = _followed_points(model, fixed, position)
     step = 1e-3
-    speeds = np.linalg.norm(frame_origins(model.chain, path.at(time + step)[0]) - frames, axis=2) / step
+    speeds = np.linalg.norm(_followed_points(model, fixed, path.at(time + step)[0])[0] - frames, axis=2) / step
     home = rest(limits.home)
     begin, end = (Setpoint(*path.at(at)[:3]) for at in (0.0, path.duration))
     approach: tuple[float, float] | None
@@ -99,9 +103,48 @@ def motion_extent(model: ArmModel, excitation: Excitation, speed: float = 1.0) -
         speed * np.abs(velocity).max(axis=0),
         (np.stack([limits.lower, limits.upper], axis=1), limits.velocity),
         speed * float(speeds[:-1].max()),
-        float(np.linalg.norm(frames[..., :2], axis=2).max()),
-        (float(frames[..., 2].min()), float(frames[..., 2].max())),
+        float((np.linalg.norm(frames[..., :2], axis=2) + radii).max()),
+        (float((frames[..., 2] - radii).min()), float((frames[..., 2] + radii).max())),
     )
+
+
+def _fixed_points(model: ArmModel) -> dict[int, list[tuple[Array, float]]]:
+    """Return, per joint, points in its frame [m] with their radii: links of the arm's file, and its bodies."""
+    names, found = model.chain.names, dict[int, list[tuple[Array, float]]]()
+    kinematics = model.config.kinematics
+    files: tuple[tuple[Kind, TextFile | None], ...] = (("urdf", kinematics.urdf), ("mjcf", kinematics.mjcf))
+    for kind, file in files:
+        if file is not None:
+            mechanism = read_mechanism(file, kind, kinematics)  # which made the model, too
+            for joint, _, place in mechanism.frames.values():
+                if joint != WORLD and mechanism.names[joint] in names:
+                    found.setdefault(names.index(mechanism.names[joint]), []).append((place, 0.0))
+    for body in _bodies(model):
+        if body.joint != WORLD and not isinstance(body.solid, HalfSpace):
+            points, radius = corners(body)
+            found.setdefault(body.joint, []).extend((point, radius) for point in points)
+    return found
+
+
+def _followed_points(
+    model: ArmModel, fixed: dict[int, list[tuple[Array, float]]], position: Array
+) -> tuple[Array, Array]:
+    """Return frames and fixed points along positions [m], shape (samples, points, 3), and their radii, (points,)."""
+    frames = frame_origins(model.chain, position)
+    poses, followed, radii = joint_poses(model.chain, position), [frames], [0.0] * frames.shape[1]
+    for joint, points in fixed.items():
+        turned, moved = poses[joint]
+        followed += [(turned @ place + moved)[:, None] for place, _ in points]
+        radii += [radius for _, radius in points]
+    return np.concatenate(followed, axis=1), np.array(radii)
+
+
+def _bodies(model: ArmModel) -> list[Body]:
+    """Return the arm's own bodies; none where its description has mistakes about them."""
+    try:
+        return [one for one in scene(model).bodies if one.owner in (*model.chain.names, "base")]
+    except IdentError:
+        return []
 
 
 def motion_picture(model: ArmModel, excitation: Excitation) -> str:
@@ -146,11 +189,7 @@ def _limbs(model: ArmModel, position: Array) -> list[Limb]:
     poses, frames = joint_poses(chain, position[None]), frame_origins(chain, position[None])[0]
     last = max(chain.joints - 1, 1)
     limbs, clothed = [], set[int]()
-    try:
-        bodies = [one for one in scene(model).bodies if one.owner in (*chain.names, "base")]
-    except IdentError:
-        bodies = []
-    for body in bodies:
+    for body in _bodies(model):
         if isinstance(body.solid, HalfSpace):
             continue
         points, radius = corners(body)

@@ -393,10 +393,10 @@ def test_a_motion_is_confirmed_knowing_its_length_speed_and_reach(daemon: Asked)
         assert (answer.status_code, complaints(answer.text)) == (200, [])
         return re.sub(r"<[^>]+>|\s+", " ", answer.text)
 
-    # Four periods of five seconds; two links of half a metre.
+    # Four periods of five seconds; two links of half a metre, with bodies around them.
     assert re.search(r"Length\s+20 s, and \d s from home", shown("run", 1.0))
     assert re.search(r"Length\s+40 s", shown("run", 0.5))
-    assert re.search(r"Reach\s+joints and tool come up to 1 m from", shown("rehearse", 0.2))
+    assert re.search(r"Reach\s+joints, links and described bodies come up to 1 m from", shown("rehearse", 0.2))
     whole, half = (re.search(r"moves at up to ([\d.]+) m/s", shown("run", speed)) for speed in (1.0, 0.5))
     assert whole is not None
     assert half is not None
