@@ -278,8 +278,9 @@ def new_description(
         path = path.with_name(f"{path.stem}-arm.yaml")
     beside = None if read.kind == "dh" else path.parent / source.name
     for there in (path, beside):
-        if there is not None and there.exists() and not (there == beside and there.samefile(source)):
-            raise UsageError(f"{there}: exists already; give --out another place")
+        if there is None or not there.exists() or (there == beside and there.read_bytes() == source.read_bytes()):
+            continue
+        raise UsageError(f"{there}: exists already; give --out another folder")
     part: dict[str, Any] = {read.kind: source.name, **arm_part(read.outline, source.name, base, tip)} if beside else {}
     if read.table is not None:
         part = {"dh": read.table.model_dump(mode="json")}

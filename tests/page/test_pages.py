@@ -18,6 +18,7 @@ from daemon.conftest import URL, Asked, known_arm, quick_text, serving
 from daemon.conftest import commissioned as commissioned
 from fastapi.routing import APIRoute
 
+from ident_service.cli import main
 from ident_service.daemon.app import PAGES
 from ident_service.daemon.maintenance.reidentification import enter_concluded
 from ident_service.daemon.web.render import STATIC, mark, static
@@ -305,6 +306,18 @@ def test_stop_needs_nobody_here_and_somebody_elsewhere(daemon: Asked) -> None:
     assert daemon.post("/stop", headers={"Origin": "http://elsewhere.example"}).status_code == 403
     enter(daemon, "viewer")
     assert daemon.post("/stop", headers={"Origin": URL}, address="203.0.113.9").status_code == 200
+
+
+def test_a_set_that_was_accepted_elsewhere_has_no_link(daemon: Asked, commissioned: Path, tmp_path: Path) -> None:
+    enter(daemon, "viewer")
+    assert f'href="/runs/{commissioned.name}"' in daemon.get(f"/arms/{ARM}").text
+    shutil.copytree(commissioned, tmp_path / "elsewhere")
+    state = str(daemon.service.state)
+    assert main(["accept", str(tmp_path / "elsewhere"), "--note", "x", "--by", "ann", "--state", state]) == 0
+    for page in (f"/arms/{ARM}", f"/arms/{ARM}/parameters"):
+        text = daemon.get(page).text
+        assert "elsewhere" in text
+        assert "/runs/elsewhere" not in text
 
 
 def test_accepting_asks_for_the_name_and_mistakes_are_pages(daemon: Asked, commissioned: Path) -> None:
