@@ -20,7 +20,7 @@ import yaml
 
 from ident_service.config.kinematics import angles_barely_rounded
 from ident_service.config.load import load_arm
-from ident_service.config.motion_design import BASE
+from ident_service.config.motion_design import BASE, Capsule
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import TextFile
 from ident_service.config.yaml_source import MODELINE, SCHEMA, arm_schema_file
@@ -483,6 +483,22 @@ def _worst(model: ArmModel, ranges: list[tuple[float, float]]) -> tuple[Array, A
     return gravity, inertia
 
 
+def _guessed_capsules(model: ArmModel, link: int) -> list[Capsule]:
+    """Return capsules of a link whose mesh cannot be read; of the last one as far as its body or its tool reaches."""
+    found = list(lines_of(model, link))
+    kinematics = model.config.kinematics
+    if len(found) != 1 or found[0].start != found[0].end or kinematics.urdf is None:
+        return found
+    mechanism = read_mechanism(kinematics.urdf, "urdf", kinematics)
+    joint = mechanism.names.index(model.chain.names[link])
+    body = mechanism.bodies[joint]
+    # Links that are fixed to it, and as much behind its centre of mass as before it.
+    ends = [place for carrier, _, place in mechanism.frames.values() if carrier == joint]
+    ends += [2.0 * body[6:9] / body[9]] if body[9] > 0.0 else []
+    end = max(ends, key=lambda one: float(np.linalg.norm(one)), default=np.zeros(3))
+    return [found[0].model_copy(update={"end": tuple(np.round(end, 4).tolist())})]
+
+
 def _bodies(draft: Draft, loaded: Callable[[], ArmModel], read: Source) -> None:
     """Set capsules in place of meshes, and list the pairs of links that touch in most postures."""
     model = loaded()
@@ -490,7 +506,7 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], read: Source) -> None:
     capsules, unread = arm_capsules(read.outline, model.config.kinematics, chain)
     for owner in unread:
         if owner not in capsules:
-            capsules[owner] = list(lines_of(model, chain.names.index(owner))) if owner != BASE else []
+            capsules[owner] = _guessed_capsules(model, chain.names.index(owner)) if owner != BASE else []
     if read.kind == "dh" or not (capsules or draft.part.get("urdf")):
         capsules = {name: list(lines_of(model, link)) for link, name in enumerate(chain.names)}
         draft.remarks.append("geometry: rods along the links, because the file has none")

@@ -341,6 +341,8 @@ def test_limits_are_the_files_to_the_digit(tmp_path: Path, capsys: pytest.Captur
     assert all(one.position == (0.331613, 5.95157) for one in beyond_zero.joints.values())
     # The two meshes are not there.
     assert "a mesh of elbow, shoulder could not be read" in said
+    (forearm,) = config.geometry["elbow"]
+    assert (forearm.start, forearm.end) == ((0.0, 0.0, 0.0), (0.04, -0.02, 0.1))  # twice as far as its centre of mass
     assert config.constraints.total_mass.upper == pytest.approx(6.0)
 
 
