@@ -21,6 +21,7 @@ from ident_service.motion.after_stop import StopSecuring, after_stop, falling_jo
 from ident_service.motion.arm_factory import GROUP
 from ident_service.preflight.stability import StabilityReport, delay_of, stability
 
+_MASS = re.compile(r"m\d+")
 _NAMED = re.compile(r"kinematics\.(\w+): ")  # the key that a complaint about a mechanism begins with
 
 
@@ -83,6 +84,7 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
         raise config_error(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
         _require_names(arm, model, config, where)
+    _require_masses(arm, config)
     budget, cut_off = _bus(arm, config)
     warnings = (*cut_off, *remarks_on_angles(base_parameters(model.chain, model.layout)))
     if missing := _missing(arm, model):
@@ -159,6 +161,22 @@ def _place(message: str) -> tuple[str, ...]:
         "parameters this arm does not have": "prior",
     }
     return (next((key for words, key in about.items() if words in message), "kinematics"),)
+
+
+def _require_masses(arm: str | Path, config: ArmConfig) -> None:
+    """Refuse masses of the prior that no body has, each at its place."""
+    table = config.prior
+    named = () if table is None else zip(table.names, table.values, strict=True)
+    if problems := [
+        located(
+            arm,
+            ("prior", name),
+            f"prior.{name}: a link's mass is above 0, not {value:g} kg; give the masses of CAD, or no prior",
+        )
+        for name, value in named
+        if _MASS.fullmatch(name) and not value > 0.0
+    ]:
+        raise ConfigError(problems)
 
 
 def _require_names(arm: str | Path, model: ArmModel, config: ArmConfig, where: tuple[str, ...]) -> None:

@@ -28,6 +28,7 @@ from ident_service.errors import RecordingError
 from ident_service.recordings.files import require_file, sha256
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Stamps, assemble
 
+_TOLD = 5  # columns that appear twice, one by one
 _MOST_COLUMNS: Final = 4096
 _NAME: Final = re.compile(r"(q|dq|tau)([1-9]\d{0,3})")
 
@@ -85,7 +86,9 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
         raise RecordingError(path, f"line 1: {len(names)} columns; a recording has {_MOST_COLUMNS} at most")
     if wrong := _no_header(header, names):
         raise RecordingError(path, f"line 1: {wrong}")
-    problems = [f"column {name!r} appears twice" for name, count in sorted(Counter(names).items()) if count > 1]
+    twice = [name for name, count in sorted(Counter(names).items()) if count > 1]
+    problems = [f"column {name!r} appears twice" for name in twice[:_TOLD]]
+    problems += [f"{len(twice) - _TOLD} more columns appear twice"] if len(twice) > _TOLD else []
     if columns is None:
         place = {name: index for index, name in enumerate(names)}
     else:

@@ -126,6 +126,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             ["13:40: prior: parameters this arm does not have: weight; it has Lxx1 ... fo2"],
         ),
         (
+            "m2: 1.0}\ncontrol",
+            "m2: -1.0}\ncontrol",
+            ["13:40: prior.m2: a link's mass is above 0, not -1 kg; give the masses of CAD, or no prior"],
+        ),
+        (
             "elbow: {position",
             "elbow_: {position",
             [

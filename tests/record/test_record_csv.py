@@ -156,6 +156,8 @@ def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
         "missing dq1, dq3",
     ):
         assert problem in str(caught.value)
+    with pytest.raises(RecordingError, match="column 'a12' appears twice; 15 more columns appear twice; "):
+        CsvRecording(write(tmp_path / "run.csv", ",".join(2 * [f"a{k}" for k in range(20)]) + "\n"))
     for header in ("", "\n", "t,q9999\n", "t;q1;tau1\n", "t\n", "t,q0,tau0\n"):
         with pytest.raises(RecordingError):
             CsvRecording(write(tmp_path / "run.csv", header))
