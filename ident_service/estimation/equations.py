@@ -210,6 +210,12 @@ def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDAr
             f"{said}, and samples are {period:.3g} s apart: is the time not in seconds? Name its unit: "
             "recording.columns: {t: {column: NAME, unit: ms}}",
         )
+    if not moved.any():
+        raise RecordingError(
+            recordings[0].path,
+            f"{said}: are positions in the unit that recording.columns names? It is rad or m where none is named. "
+            "If they are, record a motion",
+        )
     raise RecordingError(
         recordings[0].path,
         f"{said}, so that neither its inertia nor its friction shows; record a motion of it, or, where it is held, "

@@ -46,6 +46,7 @@ from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Matrix, Rec
 REGULAR: Final = 1e-3  # of a period; what stamps in whole nanoseconds or few decimals differ by
 CROWDED: Final = 0.1  # of a period; samples closer than this are too close to draw a curve through both
 MAX_GAPS: Final = 1000
+_QUICKEST_SAMPLING = 5e-5  # s; no recording of an arm has shorter steps, but its time may be in another unit
 _RATES: Final = (0.8, 10.0)  # of the own rate
 _NEAR: Final = (0.4, 1.6)  # of the usual step; a lost sample makes 2
 _ROUNDS: Final = 4
@@ -347,6 +348,12 @@ def uniform(
     least = stamps.least_s(shortest_s)
     longest = max(segment.duration_s for segment in stamps.segments)
     if longest < least:
+        if stamps.own_period_s < _QUICKEST_SAMPLING:
+            raise RecordingError(
+                recording.path,
+                f"samples are {stamps.own_period_s:.3g} s apart, and all of them last {longest:.4g} s: is the time in "
+                "the unit that recording.columns names? It is s where none is named",
+            )
         raise RecordingError(
             recording.path,
             f"the longest stretch without a gap (a step above {stamps.gap_s * 1e3:.4g} ms) is {longest:.4g} s; "

@@ -53,6 +53,9 @@ def test_short_segments_are_left_out() -> None:
     assert [segment.duration_s < known.least_s(0.05) for segment in known.segments] == [False, True, False]
     with pytest.raises(RecordingError, match=r"longest stretch without a gap .* is 0\.829 s; at least 1 s"):
         list(uniform(recording, PLAIN, known, shortest_s=1.0))
+    hurried = moving(np.arange(1000) * 1_000)  # milliseconds that were taken for microseconds
+    with pytest.raises(RecordingError, match=r"samples are 1e-06 s apart, .* unit that recording\.columns names"):
+        list(uniform(hurried, PLAIN, shortest_s=1.0))
 
 
 def acceleration_error(make: str, share: float, frequencies: tuple[float, ...] = (0.3, 1.1, 2.7)) -> float:

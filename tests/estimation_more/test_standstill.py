@@ -107,6 +107,9 @@ def test_a_joint_that_never_moves_is_named() -> None:
         RecordingError, match=rf"{name}: never faster than .* in it, .* kinematics\.lock: {{{name}: POSITI"
     ):
         equations(held, model, base)
+    nowhere = replace(recording, position=np.full_like(still, 0.3), sha256="2" * 64)
+    with pytest.raises(RecordingError, match=r"are positions in the unit that recording\.columns names"):
+        equations(nowhere, model, base)
     # Another recording may move it, and whoever only judges needs no motion of it.
     assert equations([held, recording], model, base).samples > equations(recording, model, base).samples
     assert equations(held, model, base, judging=True).samples > 0
