@@ -222,10 +222,8 @@ def _identified(ended: Ended) -> list[str]:
 
 
 def _compared(ended: Ended) -> list[str]:
-    other = ended.short(ended.given.others[-1])
-    if ended.said.get("verdict") == "changed":
-        return ["accept", other, "--note", WHY]
-    return ["report", other]
+    # What has changed is looked at, and mended or accepted, by a person.
+    return ["report", ended.short(ended.given.others[-1])]
 
 
 def _tested(ended: Ended) -> list[str]:

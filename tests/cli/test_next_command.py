@@ -83,7 +83,7 @@ TABLE: list[tuple[str, int, Mapping[str, Any], str]] = [
         {"folder": "/r", "unusable": ["wrong after 2 s of motion"], "another_motion_mends": False},
         "report /r",
     ),
-    ("compare a b", 3, {"verdict": "changed"}, "accept b --note WHY"),
+    ("compare a b", 3, {"verdict": "changed"}, "report b"),
     ("compare a b", 0, {"verdict": "unchanged"}, "report b"),
     ("feasible t.json", 3, {}, "project t.json --out feasible.json"),
     ("fleet status 'a/*' --arm wam7 --store s", 0, {}, "fleet identify 'a/*' --arm wam7 --store s"),
