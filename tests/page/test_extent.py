@@ -1,4 +1,4 @@
-"""How far an arm goes along a motion is told with everything that is fixed to its links."""
+"""Extent of a motion: whatever is fixed to a link counts."""
 
 from __future__ import annotations
 

@@ -65,6 +65,6 @@ form?.addEventListener("submit", (event) => {
   const button = form.querySelector("button");
   button.disabled = true;
   send(document.getElementById("upload-file").files[0], document.getElementById("upload-columns").value)
-    .catch((error) => (said.textContent = `Not uploaded: ${error.message} Mend what this says, then upload it again; what has arrived is kept.`))
+    .catch((error) => (said.textContent = `Not uploaded: ${error.message} Mend what this says, then upload it again.`))
     .finally(() => (button.disabled = false));
 });
