@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
+import resource
 import statistics
+import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,6 +35,15 @@ def median_seconds(call: Callable[[], object], repeats: int = 7, warmups: int = 
         call()
         times.append(time.perf_counter() - begin)
     return statistics.median(times)
+
+
+def cpu_seconds(words: Sequence[str]) -> tuple[float, str]:
+    """Return the processor seconds of a command with all its children, and what it printed; one BLAS thread."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(words, check=True, capture_output=True, text=True, env=environment)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
 
 
 def table(rows: list[Row]) -> str:

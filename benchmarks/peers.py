@@ -15,18 +15,15 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import statistics
-import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
-from benchmarks.harness import Row, table, write
+from benchmarks.harness import Row, cpu_seconds, table, write
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.pinocchio_models import pinocchio_model
@@ -65,13 +62,13 @@ def measure(folder: Path) -> list[Row]:
         files = [str(folder / "arm.urdf"), fit, unseen, str(exact)]
         words |= {name: [*script, *files] for name, script in scripts.items()}
         for name, command in words.items():
-            spent, said = _cpu_seconds(command)
+            spent, said = cpu_seconds(command)
             if turn:  # once for warm files and compiled modules
                 seconds[name].append(spent)
             if name in scripts:
                 errors[name] = json.loads(said)
     judged = [*ours, "--validate", unseen, "--out", str(folder / "judged")]
-    _cpu_seconds(judged)
+    cpu_seconds(judged)
     own = json.loads((folder / "judged" / "parameters.json").read_text())["validation"][0]["relative_error_percent"]
     identified = dynamic_model(folder / "judged" / "parameters.json", _ARM)
     *motion, torque = (part[::10] for part in states)
@@ -116,14 +113,6 @@ def _record(
     head = ",".join(["t", *names])
     np.savetxt(path, np.column_stack([time, *noisy]), delimiter=",", fmt="%.9g", header=head, comments="")
     return q, dq, ddq, torque
-
-
-def _cpu_seconds(words: Sequence[str]) -> tuple[float, str]:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(words, check=True, capture_output=True, text=True, env=environment)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, done.stdout
 
 
 def main() -> None:

@@ -22,7 +22,12 @@ from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import residual_deviation
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.feasible.torque_scales import constrained_least_squares_with_scales, scale_bounds
-from ident_service.estimation.friction_fit import fit_friction, fitted_friction_parameters, friction_trials
+from ident_service.estimation.friction_fit import (
+    FrictionTrials,
+    fit_friction,
+    fitted_friction_parameters,
+    friction_trials,
+)
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
 from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
@@ -132,9 +137,13 @@ def prepare(
         seconds = 0.0
         # For averaged periods (derivatives by harmonics, torque unfiltered) no delay is searched for.
         if model.config.identification.period is None:
-            trials = friction_trials(recordings, model, base)
+            undelayed = trials = friction_trials(recordings, model, base)
             period = min(grid(recording, model.config.recording).period_s for recording in recordings)
-            seconds, choice = choose_delay(trials, period, base, conditions)
+
+            def trials_at(delay: float) -> FrictionTrials:
+                return undelayed if delay == 0.0 else friction_trials(recordings, with_delay(model, delay), base)
+
+            seconds, choice = choose_delay(trials_at, period, base, conditions)
             choices += () if choice is None else (choice,)
         model = with_delay(model, seconds)
         trials = trials if seconds == 0.0 else None

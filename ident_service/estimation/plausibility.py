@@ -39,6 +39,8 @@ _JUMP = 20.0  # times the usual step between samples
 _LEAST_JUMP = 0.02  # rad or m
 _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
+_JOINTS_WITH_SIGN = 4  # moving joints of which gravity and friction turn the torque of at least one round
+_AT_REST = 0.9  # share of the time at standstill from which a joint need not feel a changing torque
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,12 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
         for index, seen in enumerate(joints)
         for reason in _of_joint(model.chain.names[index], seen, model, revolute=model.chain.revolute[index])
     ]
-    return (*found, *(f"{recording}: {reason}" for reason in _weight(joints, model)))
+    return (*found, *(f"{recording}: {reason}" for reason in (*_weight(joints, model), *_without_sign(joints))))
+
+
+def torque_missing(seen: JointQuality) -> bool:
+    """Return whether a joint's torque never changes although it moves: what was recorded is not its torque."""
+    return seen.torque[0] == seen.torque[1] and seen.standstill < _AT_REST
 
 
 def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
@@ -290,12 +297,24 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
             f"{name} jumps by {seen.largest_step:.3g} {unit} between two samples, {seen.usual_step:.2g} as a rule: cut"
             f" or mend the samples {seen.where:.4g} s after the first"
         )
+    if torque_missing(seen):
+        yield (
+            f"the torque of {name} is always {seen.torque[0]:g} although it moves from {low:.4g} to {high:.4g} {unit}:"
+            " it was not recorded, or another column was meant (recording.columns)"
+        )
     torque, most = (None if described is None else described.torque), max(-seen.torque[0], seen.torque[1])
     if torque is not None and most > _TOO_STRONG * torque:
         yield (
             f"the torque of {name} reaches {most:.4g}, {most / torque:.0f} times its limit of {torque:g}: is it in"
             " other units, or of another joint?"
         )
+
+
+def _without_sign(joints: Sequence[JointQuality]) -> Iterator[str]:
+    """Yield a reason where no torque of many joints that move changes its sign, as of a current's magnitude."""
+    moving = [seen for seen in joints if seen.standstill < _AT_REST and not torque_missing(seen)]
+    if len(moving) >= _JOINTS_WITH_SIGN and all(seen.torque[0] >= 0.0 for seen in moving):
+        yield "no joint's torque is ever negative: were magnitudes recorded? The model needs their signs"
 
 
 def _weight(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:

@@ -10,7 +10,7 @@ by feasible estimates: without conditions the first order gives a KUKA 29 ms tha
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,25 +90,49 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
 
 
 def choose_delay(
-    trials: FrictionTrials, period: float, base: BaseParameters, conditions: FeasibleSet
+    trials_at: Callable[[float], FrictionTrials], period: float, base: BaseParameters, conditions: FeasibleSet
 ) -> tuple[float, Choice | None]:
-    """Choose a delay of a few samples, common to all joints; zero unless a delay is clearly better.
+    """Choose a delay that is common to all joints; zero unless a delay is clearly better.
+
+    It is searched for within a few samples, and further on about the largest of them while that one is clearly better.
 
     Args:
-        trials: rows of the recordings that are fitted to.
+        trials_at: gives rows of the recordings that are fitted to, the torque taken to be stamped so much too late [s].
         period: of their samples [s].
         base: grouping of the parameters.
         conditions: that estimates are held in.
 
     Returns:
-        The delay [s], and how it was chosen; None where a joint does not move in every third.
+        The delay [s], and how it was chosen; None where a joint does not move in every third. Zero where it would be
+        more than 0.2 s, so that the channels do not belong together.
     """
+    step = max(period, _STEP)
+    seconds, first = _choose_near(trials_at(0.0), step, base, conditions)
+    last, moved = first, seconds
+    while last is not None and abs(moved) == _STEPS * step:
+        if abs(seconds) > _LARGEST:
+            return 0.0, None if first is None else replace(first, value=_words(0.0))
+        moved, last = _choose_near(trials_at(seconds), step, base, conditions)
+        seconds += moved
+    if first is None or last is None or last is first:
+        return seconds, first
+    errors = {_words(0.0): first.held_out[_words(0.0)], _words(seconds): last.held_out[last.value]}
+    return seconds, Choice("delay", _words(seconds), errors)
+
+
+def _words(seconds: float) -> str:
+    return f"{1e3 * seconds:.3g} ms"
+
+
+def _choose_near(
+    trials: FrictionTrials, step: float, base: BaseParameters, conditions: FeasibleSet
+) -> tuple[float, Choice | None]:
+    """Choose a further delay of at most a few steps; zero unless it is clearly better."""
     thirds_at = trials.delayed_rows(np.full(trials.joints, 0.1))
     at_once = thirds_at(0.0)
     if any(not part.rows.all() for part in at_once):
         return 0.0, None
     weights = weighted_least_squares(Information.sum(at_once)).weights
-    step = max(period, _STEP)
     tried: dict[float, Array] = {}
 
     def error(steps: float) -> float:
@@ -126,7 +150,7 @@ def choose_delay(
         vertex = 0.5 * (low - high) / bend if bend > 0.0 else 0.0  # of the parabola through the three
         if abs(vertex) > _FINEST:
             found = min((found, found + vertex), key=error)
-    ways = {f"{1e3 * steps * step:.3g} ms": steps for steps in (0.0, found or min((-1.0, 1.0), key=error))}
+    ways = {_words(steps * step): steps for steps in (0.0, found or min((-1.0, 1.0), key=error))}
     choice = significant_choice("delay", {name: tried[steps] for name, steps in ways.items()})
     return step * ways[choice.value], choice
 

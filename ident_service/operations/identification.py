@@ -27,6 +27,7 @@ from ident_service.estimation.plausibility import (
     reasons_in_length,
     reasons_in_recording,
     remarks_on_limits,
+    torque_missing,
 )
 from ident_service.model.arm_model import arm_model
 from ident_service.model.chain import Array
@@ -238,11 +239,13 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     """Return the reasons, from its recordings and its errors, why an estimate must not be used."""
     model = estimate.model
     seen = (reasons_in_recording(recording.path.name, one.joints, model) for recording, one in found)
-    known = set(estimate.recordings)
-    fitted = [(recording, one) for recording, one in found if (recording.path.name, recording.sha256) in known]
+    names = set(estimate.recordings)
+    fitted = [(recording, one) for recording, one in found if (recording.path.name, recording.sha256) in names]
     seconds = sum(one.duration_s for _, one in fitted)
     wrong = (reason for reasons in seen for reason in reasons)
-    against = reasons_against(estimate, [recording for recording, _ in fitted])
+    # Without a joint's torque every reading of the others is as wrong.
+    known = not any(torque_missing(joint) for _, one in fitted for joint in one.joints)
+    against = reasons_against(estimate, [recording for recording, _ in fitted]) if known else ()
     return Objections((*wrong, *against), reasons_in_length(estimate, seconds))
 
 

@@ -130,7 +130,9 @@ def test_a_delay_beyond_reason_is_refused() -> None:
         estimate_delay([late(0.35)], model, base)
 
 
-@pytest.mark.parametrize(("seconds", "taken"), [(0.0, False), (0.003, True), (0.006, True), (-0.01, True)])
+@pytest.mark.parametrize(
+    ("seconds", "taken"), [(0.0, False), (0.003, True), (0.006, True), (-0.01, True), (0.06, True)]
+)
 def test_a_delay_is_chosen_where_there_is_one(seconds: float, taken: bool) -> None:
     model, _, _ = two_links()
     estimate = identify(with_options(model, plain_options(smoothing=SMOOTH, delay="choose")), [late(seconds)])
@@ -141,6 +143,13 @@ def test_a_delay_is_chosen_where_there_is_one(seconds: float, taken: bool) -> No
     assert found == pytest.approx(seconds, abs=0.5e-3)
     errors = list(choice.held_out.values())
     assert (errors[1] < 0.9 * errors[0]) is taken
+
+
+def test_channels_that_do_not_belong_together_have_no_delay() -> None:
+    model, _, _ = two_links()
+    estimate = identify(with_options(model, plain_options(smoothing=SMOOTH, delay="choose")), [late(0.35)])
+    assert estimate.choices[0].value == "0 ms"
+    assert estimate.model.config.identification.delay == 0.0
 
 
 def test_a_delay_of_one_third_is_not_taken() -> None:
