@@ -24,6 +24,7 @@
     └── ArmError (RuntimeError)        something below the motion loop
         ├── DriverError (OSError)      the arm cannot be opened, enabled or reached
         │   ├── ActionNeeded           a person has to act at the arm first, as the message says
+        │   │   └── EmergencyStopped   the emergency stop is pressed, or has been
         │   ├── AnotherDrive           a drive answers that the description does not name
         │   ├── NobodyEnabled          a person did not enable the arm in time, or is no longer waited for
         │   └── PositionUnknown        the encoders lost their zero: a person must set the home
@@ -228,6 +229,10 @@ class DriverError(ArmError, OSError):
 
 class ActionNeeded(DriverError):
     """A person has to act at the arm first; the message says how."""
+
+
+class EmergencyStopped(ActionNeeded):
+    """The emergency stop is pressed, or has been and must be cleared; the message says how."""
 
 
 class AnotherDrive(DriverError):

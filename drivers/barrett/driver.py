@@ -34,7 +34,7 @@ from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, motor_coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.barrett import BarrettDriver
-from ident_service.errors import ActionNeeded, DriverError, NobodyEnabled, PositionUnknown
+from ident_service.errors import ActionNeeded, DriverError, EmergencyStopped, NobodyEnabled, PositionUnknown
 
 LOOK_RATE = 20.0  # Hz
 _SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
@@ -419,7 +419,7 @@ class BarrettArm(Arm):
                 f"{', '.join(bad)} has an error (STAT 1), which `ident recover ARM` clears once its cause has gone"
             )
         if codec.safety.mode == SafetyMode.ESTOP:
-            raise ActionNeeded("the emergency stop is pressed, or has been: release it, then press Shift-Idle")
+            raise EmergencyStopped("the emergency stop is pressed, or has been: release it, then press Shift-Idle")
         causes = [cause for cause in codec.safety.pendant.faults if cause not in ("heartbeat", "e-stop")]
         if causes:
             raise ActionNeeded(f"the pendant shows {' and '.join(causes)} fault; {_SHIFT_IDLE}")

@@ -37,7 +37,8 @@ from ident_service.model.pinocchio_models import InverseDynamics
 # Times the expected friction, which is a guess: by how much the push may change against a joint that stands, and along
 # the direction of one that slid, since friction is larger at rest and other joints react.
 STANDING, SLIDING = 3.0, 1.0
-SLID = 20  # cycles within which a second step in the same direction shows that a joint slides
+# s within which a second step in the same direction shows that a joint slides; longer apart, it may stand in between.
+SLID = 0.02
 HIDDEN_SHARE, STEPS = 0.02, 10.0  # of the following error allowed; and steps of the encoder
 _SAME = 1e-9  # rad or m, by which a drive's position that did not change may seem to: positions are computed back
 
@@ -149,7 +150,7 @@ class FrozenEncoderObserver:
         self._base_fed = np.zeros_like(friction)
         self._none: Flags = np.zeros(len(friction), dtype=bool)
         self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
-        self._cycle = 0
+        self._cycle, self._slides_within = 0, max(1, round(SLID / period))
         self._stepped: Counts = np.zeros(len(friction), dtype=np.int64)
         self._owing = False
 
@@ -182,7 +183,7 @@ class FrozenEncoderObserver:
         pushed = correction + fed
         changed = direction != 0.0
         if changed.any():
-            slides = (direction == self._direction) & (self._cycle - self._stepped <= SLID)
+            slides = (direction == self._direction) & (self._cycle - self._stepped <= self._slides_within)
             np.copyto(self._slid, direction * slides, where=changed)
             np.copyto(self._direction, direction, where=changed)
             np.copyto(self._stepped, self._cycle, where=changed)

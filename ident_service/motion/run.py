@@ -22,7 +22,7 @@ import numpy as np
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.errors import ArmFault, DriverError, MotionRefused, NobodyEnabled
+from ident_service.errors import ArmFault, DriverError, EmergencyStopped, MotionRefused, NobodyEnabled
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.collision import Contact
@@ -292,7 +292,7 @@ class _Run:
         """
         try:
             self.states.enter(State.CHECKED)
-            action = self.arm.operator_action
+            action, wanted = self.arm.operator_action, self.arm.still_wanted
             if action:
                 loop.tell(_INFO, self._stamp_ns, f"{WAITS_FOR} {action}")
                 self.arm.still_wanted = self._still_wanted
@@ -303,6 +303,11 @@ class _Run:
                 # A stop is found, and told, where the next attempt begins.
                 self.nobody = str(error) if self._still_wanted() else ""
                 return False
+            except EmergencyStopped as error:
+                raise ArmFault("emergency_stop", str(error)) from error
+            finally:
+                # The arm outlives this run; a motion process, which collects no garbage, would keep all of it at exit.
+                self.arm.still_wanted = wanted
             if not action or self.controls.stop:
                 return True
             moved = np.abs(self.arm.exchange(torque).position - self._home)

@@ -14,7 +14,7 @@ from drivers.clock import Clock, utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
-from ident_service.errors import ArmError, UsageError
+from ident_service.errors import ArmError, MotionRefused, UsageError
 from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.equations import Equations, equations
 from ident_service.estimation.feasible.feasible_set import SetName
@@ -249,7 +249,7 @@ def simulate(
         clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.
-        stop_requested: asked every cycle.
+        stop_requested: asked every cycle, and between the steps of identification.
 
     Raises:
         UsageError: the folder exists, or the arm is not simulated.
@@ -278,22 +278,33 @@ def simulate(
                 arm.observer = observed.append
             driven = sum(one.duration for one in motions[: len(reports)])
             asked = _counted(stop_requested, config.control.rate, planned, driven / whole, _MOTIONS / whole, step)
-            report = record_motion(arm, model, planned, path, asked)
+            stopped = _stopped(f"{planned.name} motion")
+            try:
+                report = record_motion(arm, model, planned, path, asked)
+            except MotionRefused:
+                if not reports or not stop_requested():
+                    raise
+                raise stopped from None  # what refuses says that nothing has moved, which the first motion did
             if report.state is not State.DONE:
-                # After a requested stop the arm must not move again.
-                raise ArmError(f"{planned.name} motion: stopped on request; nothing was kept")
+                raise stopped  # after a requested stop the arm must not move again
             reports.append(report)
             write_atomically(staging / f"{planned.name}.excitation.json", planned.to_json() + "\n")
+
+        def go_on(words: str, share: float) -> None:
+            if stop_requested():
+                raise _stopped("identifying")
+            step(words, share)
+
         tell("identifying")
-        step("identifying", _MOTIONS)
+        go_on("identifying", _MOTIONS)
         recordings = [CachedRecording(open_recording(path, model.chain.names)) for path in paths]
         estimate = identify(
             *(model, recordings[:1], recordings[1:]),
             set_name=set_name,
             custom=custom,
-            step=lambda words, share: step(words, _MOTIONS + 0.6 * share * (1.0 - _MOTIONS)),
+            step=lambda words, share: go_on(words, _MOTIONS + 0.6 * share * (1.0 - _MOTIONS)),
         )
-        step("scoring, and writing the report", _MOTIONS + 0.6 * (1.0 - _MOTIONS))
+        go_on("scoring, and writing the report", _MOTIONS + 0.6 * (1.0 - _MOTIONS))
         scored = score(estimate, truth, observed, equations(recordings[1], model, estimate.base))
         found = [(one, recording_quality(one, model)) for one in recordings]
         objections = unusable_because(estimate, found)
@@ -311,6 +322,10 @@ def simulate(
         write_report(staging, estimate, recordings[:1], recordings[1:], warnings)
         write_manifest(staging)
     return Commissioning(folder, estimate, (reports[0], reports[1]), scored, objections, tuple(warnings))
+
+
+def _stopped(during: str) -> ArmError:
+    return ArmError(f"{during}: stopped on request; nothing was kept")
 
 
 def score_document(scored: Score) -> dict[str, object]:

@@ -18,7 +18,7 @@ from drivers.axis_status import AxisStatus
 from drivers.clock import Clock, RealClock
 from ident_service.config.can_bus import WIRE_INTERFACE
 from ident_service.config.motion_limits import MotionLimits, Vector, motion_limits
-from ident_service.errors import ArmError, ArmFault, ModelError, MotionRefused
+from ident_service.errors import ActionNeeded, ArmError, ArmFault, ModelError, MotionRefused
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.blas_threads import one_blas_thread
@@ -53,6 +53,7 @@ from ident_service.preflight.direction import (
     moved_against_torque,
     sign_failure,
     strokes,
+    swings,
 )
 from ident_service.preflight.passive_checks import (
     IdleRecording,
@@ -67,9 +68,13 @@ from ident_service.preflight.passive_checks import (
 from ident_service.preflight.session import (
     BROKEN_REMEDY,
     EMULATED_REMEDY,
+    FARTHEST,
     NO_CABLE,
+    SHAKEN_REMEDY,
+    TORQUE_WARNINGS,
     Rows,
     Session,
+    code_of,
     remedy_of,
     trace_of,
 )
@@ -410,8 +415,14 @@ class _Preflight:
         trace = session.trace()
         astray = int(np.argmax(np.abs(trace.position[-1] - trace.reference[-1])))
         name = self.model.chain.names[astray]
-        if moved_against_torque(trace, astray, session):
+        warned, swinging = code_of(error) in TORQUE_WARNINGS, swings(trace, astray)
+        # A joint that is shaken stays about where it should be; one whose sign is wrong is on its way to the guard.
+        left = not warned or abs(trace.position[-1] - trace.reference[-1])[astray] > 0.5 * FARTHEST
+        if left and not swinging and moved_against_torque(trace, astray, session):
             self._passed(sign_failure([astray], self.model, str(error)))
+        elif warned or swinging:
+            reason = str(error) if warned else f"{name} swings about its path: {error}"
+            self._passed(failed("direction", reason, SHAKEN_REMEDY))
         else:
             remedy = f"Free {name} if something blocks it or a brake holds it; check its encoder and its signs."
             self._passed(failed("direction", f"{name} left the path: {error}", remedy))
@@ -424,7 +435,8 @@ class _Preflight:
             # None about the motion: the path home may begin although one of them failed. The last where all are made.
             left = (code for code in CODES if code not in self.checks and code not in ABOUT_THE_MOTION)
             code = next(left, CODES[-1])
-            self._passed(failed(code, str(error), BROKEN_REMEDY))
+            remedy = "Do this, then check again." if isinstance(error, ActionNeeded) else BROKEN_REMEDY
+            self._passed(failed(code, str(error), remedy))
 
     def _passed(self, check: Check, *, of_place: bool = False) -> bool:
         if of_place and check.verdict is Verdict.FAILED and self.away:

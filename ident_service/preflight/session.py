@@ -95,6 +95,14 @@ REMEDIES: dict[str, str] = {
 }
 
 
+TORQUE_WARNINGS = ("torque_rate", "torque_saturated")
+"""Warnings of what the loop asks for, which a wrong sign may make it ask for, too."""
+SHAKEN_REMEDY = (
+    "The loop swings or is shaken: lower kp and kd of the joint named, or its control.velocity_cutoff where its "
+    "encoder is noisy; see that its drive delays no torque, and that design.friction_guess is not too small."
+)
+
+
 def remedy_of(fault: ArmFault) -> str | None:
     """Return one sentence that says what to do about a fault.
 
@@ -104,10 +112,14 @@ def remedy_of(fault: ArmFault) -> str | None:
     Returns:
         None where the fault does not say what failed: the arm is not where it should be, too fast, or told too much.
     """
-    code = fault.code
-    if code == "repeated_warnings":  # its sentence begins with the warning's code
-        code = str(fault).removeprefix(f"{code}: ").split(" ", 1)[0]
-    return REMEDIES.get(code)
+    return REMEDIES.get(code_of(fault))
+
+
+def code_of(fault: ArmFault) -> str:
+    """Return the code of a fault, of repeated warnings that of the warning, with which their sentence begins."""
+    if fault.code == "repeated_warnings":
+        return str(fault).removeprefix(f"{fault.code}: ").split(" ", 1)[0]
+    return fault.code
 
 
 FARTHEST = 0.08  # rad or m from the reference, twice the amplitude of the motions that prove directions
@@ -206,6 +218,7 @@ class Session:
         dynamics = InverseDynamics(model.chain, model.layout, np.zeros(model.layout.size) if known is None else known)
         still = np.zeros_like(home)
         self.home = home.copy()
+        self._dynamics = dynamics
         self.gravity = dynamics.torque(home, still, still)
         self.mass = dynamics.mass_matrix(home)
         self.inertia = self.mass + np.diag(known_drives(control_model(model)))
@@ -313,6 +326,11 @@ class Session:
                     halves = [np.mean(way[len(way) // 2 :], axis=0) for way in learned.values()]
                     self._friction = np.mean(halves, axis=0)
                 return self._rows
+
+    def gravity_at(self, positions: Vector) -> Vector:
+        """Return the model's gravity torque in postures [N m or N], shape (cycles, joints)."""
+        still = np.zeros_like(self.home)
+        return np.array([self._dynamics.torque(position, still, still) for position in positions])
 
     def exchange(self, *, sends: bool = True) -> Sample:
         """Exchange one cycle with the target that the guard has let pass, or without any; raises DriverError."""

@@ -149,6 +149,7 @@ def test_an_emergency_stop_in_the_middle_of_a_run_is_latched_and_its_recording_c
         pucks.hears("emergency_stop")
         pucks.says("safety, node 10: ESTOP, pendant: e-stop fault", before)
         assert run.code() == 4
+    assert "leaked" not in run.text  # which nanobind says of what outlives the interpreter
     assert "emergency_stop" in wait_for(bench.faults.latched, "no fault was latched"), run.text
     blocks = list(open_recording(folder / "run.mcap", NAMES).blocks())
     assert sum(len(block.position) for block in blocks) > RATE

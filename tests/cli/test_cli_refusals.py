@@ -346,6 +346,15 @@ def test_a_stop_on_request_is_no_success_and_nothing_moves_again(place: Path, cy
     assert left_over(place) == before
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("during", ["validation motion", pytest.param("identifying", marks=pytest.mark.campaign)])
+def test_a_stop_after_the_first_motion_does_not_say_that_nothing_has_moved(place: Path, during: str) -> None:
+    # Asked for as soon as the step is told: a motion is still being planned then.
+    config, told = load_arm(quick_arm(place, *COARSE)), [""]
+    with pytest.raises(ArmError, match=f"^{during}: stopped on request; nothing was kept$"):
+        simulate(config, place / "run", stop_requested=lambda: told[-1].startswith(during), tell=told.append)
+
+
 @pytest.mark.parametrize("verb", ["base", "simulate", "check", "preview"])
 def test_a_broken_urdf_has_a_place(place: Path, ident: Ident, verb: str) -> None:
     arm = place / "arm.yaml"

@@ -50,8 +50,7 @@ class WamRun:
     rate: int
 
 
-# The slowest rate at which the wrist's shipped gains are stable. With softer ones it stands still against more than the
-# friction guess, which looks like a frozen encoder on one processor and not on another (decision 0008).
+# The slowest rate at which the wrist's shipped gains are stable.
 COARSE = "control: {rate: 500}\n"
 
 

@@ -11,13 +11,16 @@ from motion_bench import Story
 
 from drivers.barrett.driver import BarrettArm
 from ident_service.config.arm import ArmConfig
-from ident_service.errors import MotionRefused
+from ident_service.errors import ArmFault, MotionRefused
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import WAITS_FOR, run
 from ident_service.motion.state_machine import State
+from ident_service.motion.ticket import Verdict
+from ident_service.preflight.preflight import preflight
+from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 
 
@@ -44,8 +47,10 @@ def moved(times: int, way: float, controls: Any = None, config: ArmConfig | None
         before = arm.exchange(None).position
         try:
             report = run(arm, model, excitation(model, "identification"), story, controls, latch=latch)
-        except MotionRefused as refused:
+        except (MotionRefused, ArmFault) as refused:
             return refused, story, latch
+        finally:
+            assert arm.still_wanted is BarrettArm.still_wanted  # nothing of a run outlives it in the arm
         assert np.abs(arm.exchange(None).position - before - times * way).max() < 0.02
     return report, story, latch
 
@@ -105,3 +110,50 @@ def test_a_stop_ends_the_waiting_and_nothing_is_latched() -> None:
     assert "a stop was requested before the arm was energised" in str(refused)
     assert waited(story) == 1
     assert not latch.faults
+
+
+class PressedArm(LedArm):
+    """An arm whose emergency stop is pressed while it waits for Shift-Activate, which nobody presses."""
+
+    @staticmethod
+    def config() -> ArmConfig:
+        document = bench_puck_config().model_dump(mode="json", by_alias=True)
+        document["driver"]["emulation"]["operator"] = None
+        document["joints"]["shoulder"]["torque"] = 30.0  # what its motor gives at most
+        return ArmConfig.model_validate(document)
+
+    def enable(self) -> None:
+        wanted, asked = self.still_wanted, [0]
+
+        def press() -> bool:
+            asked[0] += 1
+            if asked[0] == 20:
+                self.behind.inject(DriveFault("emergency_stop"))
+            return wanted()
+
+        self.still_wanted = press
+        super().enable()
+
+
+def test_an_emergency_stop_that_is_pressed_while_a_person_is_waited_for_is_latched_as_one() -> None:
+    config, story, latch = PressedArm.config(), Story(), ActiveFaults()
+    model = arm_model(config)
+    with (
+        PressedArm(config, 0, 0.0) as arm,
+        pytest.raises(ArmFault, match="release it, then press Shift-Idle") as stopped,
+    ):
+        run(arm, model, excitation(model, "identification"), story, latch=latch)
+    assert stopped.value.code == "emergency_stop"
+    assert [(fault.code, fault.cause) for fault in latch.faults] == [
+        ("emergency_stop", "the emergency stop is pressed, or has been: release it, then press Shift-Idle")
+    ]
+    assert waited(story) == 1
+
+
+def test_preflight_names_an_emergency_stop_that_is_pressed_while_a_person_is_waited_for() -> None:
+    config = PressedArm.config()
+    name, arm = config.name, PressedArm(config, 0, 0.0)
+    ticket = preflight(arm, arm_model(config), None, confirm=lambda _: name, look_seconds=0.2)
+    (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
+    assert check.reason.startswith("the emergency stop is pressed, or has been: release it")
+    assert "cables" not in check.remedy

@@ -20,7 +20,7 @@ from ident_service.errors import ArmFault, DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.faults import FAULTS
-from ident_service.motion.ticket import CODES, Verdict
+from ident_service.motion.ticket import CODES, Check, Verdict
 from ident_service.preflight.preflight import preflight
 from ident_service.preflight.session import REMEDIES, remedy_of
 from sim_backend.arm import from_config
@@ -309,6 +309,30 @@ def test_a_wrong_gear_ratio_shows_in_what_the_joint_does(ratio: float, shows: st
     assert "gear ratio" in check.remedy
 
 
+def responses(check: Check) -> dict[str, float]:
+    found = [one for one in check.measures if one.what == "response to torque, measured over predicted"]
+    return {one.joint: one.value for one in found if one.joint is not None and one.value is not None}
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_twice_the_torque_is_refused_where_the_prior_is_identified(factor: float) -> None:
+    level = {"gravity": (0.0, 0.0, -9.81), "prior": TRUTH}  # the axes upright: gravity cannot tell
+    flight = Flight(changes=level)
+    flight.arm.told = lambda torque: torque * np.array([1.0, factor])
+    check = check_of(flight.ticket(), "direction")
+    assert responses(check) == {"shoulder": pytest.approx(1.0, rel=0.1), "elbow": pytest.approx(factor, rel=0.1)}
+    if factor == 1.0:
+        assert check.verdict is Verdict.PASSED
+    else:
+        assert check.reason.startswith("elbow: response to torque")
+
+
+def test_gravity_that_changes_along_the_way_is_no_part_of_the_response() -> None:
+    hangs = Flight(changes={"prior": TRUTH, "joints": joint_changes("shoulder", home=-1.5)})
+    found = responses(check_of(hangs.ticket(), "direction"))
+    assert found == {"shoulder": pytest.approx(1.0, abs=0.05), "elbow": pytest.approx(1.0, abs=0.05)}
+
+
 @pytest.mark.slow
 def test_a_blocked_joint_does_not_follow() -> None:
     truth = TRUTH | {"fc2": 30.0}
@@ -348,6 +372,34 @@ def test_an_encoder_that_freezes_while_the_joint_moves_is_noticed() -> None:
     check = only_failure(Flight(faults=(Fault(1000, FaultKind.FROZEN_ENCODER, 0, FOREVER),)).ticket(), "direction")
     assert check.reason.startswith("frozen_encoder: shoulder: ")
     assert check.remedy.startswith("Check the encoder of the joint named")
+
+
+def test_an_encoder_that_gets_noisy_shakes_the_torque_and_has_no_wrong_sign() -> None:
+    flight = Flight()
+    rng = np.random.default_rng(0)
+
+    def noisy(sample: Sample) -> Sample:  # from the motion of the first joint on: before, `noise` would find it
+        noise = np.array([5e-4, 0.0]) * rng.standard_normal(2) if len(flight.arm.torques) > 700 else 0.0
+        return replace(sample, position=sample.position + noise)
+
+    flight.arm.shown = noisy
+    check = only_failure(flight.ticket(), "direction")
+    assert check.reason.startswith("repeated_warnings: torque_rate in more than 20 of the last 100 cycles (shoulder: ")
+    assert "sign of" not in check.remedy
+    assert "control.velocity_cutoff" in check.remedy
+
+
+def test_a_loop_that_swings_by_its_delay_has_no_wrong_sign() -> None:
+    flight, sent = Flight(), list[Array]()
+
+    def late(torque: Array) -> Array:  # of the shoulder by 40 ms, from its motion on
+        sent.append(torque)
+        return np.array([sent[-21][0] if len(sent) > 700 else torque[0], torque[1]])
+
+    flight.arm.told = late
+    check = only_failure(flight.ticket(), "direction")
+    assert check.reason.startswith("elbow swings about its path: over_velocity: elbow: ")
+    assert "its drive delays no torque" in check.remedy
 
 
 @pytest.mark.slow
