@@ -27,16 +27,10 @@ from ident_service.daemon.openapi import describe
 from ident_service.daemon.request_guard import RequestGuardMiddleware
 from ident_service.daemon.routes import (
     about,
-    access,
     arms,
-    deletion,
-    descriptions,
     events,
-    exports,
     jobs,
-    live,
     maintenance,
-    pruning,
     runs,
     uploads,
     views,
@@ -73,18 +67,8 @@ PAGES = (
 )
 """Routers of the pages, which are not in the API's description."""
 ROUTERS = (
-    *(
-        about.router,
-        access.router,
-        arms.router,
-        descriptions.router,
-        jobs.router,
-        live.router,
-        runs.router,
-        pruning.router,
-        views.router,
-    ),
-    *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
+    *(about.router, arms.router, jobs.router, runs.router, views.router),
+    *(uploads.router, events.router, maintenance.router, *PAGES),
 )
 """Routers of the application, in the order in which they are included."""
 

@@ -10,9 +10,8 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.design import complete_task, family
+from ident_service.excitation.design import complete_task, family, safe_posture
 from ident_service.excitation.optimal_design import Problem
-from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import (
     Candidate,
     Interrupted,

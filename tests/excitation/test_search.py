@@ -13,9 +13,8 @@ import pytest
 from design_bench import quick, small
 
 from ident_service.errors import UsageError
-from ident_service.excitation.design import complete_task, design_motion, family
+from ident_service.excitation.design import complete_task, design_motion, family, safe_posture
 from ident_service.excitation.optimal_design import Problem
-from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import Budget, Progress, SearchResult, search, within_limits
 
 GRID = 60

@@ -20,7 +20,7 @@ from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.ticket import CODES, Ticket, Verdict
 from ident_service.motion.trajectory import Setpoint
-from ident_service.preflight.direction import LEAST_ANSWER
+from ident_service.preflight.active_checks import LEAST_ANSWER
 from ident_service.preflight.preflight import preflight
 from ident_service.preflight.session import trace_of
 

@@ -1,4 +1,4 @@
-"""Serve the event stream of all arms and jobs, and of the samples of runs that are being recorded."""
+"""Serve event streams: of all arms and jobs with the samples of runs that are being recorded, and of one job."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from fastapi.responses import StreamingResponse
 
 from ident_service.daemon.dependencies import Service, Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, operation_id
+from ident_service.daemon.jobs.requests import Id
 from ident_service.daemon.live import LiveRuns
-from ident_service.daemon.live_stream import RECORDED
+from ident_service.daemon.live_stream import RECORDED, live_events
 from ident_service.daemon.news import EventPoller, ViewerEvent, ViewerPosition
 from ident_service.registry import jobs as rows
 from ident_service.registry.runs import RUNS
 
-router = APIRouter(prefix="/api/v1", tags=["events"], responses=failures(), generate_unique_id_function=operation_id)
+router = APIRouter(prefix="/api/v1", responses=failures(), generate_unique_id_function=operation_id)
 _LOOK = 0.1  # s between news
 _STATE = 0.5  # s between queries for runs that are being recorded
 _BREATH = 10.0  # s without news, after which a comment shows that the connection is up
@@ -42,7 +43,7 @@ After = Annotated[int | None, Query(ge=0, lt=2**62, description="the same, for w
 Samples = Annotated[bool, Query(description="also `samples` and `doubt` of runs that are recorded")]
 
 
-@router.get("/events", response_class=StreamingResponse, responses=_STREAM)
+@router.get("/events", tags=["events"], response_class=StreamingResponse, responses=_STREAM)
 async def watch_all(
     service: Serving,
     _: Viewer,
@@ -63,6 +64,19 @@ async def watch_all(
     seen = await run_in_threadpool(watch.begin, after if last_event_id is None else last_event_id)
     live = request.app.state.live if samples else None
     return StreamingResponse(told(_events(service, watch, seen, live)), media_type="text/event-stream")
+
+
+@router.get("/jobs/{job}/live", tags=["jobs"], response_class=StreamingResponse, responses=_STREAM | failures(404))
+async def watch_live(
+    service: Serving, _: Viewer, told: WhileAuthorized, request: Request, job: Id
+) -> StreamingResponse:
+    """Watch a job and the run that it records, by server-sent events.
+
+    `job` has its state and log; `samples` has time, position, torque and following error of every joint, one every
+    20 ms; `doubt` has the standard deviations of the parameters so far.
+    """
+    row = await run_in_threadpool(rows.known_job, service.db, job)
+    return StreamingResponse(told(live_events(service, request.app.state.live, row)), media_type="text/event-stream")
 
 
 async def _events(
