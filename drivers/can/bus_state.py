@@ -94,7 +94,7 @@ class BusOffWatch:
     def __init__(self) -> None:
         self.off = False
 
-    def heard(self, frame: Frame) -> None:
+    def observe(self, frame: Frame) -> None:
         """Note an error frame; ignore other frames."""
         if frame.error:
             self.off = (self.off or bool(frame.identifier & BUS_OFF)) and not frame.identifier & RESTARTED

@@ -420,7 +420,9 @@ class EnableSequence:
             DriverError: a drive has a fault, or the step's time is over; who, and why as far as it is known.
         """
         if bad := [drive for drive in self._drives if drive.state in _FAULTS]:
-            raise DriverError(f"{_told(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)")
+            raise DriverError(
+                f"{_states_text(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)"
+            )
         for number, drive in enumerate(self._drives):
             if drive.status_age <= 1:  # came in this cycle, or before it
                 self._reported_ns[number] = now_ns
@@ -438,9 +440,8 @@ class EnableSequence:
             if self._target == 1 and self._in_other_mode and late == list(self._drives):
                 told = "; ".join(f"{self._names[number]} {words}" for number, words in self._in_other_mode.items())
                 raise DriverError(f"not enabled: {told}")
-            raise DriverError(
-                f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {_told(self._drives, self._names, late)}"
-            )
+            states = _states_text(self._drives, self._names, late)
+            raise DriverError(f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {states}")
         words = []
         for number, drive in enumerate(self._drives):
             if self._there(drive):  # and waits for the others, or for the seed
@@ -497,7 +498,7 @@ class Resetting:
             return []
         if now_ns > self._deadline_ns:
             kept = [drive for drive in self._drives if drive.state in (*_FAULTS, DriveState.UNKNOWN)]
-            raise DriverError(f"the cause is still there: {_told(self._drives, self._names, kept)}")
+            raise DriverError(f"the cause is still there: {_states_text(self._drives, self._names, kept)}")
         words = []
         for number, drive in enumerate(self._drives):
             if drive.state is DriveState.FAULT:
@@ -513,7 +514,7 @@ def hold(drives: Sequence[Drive]) -> bool:
     return any(drive.state is DriveState.QUICK_STOP for drive in drives)
 
 
-def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:
+def _states_text(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:
     """Describe the states and emergencies of the chosen drives."""
     words = []
     for name, drive in zip(names, drives, strict=True):

@@ -317,7 +317,7 @@ REMOTE: dict[str, Verb] = {
 
 # Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
 _OURS = frozenset(
-    {"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind", "progress"}
+    {"json", "state", "server", "verb", "word", "words", "asks", "requested_ns", "examples", "kind", "progress"}
 )
 _MOTION = frozenset({"arm", "motion", "confirm"})
 _CARRIED: dict[str, frozenset[str]] = {

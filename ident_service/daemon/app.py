@@ -90,7 +90,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     engine = Engine(
         *(db, settings.state),
         computing=settings.computing,
-        motion_door=settings.motion_door,
+        motion_socket=settings.motion_socket,
         lease_factor=settings.lease_factor,
         metrics=metrics,
     )

@@ -157,13 +157,13 @@ async def while_authorised(request: Request, bearer: Bearer = None, cookie: Cook
     """Return a filter that ends an event stream when its token or session is no longer valid."""
     gate, secret = service_of(request).gate, None if bearer is None else bearer.credentials
 
-    async def told(events: AsyncIterator[str]) -> AsyncIterator[str]:
+    async def while_known(events: AsyncIterator[str]) -> AsyncIterator[str]:
         async for one in events:
             if gate.known(secret, cookie) is None:
                 return
             yield one
 
-    return told
+    return while_known
 
 
 def unknown() -> HTTPException:

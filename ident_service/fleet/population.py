@@ -611,23 +611,6 @@ class HeldOut:
 
 
 @one_blas_thread()
-def held_out_errors(
-    alone: ArmFit, unseen: Merged, prior: tuple[Array, Array, Array], scale: Array, described: Described
-) -> tuple[float, float]:
-    """Return the torque errors of an arm alone and pooled on recordings held out [percent].
-
-    Args:
-        alone: estimate from the recordings that are fitted to.
-        unseen: information of those that are held out.
-        prior: mean, its covariance and T of the other arms, in units of `scale`.
-        scale: D, shape (base,).
-        described: the arm.
-    """
-    alone_fit, pooled = alone.fit, pooled_fit(alone, prior, scale)
-    return error_on(unseen, alone_fit, described), error_on(unseen, pooled, described)
-
-
-@one_blas_thread()
 def error_on(unseen: Merged, fit: LeastSquares, described: Described) -> float:
     """Return the torque error of an estimate, inside the feasible set, on recordings that it has not seen [percent]."""
     return torque_error(unseen.everything, constrained(fit, described)).relative_percent

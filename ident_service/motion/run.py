@@ -351,7 +351,7 @@ class _Run:
         home = self._home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
-        owed = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
+        observer = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
         contact = Contact(model)
         guard = SafetyMonitor(
             chain.names,
@@ -360,7 +360,7 @@ class _Run:
             home,
             revolute=chain.revolute,
             contact=contact,
-            owed=owed,
+            encoder_observer=observer,
             max_age=described.lost_cycles,
             most_torque=(1.0 + NOT_APPLIED) * limits.torque if described.streams_position else None,
             coupling=encoder_coupling(model.config),

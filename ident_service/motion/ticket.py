@@ -76,7 +76,7 @@ class Measure:
     most: float | None = None
 
     @property
-    def kept(self) -> bool:
+    def within_limits(self) -> bool:
         """Return whether the value keeps its limits; a missing value keeps none."""
         if self.least is None and self.most is None:
             return True
@@ -153,7 +153,7 @@ def measures(
 
 def check_from_measures(code: str, found: Sequence[Measure], remedy: str) -> Check:
     """Return a check that passed where every measure keeps its limits, else failed, naming each that does not."""
-    broken = [str(one) for one in found if not one.kept]
+    broken = [str(one) for one in found if not one.within_limits]
     if broken:
         return Check(code, Verdict.FAILED, tuple(found), "; ".join(broken), remedy)
     return Check(code, Verdict.PASSED, tuple(found))

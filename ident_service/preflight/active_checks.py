@@ -409,11 +409,12 @@ def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | 
         model.chain.names,
         most=HOLDABLE * limits.torque,
     )
-    if all(one.kept for one in found):
+    if all(one.within_limits for one in found):
         return None
     return failed(
         "gravity",
-        "holding the arm takes too much of the torque limits: " + "; ".join(str(one) for one in found if not one.kept),
+        "holding the arm takes too much of the torque limits: "
+        + "; ".join(str(one) for one in found if not one.within_limits),
         "Support the arm in a posture that takes less torque, then check again.",
         found,
     )

@@ -229,7 +229,7 @@ def test_an_emergency_stop_shows_within_a_status_period_and_only_a_person_clears
         assert all(word & AxisStatus.POWERED for word in bench.cycles(3, NONE).status)
 
 
-def test_a_velocity_fault_is_told_with_its_cause_before_any_consequence(bench: Bench) -> None:
+def test_a_velocity_fault_is_reported_with_its_cause_before_any_consequence(bench: Bench) -> None:
     with bench.arm as arm:
         arm.enable()
         bench.cycles(10, NONE)

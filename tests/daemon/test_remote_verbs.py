@@ -123,7 +123,7 @@ def test_no_run_is_a_path(path: str, state: Path, capsys: pytest.CaptureFixture[
         assert "named by id" in capsys.readouterr().err
 
 
-def test_answers_are_told_in_words() -> None:
+def test_answers_are_reported_in_words() -> None:
     said = {"arm": "a", "fits": True, "load": 0.25, "none": None, "names": ["x", "y"], "lines": [{"node": 1}], "no": []}
     assert list(lines_of(said)) == [
         "arm: a",
@@ -361,7 +361,7 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
 
 
 @pytest.mark.slow
-def test_what_is_no_file_here_is_told_so_and_files_of_a_description_are_sent(
+def test_what_is_no_file_here_is_reported_and_files_of_a_description_are_sent(
     state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with daemon_process(state) as (_, client):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from daemon.conftest import Asked, quick_text, serving
-from daemon.test_doors_shut import refusal
+from daemon.test_access_control import refusal
 from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, singular_copy, unstable_text, with_arms, with_run
 
 from ident_service.daemon.jobs.commands import command

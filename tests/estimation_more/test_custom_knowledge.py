@@ -319,7 +319,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("module", WRONG)
-def test_what_is_wrong_is_said_in_one_sentence_with_its_place(setting: Setting, tmp_path: Path, module: str) -> None:
+def test_what_is_wrong_is_stated_in_one_sentence_with_its_place(setting: Setting, tmp_path: Path, module: str) -> None:
     code, words = WRONG[module]
     arm = written(tmp_path, module, code)
     with pytest.raises(ConfigError, match=words) as refused:

@@ -183,7 +183,7 @@ def test_work_is_counted_in_one_process_only() -> None:
 
 
 @pytest.mark.slow
-def test_progress_is_told() -> None:
+def test_progress_is_reported() -> None:
     found, told = searched(3)
     assert [progress.phase for progress in told] == ["starts"] * 3 + ["polish"] * 3
     assert [progress.finished for progress in told][-1] == found.finished == 3

@@ -278,7 +278,7 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
     assert not violations(mended.result[1], model, task.limits)
 
 
-def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
+def test_the_parts_of_a_long_segment_show_the_error_of_the_whole() -> None:
     model = small(joints={"elbow": {"velocity": 0.1}})
     path = PosturePath(np.array([[0.0, 0.0], [0.6, 0.5], [0.0, 0.0]]), np.array([9.0, 11.0]), 0.0)
     whole = track(path, model, 0.2).error

@@ -69,7 +69,7 @@ def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     assert (judged["shoulder"].least, judged["elbow"].least) == (LEAST_ANSWER, 0.0)
 
 
-def test_the_arm_moves_no_farther_than_told_and_within_its_band_of_torque(good: Flown) -> None:
+def test_the_arm_moves_no_farther_than_announced_and_within_its_band_of_torque(good: Flown) -> None:
     powered = np.array(good.seen[: 121 + len(good.flight.arm.torques)])
     assert (np.abs(powered - powered[0]) < 0.06).all()
     torques = np.array(good.flight.arm.torques)

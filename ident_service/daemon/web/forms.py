@@ -83,7 +83,7 @@ def failure(request: Request, status: int, words: str) -> Response:
     return page("failure", who, status, title=title, words=words)
 
 
-def seen(address: str) -> RedirectResponse:
+def see_other(address: str) -> RedirectResponse:
     """Redirect to an address after a form (303 See Other)."""
     return RedirectResponse(address, 303)
 

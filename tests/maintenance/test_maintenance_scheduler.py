@@ -12,7 +12,7 @@ from maintenance.conftest import ARM, MONDAY, Clock, description
 
 from ident_service.config.load import load_arm
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import explain_interrupted, mark_interrupted, outcome, said
+from ident_service.daemon.jobs.outcome import explain_interrupted, mark_interrupted, outcome, process_output
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.jobs.requests import Check, Run
 from ident_service.daemon.maintenance.reidentification import ReidentificationRequest, reidentifications
@@ -222,7 +222,7 @@ def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> N
 
 
 @pytest.mark.parametrize("running", [False, True])
-def test_a_restart_during_a_motion_is_told_when_it_is_known(scene: Scene, running: bool) -> None:
+def test_a_restart_during_a_motion_is_reported_when_it_is_known(scene: Scene, running: bool) -> None:
     scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     if running:
         jobs.started(scene.db, scene.only["job"], "")
@@ -270,7 +270,7 @@ def test_what_was_stopped_is_no_verdict(scene: Scene) -> None:
     scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     stopped = {"exit_code": 0, "report": {"state": "stopped"}}
     (scene.state / JOBS / scene.only["job"] / "answer.json").write_text(json.dumps(stopped))
-    assert outcome(said(scene.state / JOBS / scene.only["job"]), 0, "").state == "cancelled"
+    assert outcome(process_output(scene.state / JOBS / scene.only["job"]), 0, "").state == "cancelled"
     scene.ended("cancelled", detail="a stop was requested")
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
 
