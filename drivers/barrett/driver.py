@@ -16,18 +16,17 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from math import pi
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
+from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog, read_only
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
-from drivers.can.bus_state import HOST, Event, EventCode
+from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import BusSession
 from drivers.clock import Clock, RealClock, VirtualClock
@@ -87,7 +86,7 @@ class JointEncoders:
             self._beyond[k] = 0
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Compare the encoders with the motors.
+        """Return joint positions by the encoders, and an event of each joint that has come apart from its motors.
 
         Args:
             pucks: at the end of a cycle.
@@ -131,21 +130,7 @@ _LOWER_EVERY = 5  # cycles between two commands to an arm that is active while n
 _EXPLAINED = 4  # cycles, at most, that news of an arm that is not active any more wait for the pendant's reason
 _SHIFT_IDLE = "find the cause, then press Shift-Idle on the pendant"
 
-_CODES: dict[EventCode, AxisEventCode] = {
-    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
-    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
-    EventCode.DRIVE_STATE: AxisEventCode.DRIVE_LEFT,
-    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
-    EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,
-    EventCode.LATE: AxisEventCode.STRANGE_FRAME,
-    EventCode.WRONG_LENGTH: AxisEventCode.STRANGE_FRAME,
-    EventCode.STRANGER: AxisEventCode.STRANGE_FRAME,
-    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
-    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
-    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
-    EventCode.OVERFLOW: AxisEventCode.STRANGE_FRAME,
-    EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
-}
+_CODES = BUS_EVENTS | {EventCode.DRIVE_STATE: AxisEventCode.DRIVE_LEFT}
 
 
 class BarrettArm(Arm):
@@ -184,7 +169,7 @@ class BarrettArm(Arm):
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
         self._home = [joint.home for joint in config.joints.values()]
         joints = len(pucks)
-        self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
+        self._all_fresh = read_only(np.ones(joints, dtype=bool)), read_only(np.zeros(joints, dtype=np.int64))
         self._motors_of = self._coordinates.motors_of
         self._joint_encoders = JointEncoders(config.driver, self._coordinates, list(config.joints))
         joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
@@ -203,7 +188,7 @@ class BarrettArm(Arm):
         self._enabled = False
         self._untold = False  # whether a stop is still to be sent
         self._counts = [0] * len(self._limits)
-        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._acting = read_only(np.zeros(len(self._limits)))
         self._unwrapped: list[int] = []
         self._cycle = 0
         self._stale: set[int] = set()
@@ -219,7 +204,7 @@ class BarrettArm(Arm):
         return BarrettArm(self._config, self._open_bus, looks=True)
 
     def zero(self) -> tuple[str, ...]:
-        """Define the present position as the home of the description; as in the contract."""
+        """Define the present position as the home of the description; see `Arm`."""
         if self._bus is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         if self._looks:
@@ -236,7 +221,7 @@ class BarrettArm(Arm):
             self.close()
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session; as in the contract."""
+        """Log every frame of the next session; see `Arm`."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -301,7 +286,7 @@ class BarrettArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the pucks say of themselves, see `Arm`."""
+        """Return what the pucks report of themselves, see `Arm`."""
         return self._checks
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
@@ -364,7 +349,7 @@ class BarrettArm(Arm):
             raise ActionNeeded(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, as the contract says.
+        """Exchange one cycle; see `Arm`.
 
         Raises:
             DriverError: as in the contract; also an arm that is looked at and has been activated.
@@ -378,7 +363,7 @@ class BarrettArm(Arm):
                 raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)
             self._counts, _ = self._coordinates.torque_counts(wanted)
-            self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+            self._acting = read_only(self._coordinates.joint_torque(self._counts))
         if not self._enabled:
             self._keep_idle(bus)
         stamp_ns = bus.cycle(None if torque is None else self._counts)
@@ -545,7 +530,7 @@ class BarrettArm(Arm):
 
     def _no_torque(self) -> None:
         self._counts = [0] * len(self._limits)
-        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._acting = read_only(np.zeros(len(self._limits)))
 
     def _sample(self, bus: PuckBus, stamp_ns: int) -> Sample:
         pucks, safety = bus.codec.pucks, bus.codec.safety
@@ -617,8 +602,3 @@ def from_config(config: ArmConfig, clock: Clock | None = None) -> BarrettArm:
         DriverError: the description lacks something.
     """
     return BarrettArm(config)
-
-
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
-    array.setflags(write=False)
-    return array

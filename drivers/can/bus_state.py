@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Literal
 
+from drivers.axis_status import AxisEventCode
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 
@@ -186,6 +187,17 @@ MILD = frozenset(
         *(EventCode.BUS_ERROR, EventCode.OVERFLOW),
     }
 )
+
+BUS_EVENTS = {
+    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
+    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
+    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
+    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
+    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
+    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
+    **dict.fromkeys(MILD, AxisEventCode.STRANGE_FRAME),
+}
+"""Events that any drives on CAN have, as events of the arm's axes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,7 +89,7 @@ class BusSession:
         self._log: SessionLog | None = None
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; see `Arm`."""
         self._path = require_format(path)
 
     def logged(self) -> str:

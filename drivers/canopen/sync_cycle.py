@@ -162,7 +162,7 @@ class Buses:
         return display.unpack(data) if data is not None and len(data) == display.kind.size else None
 
     def other_modes(self) -> dict[int, str]:
-        """Return what drives tell instead of their mode of operation, in words by number, and ask one of them anew."""
+        """Return what drives report instead of their mode of operation, by number, and ask one of them anew."""
         found = {}
         for number, mode in enumerate(self.modes):
             if (shown := self.mode_shown(number)) != mode.wanted:
@@ -176,7 +176,7 @@ class Buses:
         return found
 
     def forget_modes(self) -> None:
-        """Discard what drives have told of their modes of operation."""
+        """Discard what drives have reported of their modes of operation."""
         for drive, mode in zip(self.drives, self.modes, strict=True):
             drive.uploads.pop(mode.display.key, None)
 
@@ -324,7 +324,7 @@ class Buses:
         return stamp_ns
 
     def _ask_silent(self) -> None:
-        """Ask the drive that tells nothing any more for its status word: out of `operational` it still answers SDOs.
+        """Ask the drive that reports nothing any more for its status word: out of `operational` it still answers SDOs.
 
         A drive whose watchdog was tried may end there, and whether it has let go must be heard of. One drive a cycle;
         none that has booted, as it has no power and must be configured first.

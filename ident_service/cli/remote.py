@@ -142,7 +142,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 def job_verb(
     make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = with_answer_lines
 ) -> Verb:
-    """A verb that is a job.
+    """Return a verb that runs as a job of the daemon.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.

@@ -72,7 +72,7 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
 def arm_part(
     model: pin.Model, part: ArmSelection, followers: Mapping[str, Mimic], file: str
 ) -> tuple[pin.Model, dict[str, float]]:
-    """Reduce a mechanism to the arm.
+    """Return the arm's part of a mechanism, and where its locked joints stand.
 
     Args:
         model: of the whole mechanism, mimicking joints as joints of their own.

@@ -533,7 +533,7 @@ class InterruptibleArm(Arm):
         return self._arm.bus_budget(rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the wrapped arm's drives say of their set-up."""
+        """Return what the wrapped arm's drives report of their set-up."""
         return self._arm.setup_checks()
 
     @property

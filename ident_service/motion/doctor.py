@@ -142,7 +142,7 @@ def measure_wake_up(
     clock: Clock | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Woken:
-    """Sleep from slot to slot as the loop of a motion does, and note how late each one is reached.
+    """Measure how late a loop is woken that sleeps from slot to slot, as that of a motion does.
 
     Args:
         rate: of slots [Hz].

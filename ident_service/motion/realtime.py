@@ -103,7 +103,7 @@ def request_privileges(core_from_last: int = 0, settings: Realtime | None = None
 
 @contextmanager
 def temporary_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[RealtimePrivileges]:
-    """The same for a while, for a loop in a process that does other things afterwards.
+    """Hold the privileges of `request_privileges` for the block, in a process that does other things afterwards.
 
     Args:
         core_from_last: as for `request_privileges`.

@@ -105,7 +105,7 @@ def _wait_for(over: threading.Event) -> None:
 
 @contextmanager
 def unhurried() -> Iterator[None]:
-    """Work at no real-time priority, but before all that has none, where real time was granted (`realtime.py`).
+    """Run the block without real-time priority, at the highest other one, where real time was granted (`realtime.py`).
 
     Cycles in a thread that was started before go first. What works for seconds at a real-time priority starves all else
     on its core, for which the kernel stops every real-time process there for up to 50 ms of a second

@@ -274,7 +274,7 @@ class TrajectorySequencer:
         return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
     def search_return(self) -> str | None:
-        """Do one slice of the search for a trajectory back; returns the reason where there is none, else None."""
+        """Do one slice of the search for a trajectory back; return the reason where none exists, else None."""
         if self._search is None:
             return None
         try:

@@ -274,7 +274,7 @@ def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
 def store_or_restore(
     config: ArmConfig, *, store: bool, dry: bool = False, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[int, ...]:
-    """Have all drives store what they hold (1010h), or take back what they were shipped with (1011h).
+    """Make all drives store their configuration (1010h), or restore that of their delivery (1011h).
 
     What is restored takes effect when the drives' power has been switched off and on.
 

@@ -1,7 +1,7 @@
 """Prove that the drives stop by themselves when the host falls silent: the one protection that works when it dies.
 
 Done last, where the arm has just been held, and again in the middle of a small motion: what the drives' watchdogs watch
-is withheld, and looked at what the drives say of themselves. An arm without brakes then sinks onto its support, so a
+is withheld, and looked at what the drives report of themselves. An arm without brakes then sinks onto its support, so a
 person must have typed the arm's name first.
 """
 
@@ -92,7 +92,7 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
 def watchdog_check(
     arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
 ) -> Check:
-    """Fall silent while the arm is held, and check that its drives stop; the arm is without torque afterwards.
+    """Check that drives stop when the host falls silent while it holds the arm; the arm is without torque afterwards.
 
     What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
     another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have

@@ -109,7 +109,7 @@ WHAT_THEN = (
 
 
 def implausible_links(estimate: Estimate) -> tuple[str, ...]:
-    """Return the links whose chosen values are implausible: which value, and beside which bound.
+    """Return a sentence for each link whose chosen values are implausible: the value and its bound.
 
     Args:
         estimate: with link values; one without, or with values that a prior or custom knowledge asked for, has none

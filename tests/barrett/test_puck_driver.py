@@ -401,7 +401,7 @@ def test_unequal_firmware_is_refused() -> None:
         arm.enable()
     other = Bench(wam())
     with_firmware(other, 4, 40)
-    with pytest.raises(DriverError, match=r"P has not one number in all pucks.*puck 4 40"):
+    with pytest.raises(DriverError, match=r"property P has another number in some pucks.*puck 4 40"):
         other.arm.open()
 
 

@@ -87,7 +87,7 @@ def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
 
 
 def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
-    """Return the samples that a job's process has told since an offset in its log, and the offset to go on from.
+    """Return the samples that a job's process has printed since an offset in its log, and the offset to go on from.
 
     Each has `joints`, `time` [s] and `position` [rad or m] as the samples of a run have (`live.Thinned`).
     """

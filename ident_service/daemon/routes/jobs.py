@@ -266,7 +266,7 @@ def _named(value: Any, service: Service, row: Row) -> Any:
 
 
 def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
-    """Values in which places below the state folder are told relative to it.
+    """Return values in which paths below the state folder are relative to it.
 
     Args:
         value: JSON values.

@@ -53,7 +53,7 @@ _PAGE: dict[int | str, dict[str, Any]] = {
 
 
 class Labels(BaseModel):
-    """Tags and note of a run: whoever looks for it finds it again by them."""
+    """Tags and note of a run, by which it is found in lists."""
 
     model_config = ConfigDict(extra="forbid")
     tags: Annotated[list[Annotated[str, Field(max_length=40)]], Field(max_length=runs.MOST_TAGS)] = []
@@ -163,7 +163,7 @@ def delete_run(service: Serving, who: Operator, run: Id, anyway: Anyway = False)
 @router.post("/recordings/prune")
 def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
     """Delete old recordings of runs that nobody accepted and no job needs."""
-    untold = runs.rebuild_runs(service.db, service.state)
+    unreadable = runs.rebuild_runs(service.db, service.state)
     gone = (
         run_archive.prune(service.db, service.state, body.keep, who.name)
         if body.yes
@@ -173,7 +173,7 @@ def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
         deleted=body.yes,
         bytes=sum(one.bytes for one in gone),
         recordings=[PrunedRecording(run=one.run, name=one.name, bytes=one.bytes) for one in gone],
-        left_alone=without_paths(untold, str(service.state)),
+        left_alone=without_paths(unreadable, str(service.state)),
     )
 
 
