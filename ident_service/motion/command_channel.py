@@ -51,7 +51,6 @@ import time
 from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, Self
 
 from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
@@ -357,9 +356,7 @@ class ControlFile:
         """Return these controls."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the controls."""
         self.close()
 

@@ -132,12 +132,12 @@ def _fixed(sheet: DataSheet) -> frozenset[int]:
     return frozenset(key for key, entry in sheet.entries.items() if not entry.writable)
 
 
-def require_drives(config: ArmConfig) -> CanopenDriver:
-    """Return the driver's section of an arm; raises UsageError where its drives are not CANopen's."""
+def require_drives(config: ArmConfig, why: str = "only CANopen drives are configured") -> CanopenDriver:
+    """Return the driver's section of an arm; raises UsageError with `why` where its drives are not CANopen's."""
     if isinstance(config.driver, CanopenDriver):
         return config.driver
     kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
-    raise UsageError(f"{config.name} has {kind}; only CANopen drives (driver.kind: canopen) are configured")
+    raise UsageError(f"{config.name} has {kind}; {why} (driver.kind: canopen)")
 
 
 _NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
