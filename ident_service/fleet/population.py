@@ -97,7 +97,7 @@ class ArmFit:
 
     @classmethod
     def of(cls, fit: LeastSquares, doubt: Uncertainty, clusters: int, total: Information, error: TorqueError) -> ArmFit:
-        """Return the estimate with its precision where nothing differs from recording to recording."""
+        """Return an estimate whose precision counts no differences from recording to recording."""
         degrees = max(int(total.rows.sum()) - total.base, 1)
         variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
         # One factor for all: factors of their own would turn the combinations that are known well into others.
@@ -105,7 +105,7 @@ class ArmFit:
         return cls(fit, doubt, clusters, precision, total, error)
 
     def weighed(self, between: Array) -> ArmFit:
-        """Return the estimate as less sure by what differs from recording to recording.
+        """Return the estimate with its precision lowered by the variance from recording to recording.
 
         Args:
             between: variance of the arm's mean by that [SI^2], shape (base,).

@@ -212,7 +212,7 @@ def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
 
 
 def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Read the arm in an MJCF; `part` as for a URDF."""
+    """Return the arm of an MJCF as JSON values; `part` selects it, as in a URDF."""
     return _document("MJCF", lambda: pin.buildModelFromMJCF(path), part, dict)
 
 
