@@ -1,4 +1,4 @@
-"""The ladder through the API, on the small simulated arm in virtual time: real processes, real folders."""
+"""The commissioning workflow through the API, on the small simulated arm in virtual time, with real processes."""
 
 from __future__ import annotations
 

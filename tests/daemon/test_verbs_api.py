@@ -1,4 +1,4 @@
-"""Verbs over the API that are no steps of the ladder: what each does, and what it refuses."""
+"""Verbs over the API that are no steps of the commissioning workflow: what each does, and what it refuses."""
 
 from __future__ import annotations
 

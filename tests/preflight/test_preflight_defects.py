@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_changes, only_failure, verdicts
+from flight_bench import FOREVER, Flight, FlightArm, check_of, joint_changes, only_failure, verdicts
+from motion.motion_bench import TRUTH
 
 from drivers.arm import Sample, Watchdog
 from drivers.axis_status import AxisStatus

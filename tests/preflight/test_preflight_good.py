@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flight_bench import LIMIT, PRIOR, TRUTH, Flight, Flown, check_of, verdicts
+from flight_bench import LIMIT, Flight, Flown, check_of, verdicts
 from helpers.forks import fork_plants
+from motion.motion_bench import PRIOR, TRUTH
 
 from drivers.arm import Sample
 from ident_service.cli import main

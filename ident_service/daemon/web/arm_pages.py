@@ -97,7 +97,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Ladder:
+class CommissioningWorkflow:
     """All commissioning steps of an arm, and what they are about.
 
     Attributes:
@@ -119,7 +119,7 @@ class Ladder:
     comparable: bool
 
 
-def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
+def commissioning_workflow(db: Database, state: Path, config: ArmConfig) -> CommissioningWorkflow:
     """Return the commissioning steps of an arm with their states.
 
     Raises:
@@ -188,7 +188,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
         done = {key: done[key] for key in _WITHOUT_ARM}
         upcoming = next((key for key, (finished, _) in done.items() if not finished), "")
     steps = tuple(Step(key, TITLES[key], state_of(key), words, busy.get(key)) for key, (_, words) in done.items())
-    return Ladder(steps, run_id, identified, accepted, exported, reported, comparable)
+    return CommissioningWorkflow(steps, run_id, identified, accepted, exported, reported, comparable)
 
 
 def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
@@ -337,7 +337,7 @@ def _upcoming(service: Service, row: Row, facts: ArmFacts) -> Step | None:
         return None
     try:
         config = known.known_arm(service.db, service.state, row["name"]).config
-        steps = ladder(service.db, service.state, config).steps
+        steps = commissioning_workflow(service.db, service.state, config).steps
     except IdentError:
         return None  # the page of the arm says why
     return next((step for step in steps if step.state in ("busy", "next")), None)
@@ -388,7 +388,7 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
         joints=joint_facts(config),
         seen=_last_look(service, answer.name),
         unread=_failed_look(service, answer.name),
-        rungs=ladder(service.db, service.state, config),
+        workflow=commissioning_workflow(service.db, service.state, config),
         motions=known_motions.motions(service.db, answer.name),
         alarms=_alarms(service, answer.name),
         dues=due,
