@@ -94,15 +94,15 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
         lease_factor=settings.lease_factor,
         metrics=metrics,
     )
-    keeper = MaintenanceScheduler(engine, _webhook(settings, db))
-    service = Service(settings, db, engine, Authenticator(db), metrics, keeper, Checks())
+    scheduler = MaintenanceScheduler(engine, _webhook(settings, db))
+    service = Service(settings, db, engine, Authenticator(db), metrics, scheduler, Checks())
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         synchronise(db, settings.state)
         remove_deleted(settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
-        keeper.start()
+        scheduler.start()
         refreshing = asyncio.create_task(_refresh(service))
         try:
             yield
@@ -110,7 +110,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
             refreshing.cancel()
             await run_in_threadpool(engine.close)
             app.state.live.close()
-            await run_in_threadpool(keeper.close)
+            await run_in_threadpool(scheduler.close)
             db.close()
 
     app = FastAPI(
@@ -137,7 +137,11 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     install_error_handlers(app)
     book = Connections() if connections is None else connections
     app.add_middleware(
-        RequestGuardMiddleware, settings=settings, metrics=service.metrics, connections=book, gate=service.gate
+        RequestGuardMiddleware,
+        settings=settings,
+        metrics=service.metrics,
+        connections=book,
+        authenticator=service.authenticator,
     )
     return app
 
@@ -152,7 +156,7 @@ async def _refresh(service: Service) -> None:
                 for upload in await run_in_threadpool(delete_stale_uploads, service.state):
                     _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
             await run_in_threadpool(write_deferred_entries, service.db, service.state)
-            await run_in_threadpool(service.gate.refresh)
+            await run_in_threadpool(service.authenticator.refresh)
             await run_in_threadpool(service.db.rest)
         except (sqlite3.Error, OSError) as error:
             _LOG.error("the state folder cannot be looked after: %s", error)

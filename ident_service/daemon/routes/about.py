@@ -52,7 +52,7 @@ class TokenLine(BaseModel):
 )
 def healthz(service: Serving, response: Response) -> HealthAnswer:
     """Return whether the service looks after its queue and its schedule; asks for no token."""
-    healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
+    healthy = service.engine.healthy and service.scheduler.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)
 
@@ -84,7 +84,7 @@ def whoami(who: Viewer) -> WhoAnswer:
 def login(service: Serving, request: Request, response: Response, body: Login) -> WhoAnswer:
     """Exchange a token for a session; its cookie cannot be read by scripts and is sent by no other site."""
     try:
-        found = service.gate.log_in(body.token, address_of(request))
+        found = service.authenticator.log_in(body.token, address_of(request))
     except Throttled as error:
         raise throttled(error) from None
     if found is None:
@@ -105,7 +105,7 @@ def login(service: Serving, request: Request, response: Response, body: Login) -
 def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
     """End the session of the page."""
     if cookie is not None:
-        service.gate.log_out(cookie)
+        service.authenticator.log_out(cookie)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
 
 
@@ -126,5 +126,5 @@ def list_tokens(service: Serving, _: Operator) -> list[TokenLine]:
 def revoke(service: Serving, who: Operator, token: TokenName) -> TokenLine:
     """Revoke a token and the sessions that it began."""
     revoke_token(service.db, token, who.name)
-    service.gate.refresh()
+    service.authenticator.refresh()
     return next(TokenLine(**row) for row in tokens(service.db) if row["name"] == token)

@@ -195,7 +195,9 @@ def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
 def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
     """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
     name = known.known_arm(service.db, service.state, arm).name
-    return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
+    return ChallengeAnswer(
+        arm=name, challenge=service.authenticator.challenge(name, who.name), seconds=CHALLENGE_SECONDS
+    )
 
 
 @router.get("/arms/{arm}/faults")

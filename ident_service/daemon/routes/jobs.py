@@ -96,7 +96,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
         MotionRefused: no confirmation, or one that does not count.
     """
     # The challenge is used up first, so that a name cannot be tried again with it.
-    good = confirm is not None and service.gate.confirm(confirm.challenge, arm, who)
+    good = confirm is not None and service.authenticator.confirm(confirm.challenge, arm, who)
     if confirm is not None and confirm.name != arm:
         raise MotionRefused(
             f"{arm}: the typed name {confirm.name!r} is not this arm's; nothing moves. To move {arm}, type its name "

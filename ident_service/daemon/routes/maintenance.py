@@ -246,7 +246,9 @@ def begin_reidentification(service: Serving, who: Operator, body: NewReidentific
     """
     arm = _arm(service, body.arm)
     require_confirmed(service, arm, body.confirm, who.name)
-    return _answer(service, service.keeper.reidentifications.begin(ReidentificationRequest(arm, body.motion), who.name))
+    return _answer(
+        service, service.scheduler.reidentifications.begin(ReidentificationRequest(arm, body.motion), who.name)
+    )
 
 
 @router.get("/reidentifications/{name}")
@@ -258,7 +260,7 @@ def get_reidentification(service: Serving, _: Viewer, name: Id) -> Reidentificat
 @router.post("/reidentifications/{name}/lease")
 async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
     """Renew the lease of a re-identification, for the step that it is at; none is needed where nothing moves."""
-    step = service.keeper.reidentifications.step(name)
+    step = service.scheduler.reidentifications.step(name)
     if step is None:
         row = await run_in_threadpool(known_reidentification, service.db, name)
         step = row["begun_by"], row["job"]

@@ -77,7 +77,7 @@ def failure(request: Request, status: int, words: str) -> Response:
     """Return a failure as a page."""
     service = service_of(request)
     cookie = request.cookies.get(COOKIE)
-    who = service.gate.known(None, cookie)
+    who = service.authenticator.known(None, cookie)
     title = HTTPStatus(status).phrase
     words = words.replace(f"{service.state}/", "").encode("utf-8", "replace").decode()
     return page("failure", who, status, title=title, words=words)

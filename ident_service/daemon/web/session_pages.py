@@ -77,5 +77,5 @@ async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = 
     """Bring all arms to a controlled stop; the same callers may as for the API's stop."""
     done = await stop_all(service, near)
     back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
-    who = service.gate.known(None, cookie)
+    who = service.authenticator.known(None, cookie)
     return page("stopped", who, arms=done.arms, jobs=done.jobs, back="/" if back == "/stop" else back)
