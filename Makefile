@@ -30,7 +30,7 @@ unit: $(READY)
 
 # Every branch of what stops an arm, by its own tests: less than all of them fails.
 GUARDED := encoder_observer faults safety_monitor state_machine stop_trajectory
-GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_motors.py guard_positions.py guard_table.py owed.py states.py stop.py told.py)
+GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_motors.py guard_positions.py guard_table.py encoder_observer.py states.py stop.py drive_events.py)
 coverage: $(READY)
 	$(TESTS) -m "not campaign" --cov-branch --cov-report=term-missing --cov-fail-under=100 \
 		$(GUARDED:%=--cov=ident_service.motion.%) $(GUARD_TESTS)

@@ -15,8 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from ident_service.errors import DriverError
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Counts = NDArray[np.int64]
+_Numbers = TypeVar("_Numbers", bound=NDArray[Any])
 
 
 class StopKind(Enum):
@@ -36,6 +36,12 @@ class StopKind(Enum):
 
     TORQUE_OFF = "torque_off"  # no torque; an arm without brakes falls, or sinks where idle drives brake (pucks)
     QUICK_STOP = "quick_stop"  # the drives decelerate on their own, then hold or release as configured
+
+
+def read_only(array: _Numbers) -> _Numbers:
+    """Make an array read-only, and return it: samples stay what they were."""
+    array.setflags(write=False)
+    return array
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ class Watchdog:
 
 @dataclass(frozen=True)
 class SetupCheck:
-    """Represent one value that a drive says of itself, compared with what the description expects.
+    """Represent one value that a drive reports of itself, compared with what the description expects.
 
     Attributes:
         what: the value, and whose it is: `IPNM of puck 3`.
@@ -186,7 +192,7 @@ class Arm(ABC):
         Nothing is energised and nothing moves; until the encoders lose their power, `open` finds its positions by it.
 
         Returns:
-            What each drive says of itself, for people.
+            What each drive reports of itself, for people.
 
         Raises:
             DriverError: open, an arm that needs no zero, one that moves, is powered or led by another host, or that
@@ -231,7 +237,7 @@ class Arm(ABC):
         return None
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the drives of the open arm say of their set-up, compared with the description.
+        """Return what the drives of the open arm report of their set-up, compared with the description.
 
         An arm of which one is not `good` refuses to be enabled.
         """
@@ -326,8 +332,6 @@ class Arm(ABC):
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the arm, whatever happened."""
         self.close()

@@ -589,7 +589,7 @@ class Claim:
 
     @property
     def implied(self) -> frozenset[str]:
-        """Names of the conditions that the set itself consists of."""
+        """Return the names of the conditions that the set itself consists of."""
         return frozenset(block.name for block in self.blocks[: len(self.links)])
 
 

@@ -118,12 +118,12 @@ class SimulatedArm(Arm):
         self._machine.enable()
 
     def reset(self) -> None:
-        """Clear what the drives have latched, as the contract says; raises DriverError when not open."""
+        """Clear what the drives have latched; see `Arm`; raises DriverError when not open."""
         self._require_open()
         self._machine.reset()
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, as the contract says; None while enabled lets the last torque act on, as drives do.
+        """Exchange one cycle; see `Arm`; None while enabled lets the last torque act on, as drives do.
 
         Raises:
             DriverError: as in the contract; or the plant ran away, or a fault took the bus, both of which use up

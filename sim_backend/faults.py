@@ -124,7 +124,7 @@ class Feedback:
     def receive(
         self, fresh: Vector, status: tuple[int, ...], faults: Sequence[Fault]
     ) -> tuple[Vector, Flags, Counts, tuple[int, ...]]:
-        """Pass one cycle's answers through the faults of that cycle.
+        """Return one cycle's answers as the faults of that cycle change them.
 
         Args:
             fresh: positions that the encoders show [rad or m], shape (joints,); kept.

@@ -27,7 +27,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from drivers.arm import ArmDescription, Counts, Flags, StopKind, Vector
+from drivers.arm import ArmDescription, Counts, Flags, StopKind, Vector, read_only
 from drivers.axis_status import AxisStatus
 from drivers.clock import Clock
 from ident_service.errors import DriverError
@@ -138,15 +138,15 @@ class Drives:
         self._braking = braking
         self._watchdog = watchdog
         joints = imperfections.torque_limit.size
-        self._none = _frozen(np.zeros(joints))
-        self._off = self._none if unpowered is None else _frozen(unpowered)
+        self._none = read_only(np.zeros(joints))
+        self._off = self._none if unpowered is None else read_only(unpowered)
         # A power stage that failed shorts nothing; a brake, which holds more than shorted windings do, closes without.
-        self._failed = _frozen(np.where(self._off > braking, self._off, 0.0))
+        self._failed = read_only(np.where(self._off > braking, self._off, 0.0))
         self._after_ramp = braking if unpowered is None else unpowered
         self._ramp = ramp
         self._braked = np.zeros(joints, dtype=np.int64)  # periods that each axis has been idle
         self._trips = np.zeros(joints, dtype=np.int64)
-        self._full = _frozen(np.ones(joints))
+        self._full = read_only(np.ones(joints))
         self._powered = self._none
         self._energised = False
         self._silent = 0
@@ -218,7 +218,7 @@ class Drives:
             `acting`.
         """
         if torque is not None:
-            self._command = _frozen(self._imperfections.drive(torque))
+            self._command = read_only(self._imperfections.drive(torque))
         self._silent = self._silent + 1 if torque is None and self.on else 0
         self._queue.append(self._command)
         self._wanted = self._queue.popleft()
@@ -267,25 +267,20 @@ class Drives:
         for fault in faults:
             if fault.kind is FaultKind.TORQUE_SIGN:
                 really[fault.axes] *= -1.0
-        self.acting, self.torque = _frozen(told), _frozen(really)
+        self.acting, self.torque = read_only(told), read_only(really)
         idle = (trips & int(AxisStatus.IDLE)) != 0
         self._braked = np.where(idle, self._braked + 1, 0)
         # An axis that lost its power, by the emergency stop or by itself, has no ramp.
         ramping = idle & (self._braked <= self._ramp) & ((trips & _POWERLESS) == 0)
         off = np.where(idle, self._after_ramp, self._off)
         failed = (trips & int(AxisStatus.FAULT)) != 0
-        self.damping = _frozen(
+        self.damping = read_only(
             np.where(ramping, self._braking, np.where((trips == 0) & self.on, 0.0, np.where(failed, self._failed, off)))
         )
-        self._powered = _frozen(np.where((trips == 0) & self.on, 1.0, 0.0))
+        self._powered = read_only(np.where((trips == 0) & self.on, 1.0, 0.0))
         words = np.where(trips == 0, int(self.on), trips & ~_SILENT)
         self._words = tuple(words.tolist())
         return self.acting
-
-
-def _frozen(array: Vector) -> Vector:
-    array.setflags(write=False)
-    return array
 
 
 # An arm that loses its power farther from its stand than this many times how far it sinks onto it falls beside it.

@@ -250,7 +250,7 @@ class Plant:
 
     @property
     def velocity(self) -> Array:
-        """[rad/s or m/s], shape (joints,), read-only; exactly 0 where a joint sticks with all drives that move it."""
+        """Return the velocity [rad/s or m/s], shape (joints,); exactly 0 where a joint sticks with all its drives."""
         return self._velocity
 
     @property

@@ -244,12 +244,12 @@ class RemoteArm(Arm):
         self._enabled = True
 
     def reset(self) -> None:
-        """Clear what the drives have latched, as the contract says; raises DriverError when not open."""
+        """Clear what the drives have latched; see `Arm`; raises DriverError when not open."""
         self._require_open()
         self._done(self._ask(wire.Reset(), self._deadline))
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, as the contract says; a cycle without a torque is silence for the drives' watchdog.
+        """Exchange one cycle; see `Arm`; a cycle without a torque is silence for the drives' watchdog.
 
         Raises:
             DriverError: as in the contract; a fault took the bus; or the plant did not answer within the deadline,

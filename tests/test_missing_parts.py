@@ -50,7 +50,7 @@ REASONS = ("no Chromium on this machine", "no systemd-analyze", "needs gcc", "co
         ("true", "1 failed, 1 passed, 1 skipped, 1 xfailed, 3 errors"),
     ],
 )
-def test_what_is_missing_is_told_and_fails_in_ci(tmp_path: Path, ci: str, summary: str) -> None:
+def test_what_is_missing_is_reported_and_fails_in_ci(tmp_path: Path, ci: str, summary: str) -> None:
     (tmp_path / "test_parts.py").write_text(TESTS)
     (tmp_path / "test_module.py").write_text(MODULE)
     words = ("-q", "-rs", "--color=no", "--continue-on-collection-errors", "-c", os.devnull, "--rootdir", tmp_path)

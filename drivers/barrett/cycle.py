@@ -1,4 +1,4 @@
-"""Exchange positions and torques with all pucks of an arm, cycle by cycle, and keep what each says of itself.
+"""Exchange positions and torques with all pucks of an arm, cycle by cycle, and keep what each reports of itself.
 
 A cycle begins with one GET of the position to the whole arm, which every puck answers, and with one or two frames of
 torques right behind it. A puck samples its encoder about 75 us after it was asked, when the first torque frame has just

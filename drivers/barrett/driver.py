@@ -12,22 +12,21 @@ an arm without brakes; a stream of zero torques would let it fall. IDLE is asked
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from math import pi
 from pathlib import Path
-from typing import Any
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
+from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog, read_only
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
-from drivers.barrett.cycle import PuckBus, PuckCodec, axis_status, budget
-from drivers.barrett.joint_encoders import JointEncoders
+from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
-from drivers.can.bus_state import HOST, Event, EventCode
+from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import BusSession
 from drivers.clock import Clock, RealClock, VirtualClock
@@ -35,6 +34,90 @@ from drivers.motor_units import Coordinates, motor_coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
 from ident_service.config.barrett import BarrettDriver
 from ident_service.errors import ActionNeeded, DriverError, EmergencyStopped, NobodyEnabled, PositionUnknown
+
+_CYCLES: Final = 3  # in a row beyond the tolerance: two encoders are not read in the very same moment
+
+
+class JointEncoders:
+    """Follow encoders at the joints, and compare how far joints and motors have moved since the arm was opened.
+
+    What a joint encoder counts from is not known. So each takes the motors' position where the arm is opened, and from
+    then on says the same as they, but for what cables stretch. Where it does not, a cable has slipped or broken, or one
+    of the two encoders is wrong.
+    """
+
+    def __init__(self, driver: BarrettDriver, coordinates: Coordinates, names: Sequence[str]) -> None:
+        """Use the description; nothing is known yet.
+
+        Args:
+            driver: the section `driver`.
+            coordinates: of the arm.
+            names: of the joints.
+        """
+        self._pucks, self._names, self._tolerance = driver.pucks, names, driver.joint_tolerance
+        self._radians = {k: 2.0 * pi / puck.joint_counts for k, puck in enumerate(driver.pucks) if puck.joint_counts}
+        self._motors_of = coordinates.motors_of
+        self._counts: dict[int, int] = {}
+        self._origin: dict[int, float] = {}
+        self._beyond = dict.fromkeys(self._radians, 0)
+        self._position = np.full(len(names), np.nan)
+
+    def checks(self, pucks: Sequence[MotorPuck]) -> tuple[SetupCheck, ...]:
+        """Compare whether pucks tell a joint encoder with the description.
+
+        Args:
+            pucks: as they have answered.
+        """
+        remedy = "List the nodes that read one in driver.joint_encoders, with joint_counts; its bits are on the bus."
+        words = {True: "told", False: "not told"}
+        return tuple(
+            SetupCheck(
+                f"joint encoder of puck {puck.node}", words[puck.encoder is not None], words[k in self._radians], remedy
+            )
+            for k, puck in enumerate(pucks)
+            if (puck.encoder is not None) or k in self._radians
+        )
+
+    def begin(self, pucks: Sequence[MotorPuck], position: Vector) -> None:
+        """Take the motors' position [rad], shape (joints,), as that of the encoders."""
+        for k in self._radians:
+            self._counts[k] = pucks[k].encoder or 0
+            self._origin[k] = float(position[k]) - self._counts[k] * self._radians[k]
+            self._beyond[k] = 0
+
+    def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
+        """Return joint positions by the encoders, and an event of each joint that has come apart from its motors.
+
+        Args:
+            pucks: at the end of a cycle.
+            position: of the joints by their motors [rad], shape (joints,).
+
+        Returns:
+            Positions by the encoders [rad], shape (joints,), NaN for joints without one; None for an arm without any.
+            And an event of each joint that has come apart from its motors.
+        """
+        if not self._radians:
+            return None, []
+        found, told = self._position.copy(), []
+        for k, radians in self._radians.items():
+            encoder = pucks[k].encoder
+            if encoder is None:
+                continue
+            self._counts[k] = unwrapped(self._counts[k], encoder, POSITION_BITS)
+            found[k] = self._counts[k] * radians + self._origin[k]
+            if not all(pucks[motor].answered for motor in (*self._motors_of[k], k)):
+                continue  # of different moments
+            apart = found[k] - position[k]
+            self._beyond[k] = self._beyond[k] + 1 if abs(apart) > self._tolerance else 0
+            if self._beyond[k] == _CYCLES:
+                words = (
+                    f"{self._names[k]}: its encoder has moved {apart:+.3f} rad further than its motors since the arm "
+                    f"was opened, {self._tolerance:g} rad are tolerated"
+                )
+                told.append(AxisEvent(AxisEventCode.TRANSMISSION_SLIPPED, k, words))
+        found.setflags(write=False)
+        return found, told
+
 
 LOOK_RATE = 20.0  # Hz
 _SETTLED = 5  # cycles in a row with everybody's position before an arm counts as open
@@ -47,21 +130,7 @@ _LOWER_EVERY = 5  # cycles between two commands to an arm that is active while n
 _EXPLAINED = 4  # cycles, at most, that news of an arm that is not active any more wait for the pendant's reason
 _SHIFT_IDLE = "find the cause, then press Shift-Idle on the pendant"
 
-_CODES: dict[EventCode, AxisEventCode] = {
-    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
-    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
-    EventCode.DRIVE_STATE: AxisEventCode.DRIVE_LEFT,
-    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
-    EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,
-    EventCode.LATE: AxisEventCode.STRANGE_FRAME,
-    EventCode.WRONG_LENGTH: AxisEventCode.STRANGE_FRAME,
-    EventCode.STRANGER: AxisEventCode.STRANGE_FRAME,
-    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
-    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
-    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
-    EventCode.OVERFLOW: AxisEventCode.STRANGE_FRAME,
-    EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
-}
+_CODES = BUS_EVENTS | {EventCode.DRIVE_STATE: AxisEventCode.DRIVE_LEFT}
 
 
 class BarrettArm(Arm):
@@ -100,7 +169,7 @@ class BarrettArm(Arm):
         self._limits = np.array([np.inf if j.torque is None else j.torque for j in config.joints.values()])
         self._home = [joint.home for joint in config.joints.values()]
         joints = len(pucks)
-        self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
+        self._all_fresh = read_only(np.ones(joints, dtype=bool)), read_only(np.zeros(joints, dtype=np.int64))
         self._motors_of = self._coordinates.motors_of
         self._joint_encoders = JointEncoders(config.driver, self._coordinates, list(config.joints))
         joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
@@ -119,7 +188,7 @@ class BarrettArm(Arm):
         self._enabled = False
         self._untold = False  # whether a stop is still to be sent
         self._counts = [0] * len(self._limits)
-        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._acting = read_only(np.zeros(len(self._limits)))
         self._unwrapped: list[int] = []
         self._cycle = 0
         self._stale: set[int] = set()
@@ -135,7 +204,7 @@ class BarrettArm(Arm):
         return BarrettArm(self._config, self._open_bus, looks=True)
 
     def zero(self) -> tuple[str, ...]:
-        """Define the present position as the home of the description; as in the contract."""
+        """Define the present position as the home of the description; see `Arm`."""
         if self._bus is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         if self._looks:
@@ -152,7 +221,7 @@ class BarrettArm(Arm):
             self.close()
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session; as in the contract."""
+        """Log every frame of the next session; see `Arm`."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -217,7 +286,7 @@ class BarrettArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the pucks say of themselves, see `Arm`."""
+        """Return what the pucks report of themselves, see `Arm`."""
         return self._checks
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
@@ -280,7 +349,7 @@ class BarrettArm(Arm):
             raise ActionNeeded(f"the pendant shows {bus.codec.safety.pendant}; {_SHIFT_IDLE}")
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, as the contract says.
+        """Exchange one cycle; see `Arm`.
 
         Raises:
             DriverError: as in the contract; also an arm that is looked at and has been activated.
@@ -294,7 +363,7 @@ class BarrettArm(Arm):
                 raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)
             self._counts, _ = self._coordinates.torque_counts(wanted)
-            self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+            self._acting = read_only(self._coordinates.joint_torque(self._counts))
         if not self._enabled:
             self._keep_idle(bus)
         stamp_ns = bus.cycle(None if torque is None else self._counts)
@@ -461,7 +530,7 @@ class BarrettArm(Arm):
 
     def _no_torque(self) -> None:
         self._counts = [0] * len(self._limits)
-        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._acting = read_only(np.zeros(len(self._limits)))
 
     def _sample(self, bus: PuckBus, stamp_ns: int) -> Sample:
         pucks, safety = bus.codec.pucks, bus.codec.safety
@@ -533,8 +602,3 @@ def from_config(config: ArmConfig, clock: Clock | None = None) -> BarrettArm:
         DriverError: the description lacks something.
     """
     return BarrettArm(config)
-
-
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
-    array.setflags(write=False)
-    return array

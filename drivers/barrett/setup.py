@@ -3,7 +3,7 @@
 Order (libbarrett, OWD, btclient): STAT of everybody; those in their monitor are woken one at a time, 10 ms apart, as a
 transceiver that starts can disturb the bus; a second later everybody must be ready. Then VERS and ROLE, from which the
 numbers of all other properties follow; group frames need the same numbers for P and T in all motor pucks. Then what
-each says of itself is compared with the description (`checks`).
+each reports of itself is compared with the description (`checks`).
 
 A puck counts from where it was when power came. Its positions are the arm's once a person has led the arm home and has
 said so (`ident set-home ARM`); the safety puck remembers that (ZERO = 1) for as long as it has power. A motor with
@@ -138,7 +138,7 @@ def _of_a_host(frame: Frame) -> bool:
 
 @dataclass(frozen=True)
 class FoundPuck:
-    """Hold what one motor puck says of itself.
+    """Hold what one motor puck reports of itself.
 
     Attributes:
         puck: its section of the description.
@@ -164,7 +164,7 @@ class FoundPuck:
 
 @dataclass(frozen=True)
 class FoundArm:
-    """Hold what all pucks of an arm say of themselves.
+    """Hold what all pucks of an arm report of themselves.
 
     Attributes:
         pucks: the motor pucks, in the arm's order.
@@ -185,7 +185,7 @@ class FoundArm:
 
 
 def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -> FoundArm:
-    """Ask every puck of an arm for what it says of itself.
+    """Ask every puck of an arm for what it reports of itself.
 
     Args:
         port: to the bus.
@@ -234,14 +234,14 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
         if len(set(numbers.values())) > 1:
             versions = ", ".join(f"puck {one.puck.node} {one.properties.version}" for one in arm.pucks)
             raise DriverError(
-                f"{name} has not one number in all pucks, so that no frame reaches them together: firmware of "
-                f"{versions}; bring them to one firmware"
+                f"the property {name} has another number in some pucks, so one frame cannot reach all of them; install "
+                f"the same firmware in all ({versions})"
             )
     return arm
 
 
 def checks(arm: FoundArm, driver: BarrettDriver) -> tuple[SetupCheck, ...]:
-    """Compare what the pucks say of themselves with the description.
+    """Compare what the pucks report of themselves with the description.
 
     Args:
         arm: what they say.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Literal
 
+from drivers.axis_status import AxisEventCode
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
 
@@ -94,7 +95,7 @@ class BusOffWatch:
     def __init__(self) -> None:
         self.off = False
 
-    def heard(self, frame: Frame) -> None:
+    def observe(self, frame: Frame) -> None:
         """Note an error frame; ignore other frames."""
         if frame.error:
             self.off = (self.off or bool(frame.identifier & BUS_OFF)) and not frame.identifier & RESTARTED
@@ -186,6 +187,17 @@ MILD = frozenset(
         *(EventCode.BUS_ERROR, EventCode.OVERFLOW),
     }
 )
+
+BUS_EVENTS = {
+    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
+    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
+    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
+    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
+    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
+    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
+    **dict.fromkeys(MILD, AxisEventCode.STRANGE_FRAME),
+}
+"""Events that any drives on CAN have, as events of the arm's axes."""
 
 
 @dataclass(frozen=True, slots=True)

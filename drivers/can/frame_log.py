@@ -16,7 +16,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from drivers.can.can_frame import Frame, pack_frames
@@ -89,7 +88,7 @@ class BusSession:
         self._log: SessionLog | None = None
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; as in the contract."""
+        """Log every frame of the next session to a `.log` of candump's, `.asc` or `.blf`; see `Arm`."""
         self._path = require_format(path)
 
     def logged(self) -> str:
@@ -168,9 +167,7 @@ class SessionLog:
         """Return this log."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Finish the file."""
         self.close()
 

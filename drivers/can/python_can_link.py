@@ -202,7 +202,7 @@ class PythonCanLink:
             now - round(age * 1e9) if 0.0 <= age < _PLAUSIBLE_S else now,
             message.is_fd,
         )
-        self._watch.heard(frame)
+        self._watch.observe(frame)
         return frame
 
     def _failure(self, error: Exception) -> BusError:

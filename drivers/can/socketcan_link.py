@@ -225,7 +225,7 @@ class RawLink:
                 self._note_dropped(_COUNT.unpack(value)[0], now)
         age = time.time_ns() - stamp
         frame = from_kernel(data, now - age if 0 <= age < _PLAUSIBLE_NS else now)
-        self._watch.heard(frame)
+        self._watch.observe(frame)
         return frame
 
     def _note_dropped(self, count: int, now: int) -> None:

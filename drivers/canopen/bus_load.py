@@ -11,10 +11,10 @@ for them.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
-from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Cost, Line, line_of, mean_bits, shares
+from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, mean_bits, shares
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import NmtState
 from drivers.canopen.object_dictionary import Entry, Kind
@@ -63,18 +63,7 @@ def budget(driver: CanopenDriver, rate: float) -> Budget:
     return plain if plain.fits else Budget(rate, plain.buses, tuple(_remedies(driver, rate, plain)))
 
 
-def frame_cost(cob_id: int, slots: Sequence[Entry], bus: CanBus) -> Cost:
-    """Return the time of one frame with these contents on a bus, intermission included [s].
-
-    Args:
-        cob_id: its identifier.
-        slots: entries that it carries; they decide its length and which values are typical.
-        bus: its bit rates.
-    """
-    return _line_of("", (cob_id,), tuple(slots), 1.0, bus).each
-
-
-def _line_of(
+def frame_line(
     name: str,
     cob_ids: tuple[int, ...],
     slots: tuple[Entry, ...],
@@ -83,6 +72,7 @@ def _line_of(
     *,
     cyclic: bool = False,
 ) -> Line:
+    """Return the cost of frames with these contents on a bus; `slots` decide length and typical values."""
     length, fd = sum(slot.kind.size for slot in slots), bus.data_bitrate is not None
     return line_of(name, cob_ids, length, per_second, bus, lambda one: _mean_bits(one, slots, fd), cyclic=cyclic)
 
@@ -140,7 +130,7 @@ def _line(
     *,
     cyclic: bool = False,
 ) -> Line:
-    return _line_of(name, cob_ids, slots, per_second, profile.bus, cyclic=cyclic)
+    return frame_line(name, cob_ids, slots, per_second, profile.bus, cyclic=cyclic)
 
 
 def _remedies(driver: CanopenDriver, rate: float, plain: Budget) -> Iterator[str]:

@@ -111,7 +111,7 @@ _SDO_BYTES = 8
 
 
 @dataclass
-class _Seen:
+class _LastAnswers:
     """Hold what is known of one drive: last answers, and cycles since its last position."""
 
     position: int | None = None
@@ -158,7 +158,7 @@ class MonitoringArm(Arm):
 
     def _begin(self) -> None:
         self._heard = BusListener()
-        self._seen = [_Seen() for _ in self._places]
+        self._seen = [_LastAnswers() for _ in self._places]
         self._identities: tuple[str, ...] = ()
         self._missing: set[int] = set()  # drives that did not answer when the arm was opened, so that no zero is known
         self._cycle, self._lost = 0, 0
@@ -347,7 +347,7 @@ class MonitoringArm(Arm):
         )
 
 
-def _take(seen: _Seen, position: int | None, status: int | None) -> None:
+def _take(seen: _LastAnswers, position: int | None, status: int | None) -> None:
     """Store the answers of one drive in one cycle; None for a missing answer."""
     seen.age += 1
     if position is not None:
@@ -356,6 +356,6 @@ def _take(seen: _Seen, position: int | None, status: int | None) -> None:
     seen.status = status if status is not None else seen.status
 
 
-def _says(seen: _Seen) -> str:
+def _says(seen: _LastAnswers) -> str:
     words = "no status word" if seen.status is None else drive_words(seen.status, seen.emergency)
     return words if seen.age == 0 else f"{words} (no answer for {seen.age} cycles)"

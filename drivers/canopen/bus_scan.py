@@ -82,8 +82,8 @@ def scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = open_l
     Raises:
         DriverError: another driver, a bus that is in use, by another host too, or that cannot be had.
     """
-    with asking(config, open_bus) as (driver, links, heard):
-        return _found(driver, links, heard)
+    with asking(config, open_bus) as (driver, links, listener):
+        return _found(driver, links, listener)
 
 
 @contextmanager
@@ -108,12 +108,12 @@ def asking(
         if all(bus.interface != "lock_step" for bus in driver.buses):
             locks += [BusLock(bus) for bus in driver.buses]
         links += open_bus(config)
-        heard = BusListener()
-        heard.listen(links, LISTEN)
-        if heard.streaming:
-            buses = ", ".join(driver.buses[bus].channel for bus in sorted(heard.streaming))
+        listener = BusListener()
+        listener.listen(links, LISTEN)
+        if listener.streaming:
+            buses = ", ".join(driver.buses[bus].channel for bus in sorted(listener.streaming))
             raise DriverError(f"another host sends SYNC on {buses}; a scan would delay its frames: stop it first")
-        yield driver, links, heard
+        yield driver, links, listener
     finally:
         for link in links:
             with suppress(Exception):
@@ -122,35 +122,35 @@ def asking(
             lock.close()
 
 
-def _found(driver: CanopenDriver, links: list[Link], heard: BusListener) -> list[FoundNode]:
+def _found(driver: CanopenDriver, links: list[Link], listener: BusListener) -> list[FoundNode]:
     clock = links[0].clock
 
-    def asked(places: set[Place], patience: float) -> dict[Place, int | None]:
-        answers = poll(links, places, od.DEVICE_TYPE, clock.now_ns() + round(patience * 1e9), heard.take)
+    def answering(places: set[Place], patience: float) -> dict[Place, int | None]:
+        answers = poll(links, places, od.DEVICE_TYPE, clock.now_ns() + round(patience * 1e9), listener.take)
         return answers.values | dict.fromkeys(answers.aborts)
 
     everybody = {(bus, node) for bus in range(len(links)) for node in NODES}
     bursts = -(-len(NODES) // BURST)
     wire = 2 * BURST * sum(worst(_SDO_BYTES)) / min(bus.bitrate for bus in driver.buses)
-    kinds = asked(everybody, bursts * (PATIENCE + wire))
-    doubtful = {*heard.nmt, *heard.answered, *((drive.bus, drive.node) for drive in driver.drives)} - kinds.keys()
+    kinds = answering(everybody, bursts * (PATIENCE + wire))
+    doubtful = {*listener.nmt, *listener.answered, *((drive.bus, drive.node) for drive in driver.drives)} - kinds.keys()
     if doubtful:
-        kinds |= asked(doubtful, -(-len(doubtful) // BURST) * TIMEOUT)
+        kinds |= answering(doubtful, -(-len(doubtful) // BURST) * TIMEOUT)
     patience_ns = round(LISTEN * 1e9)
     found = []
-    for place in sorted({*kinds, *heard.nmt}):
+    for place in sorted({*kinds, *listener.nmt}):
         bus, number = place
-        words = heard.nmt_words(place, clock.now_ns(), patience_ns)
+        words = listener.nmt_words(place, clock.now_ns(), patience_ns)
         node = FoundNode(bus, number, words, place in kinds, kinds.get(place))
         if node.answers:
-            _read(node, Objects(links[bus], number, hearing(heard, bus)))
+            _read(node, Objects(links[bus], number, hearing(listener, bus)))
         found.append(node)
     return found
 
 
-def hearing(heard: BusListener, bus: int) -> Callable[[Frame], None]:
+def hearing(listener: BusListener, bus: int) -> Callable[[Frame], None]:
     """Return the function that takes the frames of a bus that are not answers."""
-    return lambda frame: heard.take(bus, frame)
+    return lambda frame: listener.take(bus, frame)
 
 
 def _read(node: FoundNode, objects: Objects) -> None:

@@ -462,7 +462,7 @@ def _mode_entry(text: str) -> Entry:
 def disable_supervision(
     objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]
 ) -> Iterator[None]:
-    """Disable the supervision of the host in a drive that is off; one that is not shall miss the host, and stop.
+    """Disable in steps the supervision of the host in a drive that is off; a drive that is on keeps it.
 
     It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed it
     confirms afterwards too, and nothing else: one that restarted in the session has lost its zero.

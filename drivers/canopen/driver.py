@@ -19,15 +19,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog
+from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog, read_only
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.can.bus_load import Budget
-from drivers.can.bus_state import HOST, Event, EventCode
+from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import BusSession
 from drivers.canopen import object_dictionary as od
@@ -182,28 +180,16 @@ class MeasuredTorque:
         for motors, joints in self._coordinates.groups:
             if not (all(self._reports[k] for k in motors) and any(new[k] for k in motors)):
                 torque[list(joints)] = np.nan
-        self.torque, self.last = torque, _frozen(np.where(np.isnan(torque), self.last, torque))
+        self.torque, self.last = torque, read_only(np.where(np.isnan(torque), self.last, torque))
         if self._compares:
             self.difference = self._coordinates.joint_torque(self._outside)
 
 
-_CODES: dict[EventCode, AxisEventCode] = {
-    EventCode.EMERGENCY: AxisEventCode.EMERGENCY_MESSAGE,
+_CODES = BUS_EVENTS | {
     EventCode.NOTICE: AxisEventCode.DRIVE_NOTICE,
-    EventCode.BOOT_UP: AxisEventCode.DRIVE_RESTARTED,
     EventCode.LEFT: AxisEventCode.DRIVE_LEFT,
     EventCode.DEAF: AxisEventCode.TORQUE_IGNORED,
-    EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
     EventCode.TORQUE_LIMITED: AxisEventCode.TORQUE_LIMITED,
-    EventCode.DUPLICATE: AxisEventCode.STRANGE_FRAME,
-    EventCode.LATE: AxisEventCode.STRANGE_FRAME,
-    EventCode.WRONG_LENGTH: AxisEventCode.STRANGE_FRAME,
-    EventCode.STRANGER: AxisEventCode.STRANGE_FRAME,
-    EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
-    EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
-    EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
-    EventCode.OVERFLOW: AxisEventCode.STRANGE_FRAME,
-    EventCode.BUS_ERROR: AxisEventCode.STRANGE_FRAME,
 }
 # Emergencies of a drive that is in trouble with the bus itself (CiA 301, table 26).
 _ERROR_PASSIVE = "8120h"
@@ -212,7 +198,7 @@ _ERROR_PASSIVE = "8120h"
 def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
     """Translate the events of one bus.
 
-    events: as the codec reports them. States of drives, errors that were reset and a return to normal are not among
+    Args:
         events: as the codec tells them. States of drives, errors that were reset and a return to normal are not among
             the results.
         codec: of the bus.
@@ -315,7 +301,7 @@ class CanopenArm(Arm):
         if len(self._limits) != len(config.driver.drives):
             raise DriverError(f"{config.name}: joints must name all {len(config.driver.drives)} joints")
         joints = len(self._limits)
-        self._all_fresh = _frozen(np.ones(joints, dtype=bool)), _frozen(np.zeros(joints, dtype=np.int64))
+        self._all_fresh = read_only(np.ones(joints, dtype=bool)), read_only(np.zeros(joints, dtype=np.int64))
         # Joints that each drive moves, and drives that each joint needs.
         self._joints_of = {k: joints for motors, joints in self._coordinates.groups for k in motors}
         self._drives_of = self._coordinates.motors_of
@@ -333,7 +319,7 @@ class CanopenArm(Arm):
         self._stop = StopCommand()
         self._stops = 0  # stop commands so far
         self._counts = [0] * len(self._limits)
-        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._acting = read_only(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
         self._told: list[tuple[int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
@@ -348,14 +334,14 @@ class CanopenArm(Arm):
         return MonitoringArm(self._config, self._open_bus)
 
     def zero(self) -> tuple[str, ...]:
-        """Store the drives' present position as the home of the description; as in the contract."""
+        """Store the drives' present position as the home of the description; see `Arm`."""
         if self._buses is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         with ZeroingArm(self._config, self._open_bus) as arm:
             return arm.take_home()
 
     def log_frames(self, path: Path) -> None:
-        """Log every frame of the next session; as in the contract."""
+        """Log every frame of the next session; see `Arm`."""
         self._session.log_frames(path)
 
     def logged(self) -> str:
@@ -453,7 +439,7 @@ class CanopenArm(Arm):
         )
 
     def exchange(self, torque: Vector | None) -> Sample:
-        """Exchange one cycle, as the contract says.
+        """Exchange one cycle; see `Arm`.
 
         Raises:
             DriverError: as in the contract.
@@ -469,11 +455,11 @@ class CanopenArm(Arm):
                 raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
             self._counts, _ = self._coordinates.torque_counts(wanted)
-            self._acting = _frozen(self._coordinates.joint_torque(self._counts))
+            self._acting = read_only(self._coordinates.joint_torque(self._counts))
         return self._exchanged(buses, sends=torque is not None)
 
     def exchange_position(self, position: Vector) -> Sample:
-        """Exchange one cycle with drives that are given positions, as the contract says.
+        """Exchange one cycle with drives that are given positions; see `Arm`.
 
         Raises:
             DriverError: as in the contract.
@@ -570,7 +556,7 @@ class CanopenArm(Arm):
         """Set the targets of drives that are to do nothing: no torque, or the position where each of them is."""
         there = self._positions and self._buses is not None
         self._counts = [drive.position for drive in self._buses.drives] if there else [0] * len(self._limits)  # type: ignore[union-attr]
-        self._acting = _frozen(np.zeros(len(self._limits)))
+        self._acting = read_only(np.zeros(len(self._limits)))
 
     def _find_zero(self, buses: Buses) -> None:
         """Find the zero that the drives confirm, before they are configured, which may make them forget it."""
@@ -667,8 +653,3 @@ def from_config(config: ArmConfig, clock: Clock | None = None) -> CanopenArm:
         DriverError: the description lacks something.
     """
     return CanopenArm(config)
-
-
-def _frozen(array: NDArray[Any]) -> NDArray[Any]:
-    array.setflags(write=False)
-    return array

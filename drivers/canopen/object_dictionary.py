@@ -122,39 +122,24 @@ LAST_EMERGENCY = Entry(0x603F, 0, Kind.U16, "last error code")
 CONTROL_WORD = Entry(0x6040, 0, Kind.U16, "control word")
 STATUS_WORD = Entry(0x6041, 0, Kind.U16, "status word")
 QUICK_STOP_OPTION = Entry(0x605A, 0, Kind.I16, "reaction to quick stop")
-SHUTDOWN_OPTION = Entry(0x605B, 0, Kind.I16, "reaction to shutdown")
-DISABLE_OPTION = Entry(0x605C, 0, Kind.I16, "reaction to disable operation")
-HALT_OPTION = Entry(0x605D, 0, Kind.I16, "reaction to halt")
 FAULT_OPTION = Entry(0x605E, 0, Kind.I16, "reaction to a fault")
 MODE = Entry(0x6060, 0, Kind.I8, "mode of operation")
 MODE_DISPLAY = Entry(0x6061, 0, Kind.I8, "mode of operation in effect")
 POSITION = Entry(0x6064, 0, Kind.I32, "position", "counts")
-FOLLOWING_WINDOW = Entry(0x6065, 0, Kind.U32, "following error window", "counts")
-FOLLOWING_TIMEOUT = Entry(0x6066, 0, Kind.U16, "following error timeout", "ms")
-VELOCITY = Entry(0x606C, 0, Kind.I32, "velocity", "drive's unit")
 TARGET_TORQUE = Entry(0x6071, 0, Kind.I16, "target torque", "per mille of rated torque")
 TARGET_TORQUE_WIDE = Entry(0x6071, 0, Kind.I32, "target torque of 32 bits", "shifted counts")  # of makers
-MAX_TORQUE = Entry(0x6072, 0, Kind.U16, "largest torque", "per mille of rated torque")
-MAX_CURRENT = Entry(0x6073, 0, Kind.U16, "largest current", "per mille of rated current")
 TARGET_POSITION = Entry(0x607A, 0, Kind.I32, "target position", "counts")
-TORQUE_DEMAND = Entry(0x6074, 0, Kind.I16, "torque demand", "per mille of rated torque")
 RATED_CURRENT = Entry(0x6075, 0, Kind.U32, "rated current", "mA")
-RATED_TORQUE = Entry(0x6076, 0, Kind.U32, "rated torque", "mN m")
 TORQUE_ACTUAL = Entry(0x6077, 0, Kind.I16, "torque", "per mille of rated torque")
-CURRENT_ACTUAL = Entry(0x6078, 0, Kind.I16, "current", "per mille of rated current")
-DC_LINK = Entry(0x6079, 0, Kind.U32, "voltage of the DC link", "mV")
 LOWER_LIMIT = Entry(0x607D, 1, Kind.I32, "lowest position", "counts")
 UPPER_LIMIT = Entry(0x607D, 2, Kind.I32, "highest position", "counts")
 MAX_VELOCITY = Entry(0x607F, 0, Kind.U32, "largest velocity", "drive's unit")
-MAX_SPEED = Entry(0x6080, 0, Kind.U32, "largest speed of the motor", "turns per minute")
 QUICK_STOP_DECELERATION = Entry(0x6085, 0, Kind.U32, "deceleration of quick stop", "drive's unit")
-TORQUE_SLOPE = Entry(0x6087, 0, Kind.U32, "torque slope", "per mille of rated torque per s")
 ENCODER_COUNTS = Entry(0x608F, 1, Kind.U32, "encoder counts", "per ENCODER_TURNS")
 ENCODER_TURNS = Entry(0x608F, 2, Kind.U32, "turns of the motor for ENCODER_COUNTS")
 GEAR_MOTOR = Entry(0x6091, 1, Kind.U32, "turns of the motor for GEAR_SHAFT")
 GEAR_SHAFT = Entry(0x6091, 2, Kind.U32, "turns of the driving shaft")
 VELOCITY_UNIT = Entry(0x60A9, 0, Kind.U32, "unit of velocities", "prefix, unit, unit of time")
-TORQUE_OFFSET = Entry(0x60B2, 0, Kind.I16, "torque offset", "per mille of rated torque")
 PERIOD_NUMBER = Entry(0x60C2, 1, Kind.U8, "interpolation period", "10^PERIOD_POWER s")
 PERIOD_POWER = Entry(0x60C2, 2, Kind.I8, "power of ten of the interpolation period")
 SECOND_AXIS = Entry(0x6841, 0, Kind.U16, "status word of a second axis")  # 800h further for each (CiA 402-2)
@@ -181,8 +166,6 @@ class OperationMode:
 
 
 CST = 10  # cyclic synchronous torque, in 6060h and 6061h
-CST_SUPPORTED = 1 << 9  # in 6502h
-CSP = 8  # cyclic synchronous position
 
 
 def pdo_entry(entry: Entry, number: int, sub: int | None = None) -> Entry:

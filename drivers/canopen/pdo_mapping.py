@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.object_dictionary import Entry, pdo_entry
@@ -22,16 +21,6 @@ NMT, SYNC, EMERGENCY = 0x000, 0x080, 0x080
 TPDO1, RPDO1, TPDO2, RPDO2 = 0x180, 0x200, 0x280, 0x300
 SDO_REPLY, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
 
-# CiA 301, table "restricted COB-IDs": of no PDO, SYNC or EMCY that can be configured.
-_RESTRICTED = (
-    (0x000, 0x000),
-    (0x001, 0x07F),
-    (0x101, 0x180),
-    (0x581, 0x5FF),
-    (0x601, 0x67F),
-    (0x6E0, 0x6FF),
-    (0x701, 0x7FF),
-)
 _NOT_VALID, _NO_REMOTE = 1 << 31, 1 << 30  # bits of a PDO's COB-ID entry
 _EVERY_SYNC, _ON_RECEPTION, _ON_CHANGE = 1, 255, 255
 _UNUSED = ((False, 3), (True, 3), (False, 4), (True, 4))  # some drives command their axis by these out of the box
@@ -43,11 +32,6 @@ _STATUS_PATIENCE = 2.5  # periods without a status report: one was lost, and the
 # One emergency a second and drive (1015h): a drive with a storm of errors must not take the bus from the others.
 EMERGENCY_INHIBIT = 1.0
 GUARD_EARLY = 0.7  # of the guard time, after which a drive is asked again: questions come one a cycle
-
-
-def restricted(cob_id: int) -> bool:
-    """Return whether CiA 301 reserves this COB-ID."""
-    return any(low <= cob_id <= high for low, high in _RESTRICTED)
 
 
 @dataclass(frozen=True)
@@ -223,11 +207,6 @@ class BusProfile:
     def status_timeout(self) -> float:
         """Return how long to wait for a drive's status report [s]: one may be lost, and the next be delayed."""
         return _STATUS_PATIENCE * max(self.status_period, self.status_inhibit)
-
-    @cached_property
-    def position_ids(self) -> dict[int, int]:
-        """Return the node of each COB-ID of a position."""
-        return {TPDO1 + node: node for node in self.nodes}
 
     def pdos(self, node: int) -> list[Pdo]:
         """Return the PDOs of one drive; raises KeyError for a node that is not on this bus."""

@@ -109,7 +109,7 @@ class Objects:
             SdoRefused: the drive aborts the upload.
             DriverError: it does not answer, or the bus is gone.
         """
-        return bytes(self._asked(f"reading {index:04X}h:{sub:02X} {name}", self._client.upload, index, sub))
+        return bytes(self._request(f"reading {index:04X}h:{sub:02X} {name}", self._client.upload, index, sub))
 
     def read(self, entry: Entry) -> int:
         """Return the value of an entry; raises as `read_bytes`, and DriverError for a value of another length."""
@@ -123,7 +123,7 @@ class Objects:
         """Set an entry; raises as `read_bytes`."""
         entry = write.entry
         what = f"setting {entry} to {write.value}"
-        self._asked(what, self._client.download, entry.index, entry.sub, write.data)
+        self._request(what, self._client.download, entry.index, entry.sub, write.data)
 
     def holds(self, write: Write) -> bool:
         """Return whether an entry holds a value already; one that can only be written does not. Raises as `read`."""
@@ -151,7 +151,7 @@ class Objects:
         if not write.same(held):
             raise WriteNotVerified(f"node {self.node}: {write.entry} was set to {write.value} but holds {held}")
 
-    def _asked(self, what: str, ask: Callable[..., Any], *arguments: Any) -> Any:
+    def _request(self, what: str, ask: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return ask(*arguments)
         except SdoAbortedError as error:
@@ -279,24 +279,24 @@ def poll(
     groups = -(-max(map(len, waiting)) // BURST)
     start_ns = links[0].clock.now_ns()
     for group in range(groups):
-        asked = [places[BURST * group : BURST * (group + 1)] for places in waiting]
-        _ask(links, asked, entry, start_ns + (deadline_ns - start_ns) * (group + 1) // groups, found, others)
+        bursts = [places[BURST * group : BURST * (group + 1)] for places in waiting]
+        _ask(links, bursts, entry, start_ns + (deadline_ns - start_ns) * (group + 1) // groups, found, others)
     return found
 
 
 def _ask(
     links: Sequence[Link],
-    asked: Sequence[Sequence[Place]],
+    bursts: Sequence[Sequence[Place]],
     entry: Entry,
     deadline_ns: int,
     found: Answers,
     others: Callable[[int, Frame], None],
 ) -> None:
     """Ask one burst of nodes on every bus."""
-    for link, places in zip(links, asked, strict=True):
+    for link, places in zip(links, bursts, strict=True):
         for _, node in places:
             link.send(Frame(SDO_REQUEST + node, upload_request(entry)))
-    for bus, (link, places) in enumerate(zip(links, asked, strict=True)):
+    for bus, (link, places) in enumerate(zip(links, bursts, strict=True)):
         missing = set(places)
         while missing and (frame := link.receive(deadline_ns)) is not None:
             place = bus, frame.identifier - SDO_REPLY

@@ -144,7 +144,7 @@ class Zeros:
         return [counts for counts in held if counts is not None]
 
     def lost(self, nodes: Sequence[int]) -> str:
-        """Describe that drives have no zero, and what to do about it."""
+        """Return the message that drives have lost their zero, and what to do about it."""
         return (
             f"drives {', '.join(map(str, sorted(nodes)))} do not know where the arm stands: their encoders count from "
             "where they were when power came, and nobody has zeroed them since (with this description); lead the arm "

@@ -162,7 +162,7 @@ class Buses:
         return display.unpack(data) if data is not None and len(data) == display.kind.size else None
 
     def other_modes(self) -> dict[int, str]:
-        """Return what drives tell instead of their mode of operation, in words by number, and ask one of them anew."""
+        """Return what drives report instead of their mode of operation, by number, and ask one of them anew."""
         found = {}
         for number, mode in enumerate(self.modes):
             if (shown := self.mode_shown(number)) != mode.wanted:
@@ -176,7 +176,7 @@ class Buses:
         return found
 
     def forget_modes(self) -> None:
-        """Discard what drives have told of their modes of operation."""
+        """Discard what drives have reported of their modes of operation."""
         for drive, mode in zip(self.drives, self.modes, strict=True):
             drive.uploads.pop(mode.display.key, None)
 
@@ -324,7 +324,7 @@ class Buses:
         return stamp_ns
 
     def _ask_silent(self) -> None:
-        """Ask the drive that tells nothing any more for its status word: out of `operational` it still answers SDOs.
+        """Ask the drive that reports nothing any more for its status word: out of `operational` it still answers SDOs.
 
         A drive whose watchdog was tried may end there, and whether it has let go must be heard of. One drive a cycle;
         none that has booted, as it has no power and must be configured first.
@@ -420,7 +420,9 @@ class EnableSequence:
             DriverError: a drive has a fault, or the step's time is over; who, and why as far as it is known.
         """
         if bad := [drive for drive in self._drives if drive.state in _FAULTS]:
-            raise DriverError(f"{_told(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)")
+            raise DriverError(
+                f"{_states_text(self._drives, self._names, bad)}; only a reset clears it (`ident recover`)"
+            )
         for number, drive in enumerate(self._drives):
             if drive.status_age <= 1:  # came in this cycle, or before it
                 self._reported_ns[number] = now_ns
@@ -438,9 +440,8 @@ class EnableSequence:
             if self._target == 1 and self._in_other_mode and late == list(self._drives):
                 told = "; ".join(f"{self._names[number]} {words}" for number, words in self._in_other_mode.items())
                 raise DriverError(f"not enabled: {told}")
-            raise DriverError(
-                f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {_told(self._drives, self._names, late)}"
-            )
+            states = _states_text(self._drives, self._names, late)
+            raise DriverError(f"not {_WAY[self._target]} within {self._step_ns * 1e-9:g} s: {states}")
         words = []
         for number, drive in enumerate(self._drives):
             if self._there(drive):  # and waits for the others, or for the seed
@@ -497,7 +498,7 @@ class Resetting:
             return []
         if now_ns > self._deadline_ns:
             kept = [drive for drive in self._drives if drive.state in (*_FAULTS, DriveState.UNKNOWN)]
-            raise DriverError(f"the cause is still there: {_told(self._drives, self._names, kept)}")
+            raise DriverError(f"the cause is still there: {_states_text(self._drives, self._names, kept)}")
         words = []
         for number, drive in enumerate(self._drives):
             if drive.state is DriveState.FAULT:
@@ -513,7 +514,7 @@ def hold(drives: Sequence[Drive]) -> bool:
     return any(drive.state is DriveState.QUICK_STOP for drive in drives)
 
 
-def _told(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:
+def _states_text(drives: Sequence[Drive], names: Sequence[str], chosen: Sequence[Drive]) -> str:
     """Describe the states and emergencies of the chosen drives."""
     words = []
     for name, drive in zip(names, drives, strict=True):

@@ -96,7 +96,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     enable_interrupts()
     try:
         arguments = parser().parse_args(words)
-        arguments.asked_ns = time.monotonic_ns()
+        arguments.requested_ns = time.monotonic_ns()
     except ArgumentsError as wrong:
         if asks_for_json(words):
             print_error(UsageError.__name__, wrong.message, USAGE)
@@ -108,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.verb if arguments.server is None else remote.run_on_daemon
         )
         with progress_bar(arguments):
-            code, text, document = _asked(verb, arguments)
+            code, text, document = _answer_of(verb, arguments)
     except KeyboardInterrupt:
         # A second Ctrl-C: the person does not want to wait for what could be saved.
         print_to_person("ident: interrupted\n")
@@ -134,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _asked(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
+def _answer_of(verb: Callable[[argparse.Namespace], Answer], arguments: argparse.Namespace) -> Answer:
     """Return a verb's answer; turn refusals of the operating system into errors that say so."""
     try:
         return verb(arguments)

@@ -312,7 +312,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
 
 @contextmanager
 def deleted_with_anyway(kind: str, name: str) -> Iterator[None]:
-    """Let what refuses a deletion in the block say which command does it all the same."""
+    """Add to an error that refuses the deletion in the block the command that deletes anyway."""
     try:
         yield
     except InUse as error:

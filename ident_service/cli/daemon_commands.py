@@ -29,7 +29,8 @@ def add(verbs: VerbList) -> None:
     sub.add_argument("--tls-cert", type=Path, metavar="FILE", help="certificate chain, PEM")
     sub.add_argument("--tls-key", type=Path, metavar="FILE", help="its key, PEM")
     sub.add_argument("--name", action="append", default=[], metavar="HOST", help="further host name that clients use")
-    sub.add_argument("--motion-door", type=Path, metavar="SOCKET", help="of the unit that motions run in")
+    sub.add_argument("--motion-socket", type=Path, metavar="SOCKET", help="of the unit that motions run in")
+    sub.add_argument("--motion-door", dest="motion_socket", type=Path, help=argparse.SUPPRESS)  # former name
 
     sub.add_argument(
         "--webhook",
@@ -88,7 +89,7 @@ def _serve(arguments: argparse.Namespace) -> Answer:
         tls_cert=arguments.tls_cert,
         tls_key=arguments.tls_key,
         names=tuple(arguments.name),
-        motion_door=arguments.motion_door,
+        motion_socket=arguments.motion_socket,
         webhook=arguments.webhook,
         webhook_secret=arguments.webhook_secret,
     )

@@ -198,7 +198,7 @@ def run_and_report(
             lease=LEASE_SECONDS if lease is None else lease,
             log_frames=arguments.can_log,
             begin=begin,
-            asked_ns=arguments.asked_ns,
+            requested_ns=arguments.requested_ns,
             tell=entered,
             moved=moved,
             stop_requested=stop_requested,
@@ -487,7 +487,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.arm_factory import make_arm
     from ident_service.motion.command_channel import ControlFile, InterruptibleArm
     from ident_service.motion.last_position import PositionFile
-    from ident_service.motion.realtime import asked
+    from ident_service.motion.realtime import temporary_privileges
     from ident_service.motion.ticket import Verdict
     from ident_service.operations.arm_checks import ticket_document, ticket_text, write_ticket
     from ident_service.preflight.preflight import preflight
@@ -518,14 +518,14 @@ def _check(arguments: argparse.Namespace) -> Answer:
     # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
     with (
         interrupting() if lease is None else stopping,
-        ControlFile.take(control_path(state, config.name), None, asked_ns=arguments.asked_ns) as controls,
+        ControlFile.take(control_path(state, config.name), None, requested_ns=arguments.requested_ns) as controls,
     ):
         stoppable = InterruptibleArm(arm, stop_or_lapsed(lambda: controls.stop or stopping.requested(), lease))
         positions = PositionFile(arm_folder(state, config.name), config)
         step = step_of(arguments)
         closed, seconds = positions.read(), 0.0 if arguments.rate_seconds is None else arguments.rate_seconds
         # The rate is measured with what a run gets of the kernel.
-        with nullcontext() if arm.clock.lock_step else asked(settings=config.realtime):
+        with nullcontext() if arm.clock.lock_step else temporary_privileges(settings=config.realtime):
             ticket = preflight(
                 stoppable,
                 model,

@@ -180,7 +180,7 @@ def _preflown(ended: Ended) -> list[str]:
     return ["home", ended.arm] if given.home else ["run", ended.arm, *ended.motion]
 
 
-def _ran(ended: Ended) -> list[str]:
+def _after_run(ended: Ended) -> list[str]:
     if getattr(ended.given, "dry_run", False):
         return [ended.given.word, ended.arm, *ended.motion]
     if not ended.good:
@@ -323,7 +323,7 @@ _FOLLOWS: dict[str, Follows] = {
     ),
     "watch": _arm("preflight"),
     "preflight": _preflown,
-    **dict.fromkeys(("run", "rehearse"), _ran),
+    **dict.fromkeys(("run", "rehearse"), _after_run),
     "stop": _stopped,
     "pause": _arm("resume"),
     "resume": _arm("pause"),

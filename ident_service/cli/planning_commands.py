@@ -607,7 +607,7 @@ def _add_emulate(verbs: VerbList) -> None:
 def _emulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.control import Realtime
     from ident_service.config.load import load_arm, with_sheets
-    from ident_service.motion.realtime import asked
+    from ident_service.motion.realtime import temporary_privileges
     from sim_backend.emulator.process import emulate
 
     config = with_sheets(load_arm(arguments.arm), arguments.eds)
@@ -616,7 +616,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then if config.can_buses else ''}")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.
-    with stopping, asked(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):
+    with stopping, temporary_privileges(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):
         done = emulate(
             config,
             faults=arguments.fault,

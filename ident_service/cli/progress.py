@@ -115,7 +115,7 @@ class ProgressBar:
             self._first = mark
 
     def tell(self, line: str) -> bool:
-        """Have a line printed above the bar, without waiting; return False where there is no bar."""
+        """Print a line above the bar without waiting; return whether there is a bar."""
         if self._bar is None or self._over.is_set():
             return False
         self._lines.append(line)
@@ -123,7 +123,7 @@ class ProgressBar:
 
     @contextmanager
     def hidden(self) -> Iterator[None]:
-        """Take the bar away during the block, in which a person is asked."""
+        """Hide the bar during the block, in which a person is asked."""
         with self._drawing:
             self._hidden = True
             if self._bar is not None:

@@ -324,7 +324,7 @@ def _step(arguments: argparse.Namespace, *words: str) -> Answer:
     always = ["--state", str(state_folder(arguments)), *(["--json"] if arguments.json else [])]
     parsed = parser().parse_args([*words, *always])
     parsed.progress = getattr(arguments, "progress", None)
-    parsed.asked_ns = arguments.asked_ns  # a stop between two steps counts for the whole sequence
+    parsed.requested_ns = arguments.requested_ns  # a stop between two steps counts for the whole sequence
     tell(arguments, f"-- {words[0]}")
     try:
         answer: Answer = parsed.verb(parsed)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 Verb = Callable[["IdentClient", argparse.Namespace], Answer]
 Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
+RemoteVerb = tuple[Verb, frozenset[str]]  # and the arguments that are sent to a daemon; any other one is an error
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
@@ -80,29 +81,38 @@ def run_on_daemon(arguments: argparse.Namespace) -> Answer:
         UsageError: a verb that no daemon does.
         IdentError: as the daemon says.
     """
-    verbs, carried = table()
-    verb = verbs.get(arguments.word)
-    if verb is None:
+    verbs = table()
+    if arguments.word not in verbs:
         why = LOCAL_ONLY.get(arguments.word, "not available on a daemon")
         raise UsageError(f"{arguments.word}: {why}; --server is for {', '.join(sorted(verbs))}")
+    verb, carried = verbs[arguments.word]
     own = {action.dest for action in arguments.words._actions}  # not those of a noun that stands before it
     given = {name for name in own & set(vars(arguments)) if vars(arguments)[name] != arguments.words.get_default(name)}
-    if lost := sorted(given - carried[arguments.word] - _OURS):
+    if lost := sorted(given - carried - _OURS):
         options = ", ".join(f"--{name.replace('_', '-')}" for name in lost)
         raise UsageError(f"{arguments.word} --server: {options} cannot be sent to a daemon")
     return _with_client(verb)(arguments)
 
 
-def table() -> tuple[dict[str, Verb], dict[str, frozenset[str]]]:
-    """Return the verbs that a daemon can do, and for each the arguments that are sent to it."""
+def table() -> dict[str, RemoteVerb]:
+    """Return the verbs that a daemon can do."""
     from ident_service.cli import remote_results, remote_watching
 
-    groups = (remote_results, remote_watching)
-    verbs, carried = dict(REMOTE), dict(_CARRIED)
-    for group in groups:
-        verbs |= group.VERBS
-        carried |= group.CARRIED
-    return verbs, carried
+    return REMOTE | remote_results.VERBS | remote_watching.VERBS
+
+
+def carrying(words: str, verb: Verb) -> RemoteVerb:
+    """Return a verb with the names of the arguments that it sends to a daemon."""
+    return verb, frozenset(words.split())
+
+
+def plain_job(words: str, kind: str | None = None) -> RemoteVerb:
+    """Return a verb that is a job of exactly these arguments; its kind is the verb when None."""
+
+    def make(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+        return {"kind": kind} | {name: getattr(arguments, name) for name in words.split()}
+
+    return carrying(words, job_verb(make))
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
@@ -142,7 +152,7 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
 def job_verb(
     make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = with_answer_lines
 ) -> Verb:
-    """A verb that is a job.
+    """Return a verb that runs as a job of the daemon.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
@@ -298,41 +308,27 @@ def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return job_answer(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
 
 
-REMOTE: dict[str, Verb] = {
-    "simulate": job_verb(_simulate),
-    "identify": job_verb(_identify),
-    "design": job_verb(_design),
-    "preflight": job_verb(_check),
-    **dict.fromkeys(("home", "set-home"), job_verb(_home)),
-    "stop": _stop,
-    **dict.fromkeys(("pause", "resume", "finish"), _ask),
-    "supported": _supported,
-    "acknowledge": _ack,
-    "jobs": _list,
-    "jobs show": _show,
-    "jobs watch": _watch,
-    "jobs cancel": _cancel,
+REMOTE: dict[str, RemoteVerb] = {
+    "simulate": carrying("arm feasible_set motion seed", job_verb(_simulate)),
+    "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
+    "design": carrying("after arm chosen criterion motion search_time seed starts", job_verb(_design)),
+    "preflight": carrying("arm confirm home motion", job_verb(_check)),
+    "home": carrying("arm confirm zero", job_verb(_home)),
+    "set-home": carrying("arm confirm", job_verb(_home)),
+    "stop": carrying("arm", _stop),
+    **dict.fromkeys(("pause", "resume", "finish"), carrying("arm", _ask)),
+    "supported": carrying("arm confirm", _supported),
+    "acknowledge": carrying("arm fault", _ack),
+    "jobs": carrying("most", _list),
+    "jobs show": carrying("job", _show),
+    "jobs watch": carrying("job", _watch),
+    "jobs cancel": carrying("job", _cancel),
 }
 
 
-# Arguments that are sent to a daemon, by verb; any other argument that is given is an error.
 _OURS = frozenset(
-    {"json", "state", "server", "verb", "word", "words", "asks", "asked_ns", "examples", "kind", "progress"}
+    {"json", "state", "server", "verb", "word", "words", "asks", "requested_ns", "examples", "kind", "progress"}
 )
-_MOTION = frozenset({"arm", "motion", "confirm"})
-_CARRIED: dict[str, frozenset[str]] = {
-    "simulate": frozenset({"arm", "motion", "seed", "feasible_set"}),
-    "identify": frozenset({"arm", "recordings", "validate", "columns", "method", "feasible_set", "prior"}),
-    "design": frozenset({"arm", "search_time", "starts", "seed", "criterion", "chosen", "motion", "after"}),
-    "preflight": _MOTION | {"home"},
-    "home": frozenset({"arm", "confirm", "zero"}),
-    "set-home": frozenset({"arm", "confirm"}),
-    **dict.fromkeys(("stop", "pause", "resume", "finish"), frozenset({"arm"})),
-    "supported": frozenset({"arm", "confirm"}),
-    "acknowledge": frozenset({"arm", "fault"}),
-    "jobs": frozenset({"most"}),
-    **dict.fromkeys(("jobs show", "jobs watch", "jobs cancel"), frozenset({"job"})),
-}
 
 
 def _wait_for_job(

@@ -65,7 +65,7 @@ def require_registered(client: IdentClient, kind: str, named: str, path: Path) -
 
 
 def word_of_address(word: str) -> str:
-    """A word that may stand in an address."""
+    """Return a word that may stand in an address."""
     if not word or any(letter in word for letter in "/?#% \\") or not word.isprintable() or word.startswith("."):
         raise UsageError(f"{word!r}: with --server, arms, runs and jobs are named by id, not by path")
     return word

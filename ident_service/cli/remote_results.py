@@ -26,7 +26,7 @@ from ident_service.cli.identification_commands import accepted_name, fleet_lines
 from ident_service.cli.maintenance_commands import alarm_lines, due_line, schedule_line
 from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.recovery_commands import EXIT_CODES
-from ident_service.cli.remote import Verb, confirmation, job_verb, motion_id, word_of_address
+from ident_service.cli.remote import RemoteVerb, carrying, confirmation, job_verb, motion_id, word_of_address
 from ident_service.cli.remote_recordings import recording
 from ident_service.errors import ArmError, UsageError
 
@@ -305,61 +305,35 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 _DELETES = ("runs delete", "motions delete", "arms delete")
-VERBS: dict[str, Verb] = {
-    "report": job_verb(_run, _reported),
-    "export": job_verb(_export, _fetched),
-    "fleet identify": job_verb(_fleet, _of_fleet),
-    "figures": job_verb(_figures, _fetched),
-    "payload": job_verb(_payload, _fetched),
-    "compare": job_verb(_compare, with_answer_lines),
-    "verify": job_verb(_of_file, with_answer_lines),
-    "feasible": job_verb(_of_file, with_answer_lines),
-    "project": job_verb(_correct, _corrected),
-    "accept": _accept,
-    "rollback": _rollback,
-    "prune": _prune,
-    **dict.fromkeys(_DELETES, _delete),
-    "arms": _arms,
-    "runs": _runs,
-    "motions": _motions,
-    "tokens": _tokens,
-    "tokens revoke": _revoke,
-    "schedules add": _add_schedule,
-    "schedules": _schedules,
-    "schedules remove": _remove_schedule,
-    "schedules enable": _enabled(True),
-    "schedules disable": _enabled(False),
-    "maintenance": _maintenance,
-    "due": _due,
-    "due dismiss": _dismiss,
-    "alarms": _alarms,
-    "alarms acknowledge": _acknowledge_alarm,
-    "reidentify": _reidentify,
+# The audit trail has the token's name there, so that `--by` is not sent.
+VERBS: dict[str, RemoteVerb] = {
+    "report": carrying("out run", job_verb(_run, _reported)),
+    "export": carrying("format out run", job_verb(_export, _fetched)),
+    "fleet identify": carrying("arm out patterns settle_again", job_verb(_fleet, _of_fleet)),
+    "figures": carrying("format out run", job_verb(_figures, _fetched)),
+    "payload": carrying("out recordings refit_offsets run", job_verb(_payload, _fetched)),
+    "compare": carrying("others reference", job_verb(_compare)),
+    "verify": carrying("arm file", job_verb(_of_file)),
+    "feasible": carrying("arm feasible_set file", job_verb(_of_file)),
+    "project": carrying("arm feasible_set file metric out", job_verb(_correct, _corrected)),
+    "accept": carrying("note run", _accept),
+    "rollback": carrying("arm note to", _rollback),
+    "prune": carrying("keep yes", _prune),
+    **dict.fromkeys(_DELETES, carrying("anyway name", _delete)),
+    "arms": carrying("", _arms),
+    "runs": carrying("arm most", _runs),
+    "motions": carrying("arm most", _motions),
+    "tokens": carrying("", _tokens),
+    "tokens revoke": carrying("name", _revoke),
+    "schedules add": carrying("arm cron hours maintenance motion", _add_schedule),
+    "schedules": carrying("arm", _schedules),
+    "schedules remove": carrying("number", _remove_schedule),
+    "schedules enable": carrying("number", _enabled(True)),
+    "schedules disable": carrying("number", _enabled(False)),
+    "maintenance": carrying("arm note what", _maintenance),
+    "due": carrying("arm", _due),
+    "due dismiss": carrying("note number", _dismiss),
+    "alarms": carrying("arm", _alarms),
+    "alarms acknowledge": carrying("note number", _acknowledge_alarm),
+    "reidentify": carrying("arm confirm motion", _reidentify),
 }
-_FILE = frozenset({"file", "feasible_set", "arm"})
-_NUMBER = frozenset({"number"})
-CARRIED: dict[str, frozenset[str]] = {
-    "report": frozenset({"run", "out"}),
-    **dict.fromkeys(("export", "figures"), frozenset({"run", "format", "out"})),
-    "fleet identify": frozenset({"patterns", "arm", "settle_again", "out"}),
-    "payload": frozenset({"run", "recordings", "refit_offsets", "out"}),
-    "compare": frozenset({"reference", "others"}),
-    "verify": frozenset({"file", "arm"}),
-    "feasible": _FILE,
-    "project": _FILE | {"metric", "out"},
-    "accept": frozenset({"run", "note"}),
-    "rollback": frozenset({"arm", "note", "to"}),
-    "prune": frozenset({"keep", "yes"}),
-    **dict.fromkeys(_DELETES, frozenset({"name", "anyway"})),
-    "arms": frozenset(),
-    **dict.fromkeys(("runs", "motions"), frozenset({"arm", "most"})),
-    "tokens": frozenset(),
-    "tokens revoke": frozenset({"name"}),
-    "schedules add": frozenset({"arm", "cron", "hours", "maintenance", "motion"}),
-    **dict.fromkeys(("schedules", "due", "alarms"), frozenset({"arm"})),
-    **dict.fromkeys(("schedules remove", "schedules enable", "schedules disable"), _NUMBER),
-    "maintenance": frozenset({"arm", "what", "note"}),
-    **dict.fromkeys(("due dismiss", "alarms acknowledge"), _NUMBER | {"note"}),
-    "reidentify": frozenset({"arm", "motion", "confirm"}),
-}
-"""Arguments that are sent to a daemon, by verb; the audit trail has the token's name there, and not `--by`."""

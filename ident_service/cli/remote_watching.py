@@ -18,11 +18,13 @@ from ident_service.cli.motion_commands import RELEASED, SLOW, HeldKey, require_n
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.remote import (
     LIVE,
-    Verb,
+    RemoteVerb,
+    carrying,
     confirmation,
     job_answer,
     job_verb,
     motion_id,
+    plain_job,
     renew,
     run_job,
     telling_of_arm,
@@ -40,14 +42,6 @@ _LOOK = 0.4  # s between looks at the job
 _MOST_FILE = 8 * 2**20  # bytes of all files that a daemon takes
 
 
-def _base(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"kind": "base", "arm": arguments.arm}
-
-
-def _watch(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"arm": arguments.arm, "seconds": arguments.seconds}
-
-
 def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
 
@@ -60,18 +54,6 @@ def _recovery_answer(client: IdentClient, arguments: argparse.Namespace, answer:
 
 def _preview(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "motion": motion_id(client, arguments.arm, arguments.motion)}
-
-
-def _bus_load(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"kind": "bus_load", "arm": arguments.arm, "rate": arguments.rate}
-
-
-def _bus_scan(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"kind": "bus_scan", "arm": arguments.arm}
-
-
-def _bus_probe(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"kind": "bus_probe", "arm": arguments.arm}
 
 
 def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -184,28 +166,15 @@ def keep_rehearsal_lease(
     return job
 
 
-VERBS: dict[str, Verb] = {
-    "watch": job_verb(_watch, with_answer_lines),
-    "recover": job_verb(_recover, _recovery_answer),
-    "base-parameters": job_verb(_base, with_answer_lines),
-    "preview": job_verb(_preview, with_answer_lines),
-    "bus load": job_verb(_bus_load, with_answer_lines),
-    "bus scan": job_verb(_bus_scan, with_answer_lines),
-    "bus probe": job_verb(_bus_probe, with_answer_lines),
-    "config check": _config_check,
-    "run": _run,
-    "rehearse": _rehearse,
+VERBS: dict[str, RemoteVerb] = {
+    "watch": plain_job("arm seconds"),
+    "recover": carrying("arm confirm leave_limit", job_verb(_recover, _recovery_answer)),
+    "base-parameters": plain_job("arm", "base"),
+    "preview": carrying("arm motion", job_verb(_preview)),
+    "bus load": plain_job("arm rate", "bus_load"),
+    "bus scan": plain_job("arm", "bus_scan"),
+    "bus probe": plain_job("arm", "bus_probe"),
+    "config check": carrying("file", _config_check),
+    "run": carrying("arm chosen confirm hold_to_run motion speed until", _run),
+    "rehearse": carrying("arm confirm motion no_key speed", _rehearse),
 }
-CARRIED: dict[str, frozenset[str]] = {
-    "watch": frozenset({"arm", "seconds"}),
-    "recover": frozenset({"arm", "leave_limit", "confirm"}),
-    "base-parameters": frozenset({"arm"}),
-    "preview": frozenset({"arm", "motion"}),
-    "bus load": frozenset({"arm", "rate"}),
-    "bus scan": frozenset({"arm"}),
-    "bus probe": frozenset({"arm"}),
-    "config check": frozenset({"file"}),
-    "run": frozenset({"arm", "motion", "confirm", "speed", "until", "chosen", "hold_to_run"}),
-    "rehearse": frozenset({"arm", "motion", "confirm", "speed", "no_key"}),
-}
-"""Arguments that are sent to a daemon, by verb."""

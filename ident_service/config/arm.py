@@ -506,7 +506,7 @@ class ArmConfig(ExtendedSection):
     def watchdog(self) -> float | None:
         """Return after how long without its host the slowest drive gives up torque [s]; None where unknown.
 
-        What an open arm says of itself counts more (`ArmDescription.watchdog`); this is for before it is opened.
+        What an open arm reports of itself counts more (`ArmDescription.watchdog`); this is for before it is opened.
         """
         return self.driver.watchdog if isinstance(self.driver, _BUILT_IN) else None
 

@@ -2,7 +2,7 @@
 
 Keys of a puck are the names of its properties: `cts` counts a motor turn, `ipnm` torque counts per N m at the motor,
 `mt` the largest torque count, `poles` of the motor. Sources disagree about IPNM by a quarter, so that nothing is taken
-for granted: what each puck says of itself is read when the arm is opened, and must be what stands here.
+for granted: what each puck reports of itself is read when the arm is opened, and must be what stands here.
 
 Gears and couplings are the section `transmission` of the arm, whose motors are the pucks here, in this order.
 """

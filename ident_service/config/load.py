@@ -448,7 +448,7 @@ def _problems(error: ValidationError, tree: Tree, path: Path, section: str = "")
             continue
         name = ".".join(str(part) for part in (where[:-1] if mistakes[0]["type"] == "missing" else where))
         # Of a value that may be one thing or another, each branch has its own complaint.
-        told = list(dict.fromkeys(_told(one, where, known, tree) for one in mistakes))
+        told = list(dict.fromkeys(_mistake_words(one, where, known, tree) for one in mistakes))
         wanted = [words for kind, words in told if kind == "wanted"]
         said = [words for kind, words in told if kind == "said"]
         if wanted and not said:
@@ -484,7 +484,7 @@ _BOUNDS = {
 }
 
 
-def _told(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -> tuple[str, str]:
+def _mistake_words(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -> tuple[str, str]:
     """Return whether a mistake is told by what is `wanted` or in words that are `said`, and those words."""
     kind, context, value = mistake["type"], mistake.get("ctx", {}), mistake["input"]
     if kind in _WANTED:

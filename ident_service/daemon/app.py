@@ -27,16 +27,10 @@ from ident_service.daemon.openapi import describe
 from ident_service.daemon.request_guard import RequestGuardMiddleware
 from ident_service.daemon.routes import (
     about,
-    access,
     arms,
-    deletion,
-    descriptions,
     events,
-    exports,
     jobs,
-    live,
     maintenance,
-    pruning,
     runs,
     uploads,
     views,
@@ -73,18 +67,8 @@ PAGES = (
 )
 """Routers of the pages, which are not in the API's description."""
 ROUTERS = (
-    *(
-        about.router,
-        access.router,
-        arms.router,
-        descriptions.router,
-        jobs.router,
-        live.router,
-        runs.router,
-        pruning.router,
-        views.router,
-    ),
-    *(exports.router, uploads.router, events.router, deletion.router, maintenance.router, *PAGES),
+    *(about.router, arms.router, jobs.router, runs.router, views.router),
+    *(uploads.router, events.router, maintenance.router, *PAGES),
 )
 """Routers of the application, in the order in which they are included."""
 
@@ -106,19 +90,19 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     engine = Engine(
         *(db, settings.state),
         computing=settings.computing,
-        motion_door=settings.motion_door,
+        motion_socket=settings.motion_socket,
         lease_factor=settings.lease_factor,
         metrics=metrics,
     )
-    keeper = MaintenanceScheduler(engine, _webhook(settings, db))
-    service = Service(settings, db, engine, Authenticator(db), metrics, keeper, Checks())
+    scheduler = MaintenanceScheduler(engine, _webhook(settings, db))
+    service = Service(settings, db, engine, Authenticator(db), metrics, scheduler, Checks())
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         synchronise(db, settings.state)
         remove_deleted(settings.state)
         engine.start(lambda: rebuild_runs(db, settings.state))
-        keeper.start()
+        scheduler.start()
         refreshing = asyncio.create_task(_refresh(service))
         try:
             yield
@@ -126,7 +110,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
             refreshing.cancel()
             await run_in_threadpool(engine.close)
             app.state.live.close()
-            await run_in_threadpool(keeper.close)
+            await run_in_threadpool(scheduler.close)
             db.close()
 
     app = FastAPI(
@@ -153,7 +137,11 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     install_error_handlers(app)
     book = Connections() if connections is None else connections
     app.add_middleware(
-        RequestGuardMiddleware, settings=settings, metrics=service.metrics, connections=book, gate=service.gate
+        RequestGuardMiddleware,
+        settings=settings,
+        metrics=service.metrics,
+        connections=book,
+        authenticator=service.authenticator,
     )
     return app
 
@@ -168,7 +156,7 @@ async def _refresh(service: Service) -> None:
                 for upload in await run_in_threadpool(delete_stale_uploads, service.state):
                     _LOG.info("an upload was left alone for a day and is deleted", extra={"upload": upload})
             await run_in_threadpool(write_deferred_entries, service.db, service.state)
-            await run_in_threadpool(service.gate.refresh)
+            await run_in_threadpool(service.authenticator.refresh)
             await run_in_threadpool(service.db.rest)
         except (sqlite3.Error, OSError) as error:
             _LOG.error("the state folder cannot be looked after: %s", error)

@@ -41,9 +41,9 @@ class Service:
     settings: Settings
     db: Database
     engine: Engine
-    gate: Authenticator
+    authenticator: Authenticator
     metrics: Metrics
-    keeper: MaintenanceScheduler
+    scheduler: MaintenanceScheduler
     checks: Checks
 
     @property
@@ -85,13 +85,13 @@ async def access_of(request: Request, bearer: Bearer = None, cookie: Cookie = No
     service, found = service_of(request), None
     if bearer is not None:
         try:
-            found = await run_in_threadpool(service.gate.by_token, bearer.credentials, address_of(request))
+            found = await run_in_threadpool(service.authenticator.by_token, bearer.credentials, address_of(request))
         except Throttled as error:
             raise throttled(error) from None
         if found is None:
             raise unknown()
     elif cookie is not None:
-        found = await run_in_threadpool(service.gate.by_session, cookie)
+        found = await run_in_threadpool(service.authenticator.by_session, cookie)
         if found is not None:
             _require_page(request)
     if found is not None:
@@ -128,10 +128,10 @@ async def local_or_authenticated(request: Request, bearer: Bearer = None, cookie
     service = service_of(request)
     near = _loopback(address_of(request)) and service.settings.loopback
     secret = None if bearer is None else bearer.credentials
-    found = service.gate.known(secret, cookie)
+    found = service.authenticator.known(secret, cookie)
     if found is None and not near:
-        await run_in_threadpool(service.gate.refresh)
-        if (found := service.gate.known(secret, cookie)) is None:
+        await run_in_threadpool(service.authenticator.refresh)
+        if (found := service.authenticator.known(secret, cookie)) is None:
             raise unknown()
     request.state.who = "anybody" if found is None else found.name
     return str(request.state.who)
@@ -144,7 +144,7 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
         HTTPException: as `operator`.
     """
     secret = None if bearer is None else bearer.credentials
-    found = service_of(request).gate.known(secret, cookie)
+    found = service_of(request).authenticator.known(secret, cookie)
     if found is None:
         return await operator(await viewer(await access_of(request, bearer, cookie)))
     if secret is None:
@@ -155,15 +155,15 @@ async def lease_keeper(request: Request, bearer: Bearer = None, cookie: Cookie =
 
 async def while_authorised(request: Request, bearer: Bearer = None, cookie: Cookie = None) -> WhileKnown:
     """Return a filter that ends an event stream when its token or session is no longer valid."""
-    gate, secret = service_of(request).gate, None if bearer is None else bearer.credentials
+    authenticator, secret = service_of(request).authenticator, None if bearer is None else bearer.credentials
 
-    async def told(events: AsyncIterator[str]) -> AsyncIterator[str]:
+    async def while_known(events: AsyncIterator[str]) -> AsyncIterator[str]:
         async for one in events:
-            if gate.known(secret, cookie) is None:
+            if authenticator.known(secret, cookie) is None:
                 return
             yield one
 
-    return told
+    return while_known
 
 
 def unknown() -> HTTPException:

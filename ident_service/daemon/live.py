@@ -207,7 +207,7 @@ class LiveRun:
             samples = self._waiting.popleft()
             growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
         if growing.step() and (doubt := growing.doubt()) is not None:
-            told = _told(doubt, growing.base.expressions, growing.base.units)
+            told = _uncertainty_document(doubt, growing.base.expressions, growing.base.units)
             with self._lock:
                 self._publish("doubt", told)
 
@@ -240,7 +240,9 @@ class LiveRuns:
             found.close()
 
 
-def _told(doubt: ParameterUncertainty, expressions: tuple[str, ...], units: tuple[str, ...]) -> dict[str, Any]:
+def _uncertainty_document(
+    doubt: ParameterUncertainty, expressions: tuple[str, ...], units: tuple[str, ...]
+) -> dict[str, Any]:
     from ident_service.estimation.uncertainty import relative_deviations
 
     return {

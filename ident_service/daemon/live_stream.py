@@ -11,7 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from ident_service.daemon.dependencies import Service
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import said, told_samples
+from ident_service.daemon.jobs.outcome import printed_samples, process_output
 from ident_service.daemon.live import LiveRuns
 from ident_service.daemon.routes import jobs
 from ident_service.registry import jobs as rows
@@ -28,7 +28,7 @@ _LOG_BYTES = 64 * 1024
 
 def log_of(service: Service, row: Row) -> str:
     """Return the end of what the process of a job has printed."""
-    log: str = jobs.without_paths(said(service.state / JOBS / row["id"], _LOG_BYTES).log, str(service.state))
+    log: str = jobs.without_paths(process_output(service.state / JOBS / row["id"], _LOG_BYTES).log, str(service.state))
     return log
 
 
@@ -50,7 +50,7 @@ async def live_events(service: Service, live: LiveRuns, row: Row) -> AsyncIterat
                 number = frame.number
                 news.append(f"event: {frame.kind}\ndata: {frame.data}\n\n")
         if row["kind"] == READ:
-            found, offset = await run_in_threadpool(told_samples, service.state / JOBS / row["id"], offset)
+            found, offset = await run_in_threadpool(printed_samples, service.state / JOBS / row["id"], offset)
             news += [f"event: samples\ndata: {json.dumps(one)}\n\n" for one in found]
         if since >= _STATE:
             since = 0.0

@@ -16,7 +16,7 @@ _RUN: Final = "20261101T080000Z-wam7_sim-3fa9c1"
 _URDF: Final = "PHJvYm90IG5hbWU9ImJlbmNoIi8+"  # `<robot name="bench"/>` in base 64
 
 EXAMPLES: Final[dict[str, dict[str, Any]]] = {
-    "Acceptance": {"A person's word": {"run": _RUN, "note": "after the new belt, torque error 2.1 %"}},
+    "Acceptance": {"A person's decision": {"run": _RUN, "note": "after the new belt, torque error 2.1 %"}},
     "Description": {"An arm that extends a shipped one": {"description": _YAML}},
     "Enabled": {"Disable it": {"enabled": False}},
     "Event": {"Gear oil": {"what": "gear oil changed", "note": "joint 2, 40 ml"}},

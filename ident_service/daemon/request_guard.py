@@ -77,10 +77,10 @@ class RequestGuardMiddleware:
     """ASGI middleware: check Host, Origin, body size and load; add security headers; count and log requests."""
 
     def __init__(
-        self, app: App, settings: Settings, metrics: Metrics, connections: Connections, gate: Authenticator
+        self, app: App, settings: Settings, metrics: Metrics, connections: Connections, authenticator: Authenticator
     ) -> None:
         self._app, self._metrics, self._connections = app, metrics, connections
-        self._bodies = _Bodies(connections, gate)
+        self._bodies = _Bodies(connections, authenticator)
         self._hosts, self._scheme = settings.hosts, "https" if settings.tls else "http"
         hsts = ((b"strict-transport-security", b"max-age=31536000"),) if settings.tls else ()
         self._headers = (*_HEADERS, *hsts)
@@ -161,8 +161,8 @@ class RequestGuardMiddleware:
 class _Bodies:
     """Hold what all bodies share: the connections, who may send more than a little, and the bytes in memory."""
 
-    def __init__(self, connections: Connections, gate: Authenticator) -> None:
-        self.connections, self.gate, self.held = connections, gate, 0
+    def __init__(self, connections: Connections, authenticator: Authenticator) -> None:
+        self.connections, self.authenticator, self.held = connections, authenticator, 0
 
 
 class _Body:
@@ -210,12 +210,12 @@ class _Body:
                 raise _Busy
 
     async def _require_operator(self) -> None:
-        request, gate = Request(self._scope), self._bodies.gate
+        request, authenticator = Request(self._scope), self._bodies.authenticator
         kind, _, secret = request.headers.get("authorization", "").partition(" ")
         caller = (secret if kind.lower() == "bearer" else None, request.cookies.get(COOKIE))
-        if (found := gate.known(*caller)) is None:
-            await run_in_threadpool(gate.refresh)  # it may have been made a moment ago
-            if (found := gate.known(*caller)) is None:
+        if (found := authenticator.known(*caller)) is None:
+            await run_in_threadpool(authenticator.refresh)  # it may have been made a moment ago
+            if (found := authenticator.known(*caller)) is None:
                 raise unknown()
         if found.role != "operator":
             raise HTTPException(403, f"the token {found.name!r} may only read; this needs the role operator")

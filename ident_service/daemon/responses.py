@@ -6,6 +6,7 @@ Times are seconds since 1970 in UTC, durations seconds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from typing import Annotated, Any, Final, Literal
 from urllib.parse import urlencode
 
@@ -13,6 +14,7 @@ from fastapi import Depends, Query, Request, Response
 from pydantic import BaseModel
 
 from ident_service.daemon.jobs.requests import Id
+from ident_service.errors import Dependent
 from ident_service.registry.database import Row
 
 
@@ -29,6 +31,11 @@ class DeletionAnswer(BaseModel):
 
     deleted: str
     dependents: list[DependentAnswer]
+
+
+def deletion_answer(name: str, dependents: Sequence[Dependent]) -> DeletionAnswer:
+    """Return the answer after an entry was deleted."""
+    return DeletionAnswer(deleted=name, dependents=[DependentAnswer(**asdict(one)) for one in dependents])
 
 
 class Mistake(BaseModel):
@@ -282,6 +289,7 @@ class HealthAnswer(BaseModel):
     version: str
 
 
+Anyway = Annotated[bool, Query(description="although something refers to it; 409 names what, and what becomes of it")]
 Most = Annotated[int, Query(ge=1, le=500, description="lines of one page")]
 BeforeNumber = Annotated[
     int | None, Query(ge=0, lt=2**62, description="go on after the line of this number; `Link` names the next page")

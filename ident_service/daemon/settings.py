@@ -25,7 +25,7 @@ class Settings:
         tls_cert: file of the certificate chain, PEM.
         tls_key: file of its key, PEM.
         names: host names under which clients may reach it, besides the address.
-        motion_door: socket of the unit that motions run in; None for processes of the service's own.
+        motion_socket: socket of the unit that motions run in; None for processes of the service's own.
         webhook: address that notices go to; None for nobody.
         webhook_secret: file of the secret that they are signed with.
         computing: how many jobs compute at a time.
@@ -38,7 +38,7 @@ class Settings:
     tls_cert: Path | None = None
     tls_key: Path | None = None
     names: tuple[str, ...] = ()
-    motion_door: Path | None = None
+    motion_socket: Path | None = None
     webhook: str | None = None
     webhook_secret: Path | None = None
     computing: int = 1

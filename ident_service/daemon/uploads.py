@@ -28,7 +28,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
 from ident_service.errors import AlreadyThere, ConfigError, Problem, RecordingError, UnknownId, UsageError
@@ -321,9 +320,7 @@ class Piece:
         """Return the writer itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Unlock the upload."""
         # The lock is of the open file, which a process that is being started has, too, until it runs its program.
         fcntl.flock(self._fd, fcntl.LOCK_UN)

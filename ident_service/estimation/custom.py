@@ -65,7 +65,7 @@ class CustomFunction:
         try:
             returned = self.function(MappingProxyType(dict(link)), MappingProxyType(dict(base)))
         except Exception as error:
-            raise CustomError(f"{self.name} raised {_told(error, self.file)}") from error
+            raise CustomError(f"{self.name} raised {_error_words(error, self.file)}") from error
         penalty: Any = None
         if isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[0], list | tuple):
             returned, penalty = returned
@@ -116,15 +116,15 @@ def load_custom(name: str, folder: Path) -> CustomFunction:
     except AttributeError as error:
         if module in sys.modules and not hasattr(sys.modules[module], function):
             raise CustomError(f"the module {module!r} has no function {function!r}") from None
-        raise CustomError(f"importing {module!r} raised {_told(error, file)}") from error
+        raise CustomError(f"importing {module!r} raised {_error_words(error, file)}") from error
     except ModuleNotFoundError as error:
         if error.name is not None and (module == error.name or module.startswith(f"{error.name}.")):
             raise CustomError(
                 f"there is no module {module!r}; put {file} beside the description, or its folder into PYTHONPATH"
             ) from None
-        raise CustomError(f"importing {module!r} raised {_told(error, file)}") from error
+        raise CustomError(f"importing {module!r} raised {_error_words(error, file)}") from error
     except (Exception, SystemExit) as error:
-        raise CustomError(f"importing {module!r} raised {_told(error, file)}") from error
+        raise CustomError(f"importing {module!r} raised {_error_words(error, file)}") from error
     if not callable(found):
         raise CustomError(f"{name} is {_kind(found)}, not a function")
     source = getattr(sys.modules[module], "__file__", None)
@@ -144,7 +144,7 @@ def _importable(folder: Path) -> Iterator[None]:
         sys.path.remove(path)
 
 
-def _told(error: BaseException, file: str) -> str:
+def _error_words(error: BaseException, file: str) -> str:
     """Format an error in one line, with the last line of the user's own file that led to it."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename).name == file]
     place = f" ({file}, line {frames[-1].lineno})" if frames else ""

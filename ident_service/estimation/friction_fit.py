@@ -565,7 +565,7 @@ class _Search:
         return values
 
     def nearer(self, values: _Numbers, wanted: Sequence[str]) -> _Numbers:
-        """Closer and closer around values that the finer steps have found; what is at the edge stays, and is said."""
+        """Search around given values with finer and finer steps; a value at the edge of its range stays there."""
         inside = {key: (values[key] > _GRIDS[key][0]) & (values[key] < _GRIDS[key][-1]) for key in wanted}
         for factors in _NEARER:
             for key in [*wanted] * _ROUNDS:
@@ -600,7 +600,7 @@ class _Search:
     def chosen(
         self, start: _Numbers, fitted: _Numbers, wanted: Sequence[str], conditions: FeasibleSet
     ) -> tuple[_Numbers, list[Choice]]:
-        """Leave out each kind, refit the others, and keep it out where held-out thirds are better without."""
+        """Return the fitted values, 0 for terms that held-out thirds are predicted as well without, and the choices."""
         values, choices = fitted, []
         gathered = self._equations(fitted)
         shares = standstill_weights(gathered)

@@ -14,7 +14,13 @@ from ident_service.estimation.bootstrap import constrained_intervals
 from ident_service.estimation.choices import Choice
 from ident_service.estimation.custom import CustomFunction
 from ident_service.estimation.equations import Equations, equations
-from ident_service.estimation.feasible.convex import SOLVER, convex_least_squares, require_solver
+from ident_service.estimation.feasible.convex import (
+    SOLVER,
+    SecondOpinion,
+    convex_least_squares,
+    require_solver,
+    second_opinion,
+)
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, SetName, feasible_set
 from ident_service.estimation.feasible.priors import Prior, choose_weight, move_off_boundary
 from ident_service.estimation.feasible.problems import (
@@ -32,7 +38,6 @@ from ident_service.estimation.least_squares import (
     ordinary_least_squares,
     torque_error,
 )
-from ident_service.estimation.second_opinion import SecondOpinion, second_opinion
 from ident_service.estimation.spectra import remarks_on_noise
 from ident_service.estimation.torque_constants import require_known_load
 from ident_service.estimation.uncertainty import Verdict, negligible, verdicts

@@ -99,7 +99,7 @@ class MisreadColumns:
     after: TorqueError
 
     def sentence(self, names: Sequence[str]) -> str:
-        """Return it as a reason why an estimate must not be used, with what to correct.
+        """Return a sentence: which columns were misread, so that the estimate must not be used, and what to correct.
 
         Args:
             names: of the joints.

@@ -130,12 +130,12 @@ class SequentialLeastSquares:
             block = information_of(rows.H_b[:, :, new], rows.torque[new], rows.keep[new], self._supports)
             self._information = self._information.merged(block)
             if self._blocks is not None:
-                self._blocks = self._kept(self._blocks, rows, time_ns, new)
+                self._blocks = self._extended(self._blocks, rows, time_ns, new)
             self._seconds += float(rows.time[new][-1] - rows.time[new][0])
             self._done_ns, found = int(time_ns[-1]), True
         return found
 
-    def _kept(self, before: Equations, rows: Rows, time_ns: Stamps, new: NDArray[np.bool_]) -> Equations:
+    def _extended(self, before: Equations, rows: Rows, time_ns: Stamps, new: NDArray[np.bool_]) -> Equations:
         """Return the equations with new rows added by stretches of time, as `equations.py` does for a recording."""
         blocks, labels = list(before.blocks), list(before.labels)
         if self._origin_ns < 0:

@@ -162,7 +162,7 @@ class _Smooth:
 
     @property
     def nbytes(self) -> int:
-        """Size in memory."""
+        """Return the size in memory [bytes]."""
         return self.time.nbytes + 4 * self.position.nbytes
 
 

@@ -157,8 +157,8 @@ def jackknife(
         The covariance of the combinations, shape (combinations, combinations); degrees of freedom of its variances,
         shape (combinations,); and of which of them the data, or all clusters but one, say nothing.
     """
-    asked = np.eye(len(fit.beta)) if along is None else along
-    return _left_out([_Whitened.of(cluster, fit) for cluster in clusters], fit, asked)
+    combinations = np.eye(len(fit.beta)) if along is None else along
+    return _left_out([_Whitened.of(cluster, fit) for cluster in clusters], fit, combinations)
 
 
 @dataclass(frozen=True)
@@ -212,9 +212,11 @@ class _Whitened:
         return (V[:, others] / (1.0 - shares[others])) @ V[:, others].T, V[:, ~others] * np.sqrt(shares[~others])
 
 
-def _left_out(clusters: Sequence[_Whitened], fit: LeastSquares, asked: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return what `jackknife` does, of combinations `asked`, shape (base, combinations)."""
-    along = fit.inverse.T @ asked
+def _left_out(
+    clusters: Sequence[_Whitened], fit: LeastSquares, combinations: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return what `jackknife` does, of combinations `combinations`, shape (base, combinations)."""
+    along = fit.inverse.T @ combinations
     variances = np.maximum(np.sum(along**2, axis=0), np.finfo(float).tiny)
     alone = np.zeros(len(variances))  # largest share of a white variance along a direction of one cluster alone
     lengths, images = np.zeros((len(clusters), len(alone))), np.zeros((len(clusters), len(along), len(alone)))
@@ -229,7 +231,7 @@ def _left_out(clusters: Sequence[_Whitened], fit: LeastSquares, asked: Array) ->
         images[number] = one.share @ without
         lengths[number] = np.sum(without * images[number], axis=0)
     unseen = ~np.isfinite(fit.standard_deviations)
-    blind = np.any(asked[unseen] != 0.0, axis=0) | (alone > _SEEN_ALONE)
+    blind = np.any(combinations[unseen] != 0.0, axis=0) | (alone > _SEEN_ALONE)
     projected = scores @ along
     return projected.T @ projected, _degrees(lengths, images), blind
 
@@ -265,7 +267,7 @@ def _degrees(lengths: Array, images: Array) -> Array:
 
     With white errors, G_bc = [b = c] |g_b|^2 - m_b . m_c for blocks b and c: g_b is what the block's errors are
     multiplied by (squared lengths `lengths`, shape (blocks, asked)), m_b its image under the estimate (`images`, shape
-    (blocks, base, asked)). `asked` are parameters or combinations of them.
+    (blocks, base, asked)). `combinations` are parameters or combinations of them.
     """
     own = np.sum(images**2, axis=1)
     trace = np.sum(lengths - own, axis=0)

@@ -345,20 +345,6 @@ def certified_along(
     )
 
 
-def posture_clearance(collision: CollisionModel, position: Array) -> tuple[float, str | None]:
-    """Return the smallest distance in one posture [m] and the pair it belongs to.
-
-    Args:
-        collision: the pairs.
-        position: [rad or m], shape (joints,).
-    """
-    if not collision.pairs:
-        return float("inf"), None
-    (distances,) = collision.distances(position[None])
-    closest = int(np.argmin(distances))
-    return float(distances[closest]), collision.pairs[closest]
-
-
 def _certified(
     collision: CollisionModel,
     motion: _Motion,

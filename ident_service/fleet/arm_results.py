@@ -199,7 +199,7 @@ def arm_fits(
     keys, whole = leaves.keys, leaves.by_recording
 
     def fit(information: Callable[[], Merged], of: Sequence[str], whole: bool) -> ArmFit:
-        found = kept_fit(information, (tuple(of), whole), described, store)
+        found = stored_fit(information, (tuple(of), whole), described, store)
         return found if whole else found.weighed(between / len(of))
 
     judged: tuple[Merged | None, tuple[float, float]] = (None, (np.nan, np.nan))
@@ -208,13 +208,13 @@ def arm_fits(
         several = fit(lambda: branches.trained, keys[: leaves.count], whole)
         single = fit(lambda: branches.single, keys[:1], whole=False)
         if leaves.count < len(keys):
-            judged = _kept_held(branches, several, single)
+            judged = _stored_held_out(branches, several, single)
     except MissingFactors as error:
         return error.keys
     return ArmFits(leaves, every, several, single, *judged, vars(branches).get("merged"))
 
 
-def fits_told(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tuple[str, ...]:
+def reported_fits(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tuple[str, ...]:
     """Return what the fleet needs of an arm's fits: that of all recordings and the one without those held out."""
     return (fits.fit, fits.trained) if isinstance(fits, ArmFits) else fits
 
@@ -222,7 +222,7 @@ def fits_told(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tuple[
 def population_of(
     told: Mapping[str, tuple[ArmFit, ArmFit]], number: int, groups: Mapping[Group, Sequence[int]]
 ) -> Population:
-    """Return the common model of what `fits_told` gives of the arms: of all recordings (0), or fewer (1)."""
+    """Return the common model of what `reported_fits` gives of the arms: of all recordings (0), or fewer (1)."""
     return population({arm: fits[number] for arm, fits in told.items()}, groups)
 
 
@@ -249,13 +249,13 @@ def errors_held_out(
     return (fits.alone[0], several), (fits.alone[1], single)
 
 
-def _kept_name(kind: str, described: Described, *more: Any) -> str:
+def _stored_name(kind: str, described: Described, *more: Any) -> str:
     """Return the name in the store of what follows from factors, the description and this version."""
     told = json.dumps([__version__, described.description, more])
     return f"{KEPT}/{hashlib.sha256(told.encode()).hexdigest()}.{kind}"
 
 
-def kept_fit(
+def stored_fit(
     information: Callable[[], Merged], of: tuple[tuple[str, ...], bool], described: Described, store: Store
 ) -> ArmFit:
     """Return `arm_fit` of merged factors, from the store where it has been made.
@@ -266,7 +266,7 @@ def kept_fit(
         described: the arm.
         store: of the factors.
     """
-    name = _kept_name("fit.npz", described, of)
+    name = _stored_name("fit.npz", described, of)
     content = store.read(name)
     if content is not None:
         try:
@@ -302,10 +302,10 @@ def _fit_of(content: bytes, described: Described) -> ArmFit:
     return ArmFit.of(parts["fit"], parts["doubt"], arrays["clusters"], total, parts["error"])
 
 
-def _kept_held(branches: Branches, trained: ArmFit, single: ArmFit) -> tuple[Merged, tuple[float, float]]:
+def _stored_held_out(branches: Branches, trained: ArmFit, single: ArmFit) -> tuple[Merged, tuple[float, float]]:
     """Return the information held out, without clusters, and the errors of two fits on it, from the store if it can."""
     leaves, described, store = branches.leaves, branches.described, branches.store
-    name = _kept_name("held.npz", described, leaves.keys, leaves.count)
+    name = _stored_name("held.npz", described, leaves.keys, leaves.count)
     content = store.read(name)
     if content is not None:
         try:
@@ -381,7 +381,7 @@ def side_files(
         return _merged(keys, described, store, whole=False) if merged is None else merged
 
     of = (keys, False)
-    fit = kept_fit(information, of, described, store)
+    fit = stored_fit(information, of, described, store)
     return _files(fit, information, of, recordings, described, None, config, more, store)[0]
 
 
@@ -400,7 +400,7 @@ def _files(
     """Return files and summary; what does not depend on the other arms, the estimate with its proof, is kept."""
     used = pooled if more["pooled"] else None
     drawn = () if used is None else (used.beta.tobytes().hex(), used.R1.tobytes().hex(), str(more["arms"]))
-    name = _kept_name("zip", described, of, config, recordings, *drawn)
+    name = _stored_name("zip", described, of, config, recordings, *drawn)
     kept = _unzipped(store.read(name))
     if kept is None:
         kept = _estimated(alone, information(), recordings, described, used, config, more["arms"])

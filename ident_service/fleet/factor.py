@@ -308,7 +308,7 @@ class Settled:
 
 
 def trimmed(task: Callable[_Given, _Found]) -> Callable[_Given, _Found]:
-    """Let the C library, where it can, keep what a task frees for the next one, and give it back after some tasks.
+    """Wrap a task so that the C library keeps freed memory for the next one, and returns it after some tasks.
 
     Dask's workers give everything back at once, so that a sixth of a task's time would go into having the same pages
     again. If nothing was ever given back, a worker that has long finished would look as if it needed more than it may

@@ -29,8 +29,8 @@ from ident_service.fleet.arm_results import (
     arm_files,
     arm_fits,
     errors_held_out,
-    fits_told,
     population_of,
+    reported_fits,
     side_files,
 )
 from ident_service.fleet.population import ArmFit, HeldOut, variance_shares
@@ -146,7 +146,7 @@ def _fitted(
                 merged_on_workers(client, of, described, store, whole=whole) for of in (keys[:count], keys[count:])
             ]
             fitting[arm] = client.submit(arm_fits, leaves[arm], described, store, between, *trees, pure=False)
-            telling[arm] = client.submit(fits_told, fitting[arm], pure=False)
+            telling[arm] = client.submit(reported_fits, fitting[arm], pure=False)
         lost: dict[str, tuple[str, ...]] = {}
         for arm in waiting:
             found = result_of(telling[arm], f"merging and fitting {arm}")

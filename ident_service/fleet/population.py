@@ -97,7 +97,7 @@ class ArmFit:
 
     @classmethod
     def of(cls, fit: LeastSquares, doubt: Uncertainty, clusters: int, total: Information, error: TorqueError) -> ArmFit:
-        """Return the estimate with its precision where nothing differs from recording to recording."""
+        """Return an estimate whose precision counts no differences from recording to recording."""
         degrees = max(int(total.rows.sum()) - total.base, 1)
         variance = (fit.rho2**2 + float(np.sum((fit.rho1 - fit.R1 @ fit.beta) ** 2))) / degrees
         # One factor for all: factors of their own would turn the combinations that are known well into others.
@@ -105,7 +105,7 @@ class ArmFit:
         return cls(fit, doubt, clusters, precision, total, error)
 
     def weighed(self, between: Array) -> ArmFit:
-        """Return the estimate as less sure by what differs from recording to recording.
+        """Return the estimate with its precision lowered by the variance from recording to recording.
 
         Args:
             between: variance of the arm's mean by that [SI^2], shape (base,).
@@ -608,23 +608,6 @@ class HeldOut:
         """Return whether pooling is worth it; not where nothing was held out."""
         alone, pooled = self.totals
         return bool(pooled < _WORTH * alone)
-
-
-@one_blas_thread()
-def held_out_errors(
-    alone: ArmFit, unseen: Merged, prior: tuple[Array, Array, Array], scale: Array, described: Described
-) -> tuple[float, float]:
-    """Return the torque errors of an arm alone and pooled on recordings held out [percent].
-
-    Args:
-        alone: estimate from the recordings that are fitted to.
-        unseen: information of those that are held out.
-        prior: mean, its covariance and T of the other arms, in units of `scale`.
-        scale: D, shape (base,).
-        described: the arm.
-    """
-    alone_fit, pooled = alone.fit, pooled_fit(alone, prior, scale)
-    return error_on(unseen, alone_fit, described), error_on(unseen, pooled, described)
 
 
 @one_blas_thread()

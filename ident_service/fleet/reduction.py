@@ -154,7 +154,7 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
             ) from None
         with client:
             _require_workers(client, request.scheduler, tell)
-            with _paused_workers_told(client, tell):
+            with _reporting_paused_workers(client, tell):
                 yield client
         return
     count = request.workers or os.cpu_count() or 1
@@ -179,7 +179,7 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
 
 
 @contextmanager
-def _paused_workers_told(client: Client, tell: Tell) -> Iterator[None]:
+def _reporting_paused_workers(client: Client, tell: Tell) -> Iterator[None]:
     """Look after workers that Dask has paused near their memory limit, as it does with those that we did not start.
 
     Such a worker goes on where it needs less, so it is told to give back what it does not use. One that stays paused is

@@ -67,7 +67,7 @@ def _system(url: str) -> tuple[Any, str]:
 
 
 def persistently(action: Callable[[], _Result], url: str, pauses: Sequence[float] = PAUSES) -> _Result:
-    """Do something with storage, again after a pause where it failed for a reason that may pass.
+    """Call a function that uses storage, and again after pauses where it failed for a reason that may pass.
 
     Args:
         action: to do; it can be repeated.

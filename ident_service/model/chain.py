@@ -117,7 +117,7 @@ def chain_from_dh(table: DHTable, gravity: tuple[float, float, float]) -> Chain:
         along_x, along_z = np.array([row.a, 0.0, 0.0]), np.array([0.0, 0.0, row.d])
         turn_x, turn_z = rotation_x(row.alpha), rotation_z(row.theta)
         if table.convention == "standard":
-            # The joint turns (or slides) before the constant rest of A_k, which is the way to the distal frame.
+            # The joint turns (or slides) before the constant rest of A_k, which places the distal frame.
             rotation[k] = parent_rotation @ turn_z
             translation[k] = parent_translation
             link_rotation[k], link_translation[k] = turn_x, along_z + along_x

@@ -35,20 +35,20 @@ def presliding_distances(model: ArmModel) -> Array:
     return np.array(np.broadcast_to(np.asarray(given, dtype=float), (model.chain.joints,)))
 
 
-def advance_dahl_state(direction: Array, step: Array, ways: Array) -> Array:
+def advance_dahl_state(direction: Array, step: Array, lengths: Array) -> Array:
     """Return the direction of dry friction after a step.
 
     Args:
         direction: before it, between -1 and 1, shape (..., drives).
         step: what the drives travel, none turning round meanwhile [rad or m], shape (..., drives).
-        ways: x0 [rad or m], shape (drives,).
+        lengths: x0 [rad or m], shape (drives,).
 
     Returns:
         Shape (..., drives).
     """
     sign, distance = np.sign(step), np.abs(step)
-    left = np.exp(-distance / np.where(ways > 0.0, ways, 1.0))
-    return np.asarray(sign + np.where(ways > 0.0, (direction - sign) * left, 0.0))
+    left = np.exp(-distance / np.where(lengths > 0.0, lengths, 1.0))
+    return np.asarray(sign + np.where(lengths > 0.0, (direction - sign) * left, 0.0))
 
 
 def friction_direction(rate: Array, period: float, presliding: Array, start: Array | None = None) -> Array:

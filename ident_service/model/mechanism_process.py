@@ -72,7 +72,7 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
 def arm_part(
     model: pin.Model, part: ArmSelection, followers: Mapping[str, Mimic], file: str
 ) -> tuple[pin.Model, dict[str, float]]:
-    """Reduce a mechanism to the arm.
+    """Return the arm's part of a mechanism, and where its locked joints stand.
 
     Args:
         model: of the whole mechanism, mimicking joints as joints of their own.
@@ -212,7 +212,7 @@ def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
 
 
 def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Read the arm in an MJCF; `part` as for a URDF."""
+    """Return the arm of an MJCF as JSON values; `part` selects it, as in a URDF."""
     return _document("MJCF", lambda: pin.buildModelFromMJCF(path), part, dict)
 
 

@@ -9,7 +9,7 @@ angular acceleration and linear acceleration of the link frame's origin (gravity
 values of the base parameters and every other column at zero, `K delta = beta` holds, and so do all torques (eq. 37).
 The mass matrix is that of composite bodies, whose ten parameters simply add up.
 
-The formulas are recorded on a tape (`symbolic.py`), which other modules run or print.
+The formulas are recorded in an `ExpressionGraph` (`symbolic.py`), which other modules run or print.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def rigid_torque(
     """Return the torque of the links: M(q) ddq + c(q, dq) + g(q) without drives.
 
     Args:
-        tape: to write on.
+        tape: graph that the formulas are recorded in.
         chain: the mechanism.
         layout: order of the parameters.
         parameters: of the links.
@@ -244,7 +244,7 @@ class _Step:
         return force, add(rotate(back, moment), cross(self.arm, force))
 
     def felt(self, force: Vector, moment: Vector) -> Value:
-        """Return the component of a force and moment that the joint has to give."""
+        """Return the component of a force and moment along the joint's axis, which its drive must supply."""
         return dot(self.axis, moment if self.revolute else force)
 
 

@@ -68,33 +68,33 @@ class ClearanceChecker:
         self._clearance = model.config.workspace.clearance
         self._limits = limits
 
-    def require_clear(self, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
+    def require_clear(self, reference: Reference, limits: MotionLimits) -> Generator[None, None, None]:
         """Prove that a trajectory keeps clear and that no stop out of it touches, in slices for single control cycles.
 
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
         Args:
-            way: from rest.
-            limits: that the way keeps.
+            reference: from rest.
+            limits: that it keeps.
 
         Raises:
             MotionRefused: from any of the steps, naming what comes how near to what, and when.
         """
         if not self._collision.pairs:
             return
-        yield from self._proven(way, limits)
-        touching = yield from stops_touching(self._collision, way, self._limits)
+        yield from self._proven(reference, limits)
+        touching = yield from stops_touching(self._collision, reference, self._limits)
         if touching is not None:
             raise MotionRefused(touching)
 
-    def _proven(self, way: Reference, limits: MotionLimits) -> Generator[None, None, None]:
+    def _proven(self, reference: Reference, limits: MotionLimits) -> Generator[None, None, None]:
         reach = np.array(self._collision.reach)
         rising = 0.5 * reach @ limits.acceleration
-        here = float(self._collision.distances(way.at(0.0).position[None]).min())
+        here = float(self._collision.distances(reference.at(0.0).position[None]).min())
         least = max(min(self._clearance, 0.5 * here), 0.0)
         time, looked = 0.0, 0
-        while time < way.duration:
-            setpoint = way.at(time)
+        while time < reference.duration:
+            setpoint = reference.at(time)
             (distances,) = self._collision.distances(setpoint.position[None])
             spare = np.maximum(distances - least - _ROUNDING, 0.0)
             rate = reach @ np.abs(setpoint.velocity)
@@ -113,15 +113,15 @@ class ClearanceChecker:
 
 
 def stops_touching(
-    collision: CollisionModel, way: Reference, limits: MotionLimits
+    collision: CollisionModel, reference: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
     """Describe a stop out of a trajectory that would touch something, or None; in slices, like `require_clear`."""
-    for time in np.arange(0.0, way.duration, _BEGINS).tolist():
-        reference = stop(way.at(time), limits)
+    for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
+        stopping = stop(reference.at(time), limits)
         yield
-        times = np.linspace(0.0, reference.duration, _POINTS).tolist()
+        times = np.linspace(0.0, stopping.duration, _POINTS).tolist()
         for first in range(0, _POINTS, _AT_ONCE):
-            postures = np.array([reference.at(moment).position for moment in times[first : first + _AT_ONCE]])
+            postures = np.array([stopping.at(moment).position for moment in times[first : first + _AT_ONCE]])
             nearest = collision.distances(postures).min(axis=0)
             pair = int(nearest.argmin())
             if nearest[pair] <= 0.0:
@@ -171,13 +171,13 @@ def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | No
     return _touches("motion", nearest.time, nearest.pair, nearest.distance)
 
 
-def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits: MotionLimits) -> None:
+def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference], limits: MotionLimits) -> None:
     """Refuse a run that would come too near to anything.
 
     Args:
         model: of the arm, with its geometry and surroundings; without any, nothing is checked.
         path: the motion.
-        ways: to it and back from it.
+        trajectories: to it and back from it.
         limits: of the arm.
 
     Raises:
@@ -188,18 +188,20 @@ def require_clear(model: ArmModel, path: Path, ways: Sequence[Reference], limits
         return
     least = model.config.workspace.clearance
     _require_proven("the motion", certified_clearance(collision, path, least), least)
-    require_clear_trajectories(model, [("the path to or from the motion", way) for way in ways], limits)
+    require_clear_trajectories(model, [("the path to or from the motion", one) for one in trajectories], limits)
     if touching := touching_stop(path, limits, model):
         raise MotionRefused(touching)
 
 
-def require_clear_trajectories(model: ArmModel, ways: Sequence[tuple[str, Reference]], limits: MotionLimits) -> None:
+def require_clear_trajectories(
+    model: ArmModel, trajectories: Sequence[tuple[str, Reference]], limits: MotionLimits
+) -> None:
     """Refuse trajectories that come too near to anything, or out of which a stop would touch something.
 
     Args:
         model: of the arm, with its geometry and surroundings; without any, nothing is checked.
-        ways: each with what it is called in a refusal.
-        limits: of the arm; no way is faster.
+        trajectories: each with its name in a refusal.
+        limits: of the arm; none of them is faster.
 
     Raises:
         MotionRefused: naming what comes how near to what, and when.
@@ -208,9 +210,9 @@ def require_clear_trajectories(model: ArmModel, ways: Sequence[tuple[str, Refere
     if not collision.pairs:
         return
     least = model.config.workspace.clearance
-    for what, way in ways:
-        _require_proven(what, trajectory_clearance(collision, way, limits, least), least)
-        if touching := run_to_end(stops_touching(collision, way, limits)):
+    for what, reference in trajectories:
+        _require_proven(what, trajectory_clearance(collision, reference, limits, least), least)
+        if touching := run_to_end(stops_touching(collision, reference, limits)):
             raise MotionRefused(touching)
 
 

@@ -51,7 +51,6 @@ import time
 from collections.abc import Callable
 from enum import IntEnum
 from pathlib import Path
-from types import TracebackType
 from typing import Protocol, Self
 
 from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog
@@ -107,32 +106,23 @@ class Controls(Protocol):
 
 
 class StopCondition:
-    """Provide controls that neither pause nor finish early: the arm stops when a function returns true.
-
-    A second function tells whether the arm, held after that stop, is supported.
-    """
+    """Provide controls that neither pause nor finish early: the arm stops when a function returns true."""
 
     pause = False
     finish = False
+    supported = False
     homing = Homing.NONE
 
-    def __init__(
-        self, asked: Callable[[], bool] = lambda: False, supported: Callable[[], bool] = lambda: False
-    ) -> None:
-        self._asked, self._supported = asked, supported
+    def __init__(self, stop_requested: Callable[[], bool] = lambda: False) -> None:
+        self._stop_requested = stop_requested
 
     @property
     def stop(self) -> bool:
         """Return whether the stop function asks for a stop."""
-        return self._asked()
-
-    @property
-    def supported(self) -> bool:
-        """Return whether the support function says that the arm is supported."""
-        return self._supported()
+        return self._stop_requested()
 
     def wait_for_support(self) -> None:
-        """Do nothing: the support function is asked in every cycle."""
+        """Do nothing: nobody can say that the arm is supported."""
 
     def tell_homing(self, stage: Homing) -> None:
         """Do nothing: these controls never ask for the way home."""
@@ -140,55 +130,6 @@ class StopCondition:
     def lease_ok(self, now_ns: int) -> bool:
         """Return True: there is no lease to lose."""
         return True
-
-
-class LocalCommands:
-    """Hold controls as attributes for use within this process, each written and read whole.
-
-    Attributes:
-        stop: the arm is to stop.
-        pause: the arm is to stand.
-        finish: the run is to end early.
-        supported: the arm, which is held, is supported.
-        waiting: whether the arm is held until that is so.
-        homing: the arm, which is held, is to be led home.
-    """
-
-    def __init__(self, lease_seconds: float | None = None) -> None:
-        """Start with all controls off.
-
-        Args:
-            lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
-        """
-        self.stop = False
-        self.pause = False
-        self.finish = False
-        self.supported = self.waiting = False
-        self.homing = Homing.NONE
-        self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
-        self._renewed_ns: int | None = None
-
-    def wait_for_support(self) -> None:
-        """Wait for the switch `supported`; one that was set before does not count."""
-        self.supported, self.waiting = False, True
-
-    def tell_homing(self, stage: Homing) -> None:
-        """Set the stage of leading the arm home; `stop`, which preceded it, is off while the arm goes home."""
-        if stage is Homing.GOING:
-            self.stop = self.pause = self.waiting = False
-        self.homing = stage
-
-    def renew(self, now_ns: int) -> None:
-        """Renew the lease at a time of the loop's clock [ns]."""
-        self._renewed_ns = now_ns
-
-    def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the lease was renewed in time; before any renewal, the first call starts it."""
-        if self._length_ns is None:
-            return True
-        if self._renewed_ns is None:
-            self._renewed_ns = now_ns
-        return now_ns - self._renewed_ns <= self._length_ns
 
 
 _MAGIC, _VERSION, _SIZE = b"identctl", 1, 64
@@ -212,17 +153,17 @@ class ControlFile:
         path: Path,
         lease_seconds: float | None,
         now_ns: Callable[[], int] = time.monotonic_ns,
-        asked_ns: int | None = None,
+        requested_ns: int | None = None,
     ) -> Self:
         """Take the controls of the arm as the process that moves it: all controls off, the lease renewed.
 
-        Only a stop that was asked for after `asked_ns` is there from the beginning.
+        Only a stop that was asked for after `requested_ns` is there from the beginning.
 
         Args:
             path: of the file; made where it is missing.
             lease_seconds: how long the arm may move after `renew` [s]; None for a run that needs no lease.
             now_ns: the lease's clock.
-            asked_ns: when the motion was asked for, on that clock [ns]; when None, no earlier stop counts.
+            requested_ns: when the motion was asked for, on that clock [ns]; when None, no earlier stop counts.
 
         Raises:
             DriverError: another process moves the arm.
@@ -248,7 +189,7 @@ class ControlFile:
         # Read last: a stop either finds these controls in place, or has left its time behind before.
         stopped = taken._words[_STOPPED // 8]
         # One that seems yet to come is from before the machine was started.
-        if asked_ns is not None and asked_ns <= stopped <= now_ns():
+        if requested_ns is not None and requested_ns <= stopped <= now_ns():
             taken.ask_stop()
         return taken
 
@@ -415,9 +356,7 @@ class ControlFile:
         """Return these controls."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the controls."""
         self.close()
 
@@ -543,11 +482,11 @@ class SupervisedCommands:
 class InterruptibleArm(Arm):
     """Wrap an arm and refuse to enable it, or to send a torque, once a stop was asked for."""
 
-    def __init__(self, arm: Arm, asked: Callable[[], bool]) -> None:
-        """Wrap the given arm; `asked` returns whether it is to stop."""
-        self._arm, self._asked = arm, asked
+    def __init__(self, arm: Arm, stop_requested: Callable[[], bool]) -> None:
+        """Wrap the given arm; `stop_requested` returns whether it is to stop."""
+        self._arm, self._stop_requested = arm, stop_requested
         self.clock = arm.clock
-        arm.still_wanted = lambda: not asked()
+        arm.still_wanted = lambda: not stop_requested()
 
     def open(self) -> None:
         """Open the wrapped arm and use its clock."""
@@ -591,7 +530,7 @@ class InterruptibleArm(Arm):
         return self._arm.bus_budget(rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the wrapped arm's drives say of their set-up."""
+        """Return what the wrapped arm's drives report of their set-up."""
         return self._arm.setup_checks()
 
     @property
@@ -612,5 +551,5 @@ class InterruptibleArm(Arm):
         self._arm.close()
 
     def _require_no_stop_request(self) -> None:
-        if self._asked():
+        if self._stop_requested():
             raise DriverError("a stop was requested")

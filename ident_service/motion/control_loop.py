@@ -279,7 +279,7 @@ class Loop:
             self.course.plan_homing(wanted if near else here)
             self._leading = True
         else:
-            refusal = self.course.look_for_way_back()
+            refusal = self.course.search_return()
         if refusal is not None:
             self._leading = False
             self.tell(Severity.WARNING, stamp_ns, f"not moved home: {refusal}")
@@ -344,7 +344,7 @@ class Loop:
             if finish:
                 self.course.finish(stamp_ns)
         if self.states.state is State.PAUSED:
-            refusal = self.course.look_for_way_back()
+            refusal = self.course.search_return()
             self._report_finish_refused(stamp_ns)
             if refusal is not None:
                 self._react(self.guard.findings.found("no_way_back", refusal), stamp_ns)

@@ -26,7 +26,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.can_bus import CanBus
 from ident_service.config.control import Realtime
 from ident_service.motion.cycle_timing import LATE, SUCCESS, longest_stall
-from ident_service.motion.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, asked, capable, core_numbers
+from ident_service.motion.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, capable, core_numbers, temporary_privileges
 
 LEAST_RATE = 1000.0  # Hz, at which lateness is measured at least
 _SHARES = (1, 2, 4, 5, 10)  # of that rate, that are judged
@@ -142,7 +142,7 @@ def measure_wake_up(
     clock: Clock | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
 ) -> Woken:
-    """Sleep from slot to slot as the loop of a motion does, and note how late each one is reached.
+    """Measure how late a loop is woken that sleeps from slot to slot, as that of a motion does.
 
     Args:
         rate: of slots [Hz].
@@ -154,7 +154,7 @@ def measure_wake_up(
     clock = RealClock() if clock is None else clock
     period_ns = round(1e9 / rate)
     late_ns = np.full(max(1, round(seconds * rate)), -1, dtype=np.int64)
-    with asked(settings=settings) as granted:
+    with temporary_privileges(settings=settings) as granted:
         before, faults = _processor_time(), resource.getrusage(resource.RUSAGE_SELF).ru_minflt
         deadline_ns, count = clock.now_ns() + 10 * period_ns, 0
         while count < len(late_ns) and not stop_requested():

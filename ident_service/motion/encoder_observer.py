@@ -162,7 +162,7 @@ class FrozenEncoderObserver:
         position: Vector,
         feedforward: Vector | float = 0.0,
     ) -> Flags:
-        """Update the estimate for one cycle.
+        """Update the missing motion for one cycle, and return which encoders cannot hide it.
 
         Args:
             direction: in which each position has changed, 1 or -1, or 0 where it has not or was not measured, shape

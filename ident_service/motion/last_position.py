@@ -90,7 +90,7 @@ class PositionFile:
             raise MotionRefused(f"{words}; {LOOK_AT_IT}")
 
     def read(self) -> LastPosition | None:
-        """Return what was kept; None where nothing is, or of a description with other joints, gears or counts.
+        """Return the stored position; None without one, and for one stored for other joints, gears or counts.
 
         Raises:
             UsageError: the file was damaged by somebody.
@@ -110,7 +110,7 @@ class PositionFile:
 
 
 def is_new_every_time(arm: Arm, config: ArmConfig) -> bool:
-    """Tell if an arm begins anew whenever it is opened, as simulated ones do."""
+    """Return whether an arm begins anew whenever it is opened, as simulated ones do."""
     return arm.clock.lock_step or config.driver is None or config.driver.kind == "simulated"
 
 

@@ -77,7 +77,7 @@ class Lowering:
         return np.clip(position, self._limits.lower, self._limits.upper) - position
 
     def update(self, stamp_ns: int, position: Vector, velocity: Vector) -> bool:
-        """Update the share of compensated gravity for one cycle.
+        """Update the share of compensated gravity for one cycle, and return whether the arm has come to rest.
 
         Args:
             stamp_ns: of the cycle [ns].

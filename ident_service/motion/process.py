@@ -35,7 +35,7 @@ from ident_service.motion.ending import write_ending
 from ident_service.motion.fault_store import CONTROLS, FaultStore
 from ident_service.motion.faults import ActiveFaults, Severity
 from ident_service.motion.last_position import PositionFile
-from ident_service.motion.realtime import ask
+from ident_service.motion.realtime import request_privileges
 from ident_service.motion.run import WAITS_FOR, RunReport, follow
 from ident_service.motion.run_plan import Destination, ExcitationPlan, Plan, PointToPointPlan
 from ident_service.motion.state_machine import State
@@ -115,7 +115,7 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Run the motion with the control file taken; returns the exit code, and the last line for the parent."""
     try:
         place = Path(request["arm_folder"]) / CONTROLS
-        with ControlFile.take(place, request["lease"], asked_ns=request["asked_ns"]) as controls:
+        with ControlFile.take(place, request["lease"], requested_ns=request["requested_ns"]) as controls:
             signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
             send_line({"pid": os.getpid()})
             return 0, {"report": _run_with_fault_store(request, controls)}
@@ -173,7 +173,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) 
     sink = TimedSink(ring)
     lifeline = SupervisedCommands(controls, sys.stdin.fileno(), lock_step=arm.clock.lock_step)
     # Last, so that everything it freezes and locks is loaded.
-    granted = None if arm.clock.lock_step else ask(settings=config.realtime)
+    granted = None if arm.clock.lock_step else request_privileges(settings=config.realtime)
     sentence = "virtual time" if granted is None else granted.sentence()
     positions, moves = PositionFile(Path(request["arm_folder"]), config), False
     try:

@@ -109,7 +109,7 @@ def watch(
     Args:
         arm: not open.
         seconds: how long.
-        tell: called with what the arm says of itself and every sample.
+        tell: called with what the arm reports of itself and every sample.
         cycles: how many, instead of `seconds`.
         stop_requested: asked every cycle; True ends it with what has been seen.
 

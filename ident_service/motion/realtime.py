@@ -71,7 +71,7 @@ class RealtimePrivileges:
         return f"real time: got {', '.join(got) or 'nothing'}" + "".join(f"; {reason}" for reason in self.refusals)
 
 
-def ask(core_from_last: int = 0, settings: Realtime | None = None) -> RealtimePrivileges:
+def request_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> RealtimePrivileges:
     """Ask for everything; call it once, in the process of the loop, when all that it needs is loaded.
 
     Args:
@@ -102,18 +102,18 @@ def ask(core_from_last: int = 0, settings: Realtime | None = None) -> RealtimePr
 
 
 @contextmanager
-def asked(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[RealtimePrivileges]:
-    """The same for a while, for a loop in a process that does other things afterwards.
+def temporary_privileges(core_from_last: int = 0, settings: Realtime | None = None) -> Iterator[RealtimePrivileges]:
+    """Hold the privileges of `request_privileges` for the block, in a process that does other things afterwards.
 
     Args:
-        core_from_last: as for `ask`.
-        settings: as for `ask`.
+        core_from_last: as for `request_privileges`.
+        settings: as for `request_privileges`.
     """
     policy, cores, collecting = os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled()
     parameter = os.sched_getparam(0)
     granted: RealtimePrivileges | None = None
     try:
-        granted = ask(core_from_last, settings)
+        granted = request_privileges(core_from_last, settings)
         yield granted
     finally:
         if granted is not None:

@@ -105,7 +105,7 @@ def _wait_for(over: threading.Event) -> None:
 
 @contextmanager
 def unhurried() -> Iterator[None]:
-    """Work at no real-time priority, but before all that has none, where real time was granted (`realtime.py`).
+    """Run the block without real-time priority, at the highest other one, where real time was granted (`realtime.py`).
 
     Cycles in a thread that was started before go first. What works for seconds at a real-time priority starves all else
     on its core, for which the kernel stops every real-time process there for up to 50 ms of a second
@@ -356,7 +356,7 @@ class _Run:
         home = self._home = sample.position.copy()
         admitted = self.plan.admits(model, home, limits)
         legs, limits = self.plan.legs(model, home, limits), admitted
-        owed = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
+        observer = frozen_encoder_observer(dynamics, model, limits, period, described.position_resolution)
         contact = Contact(model)
         guard = SafetyMonitor(
             chain.names,
@@ -365,7 +365,7 @@ class _Run:
             home,
             revolute=chain.revolute,
             contact=contact,
-            owed=owed,
+            encoder_observer=observer,
             max_age=described.lost_cycles,
             most_torque=(1.0 + NOT_APPLIED) * limits.torque if described.streams_position else None,
             coupling=encoder_coupling(model.config),

@@ -259,7 +259,7 @@ class SafetyMonitor:
         *,
         revolute: tuple[bool, ...] | None = None,
         contact: Contact | None = None,
-        owed: FrozenEncoderObserver | None = None,
+        encoder_observer: FrozenEncoderObserver | None = None,
         max_age: int = MAX_AGE,
         most_torque: Vector | None = None,
         coupling: Vector | None = None,
@@ -273,8 +273,8 @@ class SafetyMonitor:
             position: where it stands [rad or m], shape (joints,).
             revolute: which joints turn, for the units in the sentences; all when None.
             contact: pairs of solids that may not touch; None for no collision check.
-            owed: estimates how far joints that stand still would have moved; without it, only hard pushes and full
-                motion reveal frozen encoders.
+            encoder_observer: estimates how far joints that stand still would have moved; without it, only hard pushes
+                and full motion reveal frozen encoders.
             max_age: cycles without an axis' feedback before it counts as gone (`ArmDescription.lost_cycles`).
             most_torque: for drives that are given positions: the torque above which what they measure is a warning
                 [N m or N], shape (joints,); None for drives that are given torques.
@@ -289,7 +289,7 @@ class SafetyMonitor:
         self._units = tuple("rad" if turns else "m" for turns in revolute or (True,) * joints)
         self._contact = contact if contact is not None and contact.pairs else None
         self._pairs = contact.pairs if contact is not None else ()
-        self._owed = owed
+        self._encoder_observer = encoder_observer
         self._position = self._shown = position.copy()
         self._age: Counts = np.zeros(joints, dtype=np.int64)
         self._jumps: Counts = np.zeros(joints, dtype=np.int64)
@@ -349,7 +349,8 @@ class SafetyMonitor:
             reference: where the arm should be at its stamp.
             velocity: filtered velocity before this sample [rad/s or m/s], shape (joints,).
             correction: of the torque before this sample, what the errors added to it [N m or N], shape (joints,).
-            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, `owed` is not updated.
+            answer: the feedback acceleration in it [rad/s^2 or m/s^2], shape (joints,); without, `encoder_observer` is
+                not updated.
             elapsed: since the sample before [s]; one period when None.
             known: whether `elapsed` is the true time; if not, it is the longest that it may be.
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
@@ -369,9 +370,9 @@ class SafetyMonitor:
         pushed = np.maximum(np.abs(encoders.forces(correction + feedforward)), own)
         self._count_stationary_cycles((steps != 0.0) & valid, pushed)
         self._count_unchanged((steps == 0.0) & valid, velocity)
-        if self._owed is not None and answer is not None:
+        if self._encoder_observer is not None and answer is not None:
             direction = np.where(valid, (steps > 0.0) * 1.0 - (steps < 0.0), 0.0)
-            self._owes = self._owed.update(direction, correction, answer, self._position, feedforward)
+            self._owes = self._encoder_observer.update(direction, correction, answer, self._position, feedforward)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
             # Copied, in case that a driver fills the same array again.

@@ -273,8 +273,8 @@ class TrajectorySequencer:
                 self.not_finished = str(refusal)
         return (yield from paused.resume_in_slices(self._resuming, self._surroundings))
 
-    def look_for_way_back(self) -> str | None:
-        """Do one slice of the search for a trajectory back; returns the reason where there is none, else None."""
+    def search_return(self) -> str | None:
+        """Do one slice of the search for a trajectory back; return the reason where none exists, else None."""
         if self._search is None:
             return None
         try:
@@ -301,7 +301,7 @@ class TrajectorySequencer:
             self._begin_ns, self._way = stamp_ns, self._back
 
     def plan_homing(self, start: Vector) -> None:
-        """Begin to search for a slow, straight trajectory home of a stopped arm; `look_for_way_back` continues.
+        """Begin to search for a slow, straight trajectory home of a stopped arm; `search_return` continues.
 
         Args:
             start: from where [rad or m], shape (joints,).

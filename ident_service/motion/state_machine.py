@@ -58,16 +58,16 @@ class StateMachine:
         state: present.
     """
 
-    def __init__(self, latch: ActiveFaults, told: Callable[[State], None] = lambda state: None) -> None:
+    def __init__(self, latch: ActiveFaults, observer: Callable[[State], None] = lambda state: None) -> None:
         """Start in IDLE.
 
         Args:
             latch: the arm's.
-            told: hears every state that is entered.
+            observer: called with every state that is entered.
         """
         self.state = State.IDLE
         self._latch = latch
-        self._told = told
+        self._observer = observer
 
     def enter(self, wanted: State) -> None:
         """Enter another state.
@@ -81,4 +81,4 @@ class StateMachine:
         if waits and self._latch.faults:
             raise ArmError(f"no transition to {wanted.value} before {self._latch.faults[0].code} is acknowledged")
         self.state = wanted
-        self._told(wanted)
+        self._observer(wanted)

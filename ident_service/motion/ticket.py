@@ -76,7 +76,7 @@ class Measure:
     most: float | None = None
 
     @property
-    def kept(self) -> bool:
+    def within_limits(self) -> bool:
         """Return whether the value keeps its limits; a missing value keeps none."""
         if self.least is None and self.most is None:
             return True
@@ -153,7 +153,7 @@ def measures(
 
 def check_from_measures(code: str, found: Sequence[Measure], remedy: str) -> Check:
     """Return a check that passed where every measure keeps its limits, else failed, naming each that does not."""
-    broken = [str(one) for one in found if not one.kept]
+    broken = [str(one) for one in found if not one.within_limits]
     if broken:
         return Check(code, Verdict.FAILED, tuple(found), "; ".join(broken), remedy)
     return Check(code, Verdict.PASSED, tuple(found))
@@ -196,9 +196,9 @@ class Subject:
         excitation_sha256: of its JSON; empty for none.
         model_sha256: of the prior parameters.
         identities: per axis, what the drives answered; empty where no arm could be opened.
-        bus_sha256: of all else that the open arm says of itself; empty likewise.
-        driver: its software, likewise.
-        software: this one, and its version.
+        bus_sha256: of joint names, rate, limits and resolutions that the open arm reports; empty likewise.
+        driver: name of the driver's software; empty likewise.
+        software: name and version of this software.
     """
 
     arm: str
@@ -248,9 +248,9 @@ class Ticket:
         """Return why this ticket does not allow a motion; empty when it does.
 
         Args:
-            subject: of what is about to be done, with the open arm's own description. One without a motion, for a way
-                home, asks for all that was found of the arm and for nothing that was found of the motion: such a way is
-                checked from where it begins, when it begins.
+            subject: of the motion that is to begin, with the open arm's own description. One without a motion, for the
+                path home, needs the checks of the arm and not those of the motion: that path is checked from where it
+                begins, when it begins.
             now: UTC.
         """
         found = []

@@ -186,7 +186,7 @@ def accepted_runs(db: Database) -> set[str]:
 
 
 def accepted_recordings(state: Path) -> set[str]:
-    """SHA-256 of the recordings that any accepted set was identified from, or judged on.
+    """Return the SHA-256 of the recordings that any accepted set was identified from, or judged on.
 
     Raises:
         ParameterError: a set is not what was accepted, so that what it needs is not known.

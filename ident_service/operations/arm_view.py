@@ -78,7 +78,7 @@ def view_of_motion(config: ArmConfig, motion: Path | None, speed: float = 1.0) -
     notes = []
     if shown < path.duration - 1e-6:
         notes.append(f"{shown / speed:.3g} s of {path.duration / speed:.3g} s are shown; the rest repeats them")
-    there, back = (_way(*leg, limits) for leg in ((rest(limits.home), begin), (end, rest(limits.home))))
+    there, back = (_trajectory(*leg, limits) for leg in ((rest(limits.home), begin), (end, rest(limits.home))))
     if there is None or back is None:
         notes.append("the way from home and back cannot be planned; preflight says why")
     length = shown + sum(one.duration for one in (there, back) if one is not None)
@@ -105,7 +105,7 @@ def view_of_motion(config: ArmConfig, motion: Path | None, speed: float = 1.0) -
     return _view(model, time[apart], position[apart], phases, notes)
 
 
-def _way(begin: Setpoint, end: Setpoint, limits: MotionLimits) -> Reference | None:
+def _trajectory(begin: Setpoint, end: Setpoint, limits: MotionLimits) -> Reference | None:
     try:
         return plan_reduced_trajectory(begin, end, limits)
     except IdentError:

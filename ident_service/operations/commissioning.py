@@ -213,7 +213,7 @@ def _counted(
     """
     cycles, every = 0, max(round(0.25 * rate), 1)
 
-    def asked() -> bool:
+    def counted_stop() -> bool:
         nonlocal cycles
         cycles += 1
         if cycles % every == 0:
@@ -221,7 +221,7 @@ def _counted(
             step(f"{planned.name} motion", _MOTIONS * before + each * seconds)
         return stop_requested()
 
-    return asked
+    return counted_stop
 
 
 def simulate(
@@ -277,10 +277,12 @@ def simulate(
             if isinstance(arm, SimulatedArm | RemoteArm):
                 arm.observer = observed.append
             driven = sum(one.duration for one in motions[: len(reports)])
-            asked = _counted(stop_requested, config.control.rate, planned, driven / whole, _MOTIONS / whole, step)
+            counted_stop = _counted(
+                stop_requested, config.control.rate, planned, driven / whole, _MOTIONS / whole, step
+            )
             stopped = _stopped(f"{planned.name} motion")
             try:
-                report = record_motion(arm, model, planned, path, asked)
+                report = record_motion(arm, model, planned, path, counted_stop)
             except MotionRefused:
                 if not reports or not stop_requested():
                     raise

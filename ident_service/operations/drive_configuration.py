@@ -132,12 +132,12 @@ def _fixed(sheet: DataSheet) -> frozenset[int]:
     return frozenset(key for key, entry in sheet.entries.items() if not entry.writable)
 
 
-def require_drives(config: ArmConfig) -> CanopenDriver:
-    """Return the driver's section of an arm; raises UsageError where its drives are not CANopen's."""
+def require_drives(config: ArmConfig, why: str = "only CANopen drives are configured") -> CanopenDriver:
+    """Return the driver's section of an arm; raises UsageError with `why` where its drives are not CANopen's."""
     if isinstance(config.driver, CanopenDriver):
         return config.driver
     kind = "no driver" if config.driver is None else f"driver {config.driver.kind!r}"
-    raise UsageError(f"{config.name} has {kind}; only CANopen drives (driver.kind: canopen) are configured")
+    raise UsageError(f"{config.name} has {kind}; {why} (driver.kind: canopen)")
 
 
 _NUMBERS = {1: Kind.U8, 2: Kind.I8, 3: Kind.I16, 4: Kind.I32, 5: Kind.U8, 6: Kind.U16, 7: Kind.U32}  # CiA 301, table 44
@@ -274,7 +274,7 @@ def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
 def store_or_restore(
     config: ArmConfig, *, store: bool, dry: bool = False, open_bus: Callable[[ArmConfig], list[Link]] = open_links
 ) -> tuple[int, ...]:
-    """Have all drives store what they hold (1010h), or take back what they were shipped with (1011h).
+    """Make all drives store their configuration (1010h), or restore that of their delivery (1011h).
 
     What is restored takes effect when the drives' power has been switched off and on.
 

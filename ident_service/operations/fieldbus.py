@@ -47,7 +47,12 @@ from ident_service.config.load import config_error
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
 from ident_service.motion.arm_factory import make_arm
-from ident_service.operations.drive_configuration import planned_configuration, planned_document, planned_text
+from ident_service.operations.drive_configuration import (
+    planned_configuration,
+    planned_document,
+    planned_text,
+    require_drives,
+)
 from ident_service.recordings.files import write_atomically
 
 _HEAD = f"  {'frames':<28}{'COB-IDs':<12}{'bytes':>6}{'Hz':>7}{'one of them, us':>24}{'load of all, %':>24}"
@@ -245,10 +250,7 @@ def bus_scan(config: ArmConfig, open_bus: Callable[[ArmConfig], list[Link]] = op
         UsageError: the arm's driver has no bus to scan.
         DriverError: as `drivers.canopen.bus_scan.scan`.
     """
-    driver = config.driver
-    if not isinstance(driver, CanopenDriver):
-        kind = "no driver" if driver is None else f"driver {driver.kind!r}"
-        raise UsageError(f"{config.name} has {kind}; a bus scan is of CANopen drives (driver.kind: canopen)")
+    driver = require_drives(config, "a bus scan is of CANopen drives")
     found = {(node.bus, node.node): node for node in scan(config, open_bus)}
     wanted = {(drive.bus, drive.node): (number, drive) for number, drive in enumerate(driver.drives, 1)}
     lines = []
@@ -437,10 +439,7 @@ def bus_probe(
         UsageError: the arm's driver has no bus.
         DriverError: a bus is in use, by another host too, cannot be opened, or is lost.
     """
-    driver = config.driver
-    if not isinstance(driver, CanopenDriver):
-        kind = "no driver" if driver is None else f"driver {driver.kind!r}"
-        raise UsageError(f"{config.name} has {kind}; a bus probe is of CANopen drives (driver.kind: canopen)")
+    driver = require_drives(config, "a bus probe is of CANopen drives")
     if files:
         probed = [_of_file(driver, number % len(driver.drives), one) for number, one in enumerate(files)]
     else:
@@ -741,9 +740,7 @@ def bus_report(
     Raises:
         UsageError: no CANopen drives, the file exists, or it cannot be written.
     """
-    driver = config.driver
-    if not isinstance(driver, CanopenDriver):
-        raise UsageError(f"{config.name}: a report is of CANopen drives (driver.kind: canopen)")
+    driver = require_drives(config, "a report is of CANopen drives")
     if path.exists():
         raise UsageError(f"{path} exists; give another name")
     try:

@@ -175,7 +175,7 @@ def design_files(
         tell=tell,
         cancelled=cancelled,
     )
-    seen = _seen(model, designed.excitation, request.knowledge)
+    seen = _previewed(model, designed.excitation, request.knowledge)
     with atomic_folder(folder) as staging:
         write_atomically(staging / MOTION, designed.excitation.to_json() + "\n")
         write_atomically(staging / SEARCH, found_to_json(designed.found, task) + "\n")
@@ -198,7 +198,7 @@ def preview_files(arm: str, motion: Path | None, knowledge: PriorData, folder: P
     """
     model = known_model(arm, knowledge)
     chosen = excitation(model, "identification", checked=False) if motion is None else read_excitation(motion)
-    seen = _seen(model, chosen, knowledge)
+    seen = _previewed(model, chosen, knowledge)
     if folder is not None:
         with atomic_folder(folder) as staging:
             write_preview(staging, seen)
@@ -251,7 +251,7 @@ def known_information(model: ArmModel, base: BaseParameters, knowledge: PriorDat
     return np.asarray(R.T @ R)
 
 
-def _seen(model: ArmModel, motion: Excitation, knowledge: PriorData) -> Preview:
+def _previewed(model: ArmModel, motion: Excitation, knowledge: PriorData) -> Preview:
     noise = known_noise(model, knowledge)
     seen = preview(model, motion, noise)
     added = known_information(model, seen.base, knowledge, noise.deviation)

@@ -84,7 +84,7 @@ class ProcessResult:
     taken: bool = False
 
     @property
-    def heard(self) -> bool:
+    def reported(self) -> bool:
         """Return whether the motion process reported a result."""
         return bool(self.report or self.error)
 
@@ -244,7 +244,7 @@ class _Watch:
             ended = self.hear(time.monotonic() + _LAST_WORDS)
             while self.holding and not ended:
                 ended = self.hear(time.monotonic() + _LAST_WORDS)
-            return ended and self.ending.heard
+            return ended and self.ending.reported
 
     def ask_stop(self) -> None:
         """Ask for a controlled stop, if a process has the arm."""
@@ -257,22 +257,22 @@ class _Watch:
         if self._controls is not None:
             self._controls.close()
 
-    def _take(self, said: dict[str, Any]) -> None:
-        if "pid" in said:
+    def _take(self, output: dict[str, Any]) -> None:
+        if "pid" in output:
             self.ending.taken = True
             with suppress(UsageError):  # it died at once, as the next read will show
                 self._controls = ControlFile.reach(self._path)
-        self.ending.report = said.get("report", self.ending.report)
-        self.ending.error = said.get("error", self.ending.error)
-        if "state" in said:
-            self._tell(said["state"])
-        if "fault" in said:
-            self._fault = self._fault or said["fault"]
-            self._tell(f"fault: {said['fault']}")
-        if "held" in said:
+        self.ending.report = output.get("report", self.ending.report)
+        self.ending.error = output.get("error", self.ending.error)
+        if "state" in output:
+            self._tell(output["state"])
+        if "fault" in output:
+            self._fault = self._fault or output["fault"]
+            self._tell(f"fault: {output['fault']}")
+        if "held" in output:
             self.holding = True
             self._latch()
-            self._tell(said["held"])
+            self._tell(output["held"])
 
     def _latch(self) -> None:
         """Let everybody know the fault of an arm that is held: its own process latches it when somebody supports it."""
@@ -315,7 +315,7 @@ class TargetMonitor:
     """Monitor of a run's accuracy target.
 
     Attributes:
-        said: result once the target is reached, `seconds` of the motion and the largest `share`; None before.
+        output: result once the target is reached, `seconds` of the motion and the largest `share`; None before.
         period: of the motion [s], zero where it has none.
     """
 
@@ -331,7 +331,7 @@ class TargetMonitor:
         self._request = {"folder": str(folder), "share": target.share, "parameters": target.parameters, "least": least}
         self.period = least
         self._tell, self._over, self._heard = tell, False, b""
-        self.said: dict[str, Any] | None = None
+        self.output: dict[str, Any] | None = None
 
     def __enter__(self) -> Self:
         """Start the process that follows the recording."""
@@ -361,7 +361,7 @@ class TargetMonitor:
         assert stdout is not None  # noqa: S101 - asked for
         while not self._over and select.select([stdout], [], [], 0.0)[0]:
             self._read_output(os.read(stdout.fileno(), _MOST))
-        return self.said is not None
+        return self.output is not None
 
     def _read_output(self, part: bytes) -> None:
         self._heard = (self._heard + part)[:_MOST]
@@ -369,12 +369,12 @@ class TargetMonitor:
             return
         self._over = True
         try:
-            said = json.loads(self._heard)
-            share, seconds = float(said["share"]), float(said["seconds"])
+            output = json.loads(self._heard)
+            share, seconds = float(output["share"]), float(output["seconds"])
         except (ValueError, KeyError, TypeError):
             self._tell("the target is no longer monitored; the motion continues to its end")
         else:
-            self.said = {"share": share, "seconds": seconds}
+            self.output = {"share": share, "seconds": seconds}
             self._tell(f"target reached: largest deviation {share:.2%} after {seconds:.1f} s of the motion")
 
 
@@ -405,7 +405,7 @@ def run_motion(
     tell: Callable[[str], None] = lambda _: None,
     moved: Callable[[float], None] = lambda _: None,
     stop_requested: Callable[[], bool] = lambda: False,
-    asked_ns: int | None = None,
+    requested_ns: int | None = None,
     until: Target | None = None,
 ) -> RunResult:
     """Move an arm along a motion, or to a destination, and record it.
@@ -423,8 +423,8 @@ def run_motion(
         tell: called with each state that is entered.
         moved: called several times a second with how long the arm has been driven, in its own time [s].
         stop_requested: asked several times a second.
-        asked_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop that
-            was asked for since then keeps it from beginning.
+        requested_ns: when a person asked for the motion, on the machine's monotonic clock [ns]; now when None. A stop
+            that was asked for since then keeps it from beginning.
         until: accuracy target at which the run is finished early; None for one that goes on to its end.
 
     Raises:
@@ -435,7 +435,7 @@ def run_motion(
         DriverError: the arm cannot be had.
         RecordingError: the recording failed, which has stopped the arm.
     """
-    asked_ns = time.monotonic_ns() if asked_ns is None else asked_ns
+    requested_ns = time.monotonic_ns() if requested_ns is None else requested_ns
     faults = fault_file(state, config.name)
     faults.require_none(faults.latched())
     if folder.exists():
@@ -480,7 +480,7 @@ def run_motion(
         "folder": str(folder),
         "arm_folder": str(arm_folder(state, config.name)),
         "lease": lease,
-        "asked_ns": asked_ns,
+        "requested_ns": requested_ns,
         "ticket": ticket.to_json(),
         "speed": speed,
         "log_frames": log_frames,
@@ -505,7 +505,7 @@ def run_motion(
             ending = supervise_motion_process(request, astuple(recorder.ends), lease, tell, watched, finish)
             ending.raise_for(faults)
     except BaseException as error:
-        refused = isinstance(error, MotionRefused) or (ending is not None and ending.heard and not ending.taken)
+        refused = isinstance(error, MotionRefused) or (ending is not None and ending.reported and not ending.taken)
         if started and not (refused and not faults.latched()):
             _keep(folder, error)
         else:
@@ -514,8 +514,8 @@ def run_motion(
     write_manifest(folder)
     if reaching is None or until is None:
         return RunResult(folder, ending.report)
-    wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.said}
-    wanted["missed"] = [] if reaching.said is not None else _missed(folder, until, reaching.period, tell)
+    wanted = {"share": until.share, "parameters": list(until.parameters), "reached": reaching.output}
+    wanted["missed"] = [] if reaching.output is not None else _missed(folder, until, reaching.period, tell)
     return RunResult(folder, {**ending.report, "until": wanted})
 
 

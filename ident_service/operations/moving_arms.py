@@ -56,12 +56,12 @@ def moving_arms(state: Path) -> list[str]:
 
 
 def _command_of(ask: Callable[[ControlFile], None]) -> Callable[[Path], int]:
-    def asked(path: Path) -> int:
+    def send(path: Path) -> int:
         with ControlFile.reach(path) as controls:
             ask(controls)
             return controls.pid
 
-    return asked
+    return send
 
 
 def _reach(state: Path, arm: str | None, act: Callable[[Path], int | None]) -> list[str]:

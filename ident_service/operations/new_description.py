@@ -358,7 +358,7 @@ def _joint_angles(urdf: TextFile) -> Iterator[float]:
         yield from (float(angle) for angle in origin.get("rpy", "").split())
 
 
-def _joints(draft: Draft, model: ArmModel, said: Mapping[str, FileLimits]) -> None:
+def _joints(draft: Draft, model: ArmModel, file_limits: Mapping[str, FileLimits]) -> None:
     """Set the limits of every joint: the file's, else guesses; torque limits that can hold the arm."""
     chain = model.chain
     likely = likely_bodies(with_file_bodies(model))
@@ -379,7 +379,7 @@ def _joints(draft: Draft, model: ArmModel, said: Mapping[str, FileLimits]) -> No
         draft.remarks.append(
             "kinematics: the URDF's angles are rounded multiples of 15 degrees; they are taken as exact"
         )
-    known = [said.get(name, FileLimits()) for name in chain.names]
+    known = [file_limits.get(name, FileLimits()) for name in chain.names]
     ranges = [
         one.position or ((-_TURN, _TURN) if turns else (-_SLIDE, _SLIDE))
         for one, turns in zip(known, chain.revolute, strict=True)

@@ -95,7 +95,7 @@ class PrunableRecording:
 
 
 def expendable(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
-    """Recordings that the policy lets go.
+    """Return the recordings that `prune` would delete.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
     each arm's `newest` runs, and those that a job which waits or runs has or reads.

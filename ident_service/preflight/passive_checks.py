@@ -114,7 +114,7 @@ def identities_check(
         limits: of the description; the driver must not clip below them, or what was proven of torques is not true.
         expected: identities from an earlier check, in the order of the axes; None accepts whatever answers.
         looked: at the arm.
-        setup: what the drives say of their set-up.
+        setup: what the drives report of their set-up.
     """
     code, names = "identities", model.chain.names
     if described.joint_names != names:

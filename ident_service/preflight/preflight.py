@@ -41,20 +41,26 @@ from ident_service.motion.ticket import (
     subject_of,
 )
 from ident_service.motion.trajectory import hold, rest
-from ident_service.preflight import gravity as weight
-from ident_service.preflight.delay import hidden_delay
-from ident_service.preflight.direction import (
+from ident_service.preflight.active_checks import (
     DWELL,
+    HOLD,
+    SETTLE,
     TestMotion,
+    differences,
     direction_check,
     expected_displacement,
     follow_stroke,
+    gravity_check,
+    holdable,
+    holding_fault_check,
+    holding_torque,
     judge_response,
     moved_against_torque,
     sign_failure,
     strokes,
     swings,
 )
+from ident_service.preflight.delay import hidden_delay
 from ident_service.preflight.passive_checks import (
     IdleRecording,
     at_rest_check,
@@ -154,7 +160,7 @@ class _Gravity:
 
     def carried_by(self, held: Vector) -> bool:
         """Return whether the torque that holds the arm is near enough to the model's; fast enough between cycles."""
-        difference, most = weight.differences(held, self.torque, self.limits, self.friction)
+        difference, most = differences(held, self.torque, self.limits, self.friction)
         return bool((difference <= most).all())
 
 
@@ -271,7 +277,7 @@ class _Preflight:
         self._passed(noise_check(looked, self.described, self.model, limits, session.mass))
         if any(c.verdict is Verdict.FAILED and c.code not in ABOUT_THE_MOTION for c in self.checks.values()):
             return None
-        if (impossible := weight.holdable(session.gravity, self.model, limits)) is not None:
+        if (impossible := holdable(session.gravity, self.model, limits)) is not None:
             self._passed(impossible, of_place=True)
             return None
         agreed = confirm_watchdog_test(self.model, looked.samples[-1], self.confirm)
@@ -299,10 +305,10 @@ class _Preflight:
         silent: Check | None = None
         try:
             self._energise(session)
-            held = session.follow(hold(session.home), weight.SETTLE + max(weight.HOLD, self.rate_seconds))
-            if planned and gravity.carried_by(weight.holding_torque(held, session.period)):
+            held = session.follow(hold(session.home), SETTLE + max(HOLD, self.rate_seconds))
+            if planned and gravity.carried_by(holding_torque(held, session.period)):
                 moved += (follow_stroke(session, one) for one in planned)
-                session.follow(hold(session.home), weight.SETTLE)
+                session.follow(hold(session.home), SETTLE)
                 if try_watchdog:
                     silent = watchdog_check(self.arm, self.model, session, hold(session.home).at)
             if silent is None:
@@ -350,7 +356,7 @@ class _Preflight:
                 room = relaxed_limits(home, motion_limits(self.model.config), 0.0)
                 stroke = strokes(session, self.model, room, only=0)[0]
             self._energise(session)
-            session.follow(hold(home), weight.SETTLE)
+            session.follow(hold(home), SETTLE)
             half = DWELL + 0.5 * stroke.there.duration
             session.follow(stroke, half)
             moving = watchdog_check(self.arm, self.model, session, lambda time: stroke.at(half + time), stroke.joint)
@@ -373,8 +379,8 @@ class _Preflight:
             rate = loop_rate_check(stamps, session.period, self.arm.clock.lock_step, before)
             if rate is not before:
                 self._passed(rate)
-            torque = weight.holding_torque(held, session.period)
-            self._passed(weight.gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
+            torque = holding_torque(held, session.period)
+            self._passed(gravity_check(torque, gravity.torque, self.model, gravity.limits, gravity.friction))
         if planned and len(moved) == len(planned):
             answers = [
                 judge_response(trace_of(rows, session.period), stroke, session)
@@ -407,7 +413,7 @@ class _Preflight:
     def _faulted(self, session: Session, gravity: _Gravity, error: ArmFault) -> None:
         """Find out what ended the loop: what the fault names, a joint that went the wrong way, or another cause."""
         if "gravity" not in self.checks:
-            self._passed(weight.holding_fault_check(session, self.model, gravity.limits, gravity.friction, error))
+            self._passed(holding_fault_check(session, self.model, gravity.limits, gravity.friction, error))
             return
         if (remedy := remedy_of(error)) is not None:
             self._passed(failed("direction", str(error), remedy))

@@ -341,7 +341,7 @@ class Session:
     def cycle_without_signal(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool) -> None:
         """Check a cycle in which a signal is withheld from drives on purpose, and compute the next target.
 
-        What drives say of themselves is what is being tried, and is not judged here; neither are joints whose drives
+        What drives report of themselves is what is being tried, and is not judged here; neither are joints whose drives
         have given up torque, but for their position limits. Every other joint is held and guarded as before. A drive
         that misses its host may leave `operational` and tell no position any more: its joints stand where they were
         seen last, and the caller says how long that may go on.

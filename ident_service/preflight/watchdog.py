@@ -1,7 +1,7 @@
 """Prove that the drives stop by themselves when the host falls silent: the one protection that works when it dies.
 
 Done last, where the arm has just been held, and again in the middle of a small motion: what the drives' watchdogs watch
-is withheld, and looked at what the drives say of themselves. An arm without brakes then sinks onto its support, so a
+is withheld, and looked at what the drives report of themselves. An arm without brakes then sinks onto its support, so a
 person must have typed the arm's name first.
 """
 
@@ -92,7 +92,7 @@ def watchdogs_of(arm: Arm, model: ArmModel) -> tuple[Watchdog, ...]:
 def watchdog_check(
     arm: Arm, model: ArmModel, session: Session, setpoint_at: Callable[[float], Setpoint], moving: int | None = None
 ) -> Check:
-    """Fall silent while the arm is held, and check that its drives stop; the arm is without torque afterwards.
+    """Check that drives stop when the host falls silent while it holds the arm; the arm is without torque afterwards.
 
     What one kind of watchdog watches is withheld after the other, and everything else goes on: a drive that stops for
     another reason has not proven its watchdog. So do the closed loop and its guard, for the joints whose drives have
@@ -110,7 +110,7 @@ def watchdog_check(
     """
     period = session.period
     dogs = watchdogs_of(arm, model)
-    told = arm.describe().report_delay
+    reported = arm.describe().report_delay
     where = "at rest" if moving is None else "in motion"
     watchdog_expired: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
@@ -119,7 +119,7 @@ def watchdog_check(
     try:
         for kind in sorted({dog.kind for dog in dogs}, key=_ORDER.index):
             watched = [number for number, dog in enumerate(dogs) if dog.kind == kind]
-            most = max(_most(dogs[number], period, told) for number in watched)
+            most = max(_most(dogs[number], period, reported) for number in watched)
             of_torque = dogs[watched[0]].of_torque
             if not of_torque:
                 arm.withhold(kind)
@@ -167,7 +167,7 @@ def watchdog_check(
     for number, dog in enumerate(dogs):
         seconds, word = watchdog_expired.get(number, (None, AxisStatus(0)))
         what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
-        found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, told)))
+        found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, reported)))
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
         if fault:
@@ -178,9 +178,9 @@ def watchdog_check(
     return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
 
 
-def _most(dog: Watchdog, period: float, told: float) -> float:
+def _most(dog: Watchdog, period: float, reported: float) -> float:
     """Return how long a drive may take until it has reported that it stopped [s]."""
-    return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + told
+    return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + reported
 
 
 def _joints_of(drives: Collection[int], model: ArmModel) -> Flags:

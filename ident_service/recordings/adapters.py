@@ -121,7 +121,7 @@ def overlap(one: Recording, other: Recording) -> bool:
 
 
 def without_standstill(recording: Recording, margin: float) -> RangeRecording:
-    """Leave out what comes before the first joint moves and after the last one has stopped.
+    """Return the recording without what comes before the first joint moves and after the last one has stopped.
 
     A joint moves where its mean position over 0.1 s changes by more than 0.005 rad/s or m/s to the next 0.1 s.
 
@@ -164,7 +164,7 @@ def without_standstill(recording: Recording, margin: float) -> RangeRecording:
 
 
 def without_ends(recording: Recording, trim: tuple[float, float]) -> RangeRecording:
-    """Leave out the first and the last seconds, as `resampling.trimmed` does.
+    """Return the recording without its first and last seconds, as `resampling.trimmed` does.
 
     Args:
         recording: to be read through once.

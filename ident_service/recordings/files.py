@@ -17,7 +17,7 @@ _RANGE: Final = re.compile(r"^(?P<path>.+)@(?P<start>\d+(?:\.\d*)?)?:(?P<end>\d+
 
 
 def split_range(path: str) -> tuple[str, tuple[float, float] | None]:
-    """Split `FILE@START:END` into the file and seconds of its recording, whatever files there are.
+    """Split `FILE@START:END` into the file and seconds of its recording; files are not looked at.
 
     Raises:
         UsageError: the range ends before it begins.

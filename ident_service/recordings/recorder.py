@@ -61,7 +61,7 @@ class RecorderProcess:
         """Check the request; nothing is started or written before the context is entered.
 
         Args:
-            path: as for `RecordingWriter`, and so are the next five.
+            path: of the recording, as for `RecordingWriter`.
             joint_names: in the order of every vector.
             robot_description: URDF, as text.
             utc_offset_ns: offset from a stamp to UTC [ns since 1970].
@@ -73,7 +73,7 @@ class RecorderProcess:
             local: whether this process puts; otherwise one that is given `ends`.
 
         Raises:
-            UsageError: what `RecordingWriter` cannot mean either.
+            UsageError: arguments that `RecordingWriter` refuses.
         """
         writer = RecordingWriter(path, joint_names, robot_description, utc_offset_ns, attachments, metadata)
         self.path, self.partial = writer.path, writer.partial

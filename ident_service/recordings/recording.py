@@ -191,8 +191,8 @@ class _Check:
         self._last = cut(piece, len(step) - 1, len(step))
         if not repeats.any():
             return piece
-        kept = ~repeats
-        return _selected(piece, np.flatnonzero(kept), int(repeats.sum()))
+        rows = ~repeats
+        return _selected(piece, np.flatnonzero(rows), int(repeats.sum()))
 
     def ended(self, block: Block) -> Block:
         """Add the samples that were left out behind the file's last sample to the count of that sample."""
@@ -214,9 +214,9 @@ class _Check:
         if not self.skipped and not missing.any():
             return piece, order
         before = self.skipped + np.cumsum(missing)
-        kept = np.flatnonzero(~missing)
-        self.skipped = int(before[-1] - (before[kept[-1]] if len(kept) else 0))
-        return _selected(replace(piece, skipped=np.diff(before, prepend=0)), kept, piece.repeats), kept
+        rows = np.flatnonzero(~missing)
+        self.skipped = int(before[-1] - (before[rows[-1]] if len(rows) else 0))
+        return _selected(replace(piece, skipped=np.diff(before, prepend=0)), rows, piece.repeats), rows
 
     def _refuse(self, piece: Block, step: Stamps, stuck: NDArray[np.bool_]) -> None:
         """Raise RecordingError for the first sample that is not valid."""
@@ -257,11 +257,11 @@ def _repeated_samples(run: Block) -> NDArray[np.bool_]:
     return same
 
 
-def _selected(piece: Block, kept: NDArray[np.intp], repeats: int) -> Block:
+def _selected(piece: Block, rows: NDArray[np.intp], repeats: int) -> Block:
     """Select samples of a piece; samples skipped before dropped ones count before the next one that is kept."""
-    velocity = None if piece.velocity is None else piece.velocity[kept]
-    skipped = None if piece.skipped is None else np.diff(np.cumsum(piece.skipped)[kept], prepend=0)
-    return Block(piece.stamp_ns[kept], piece.position[kept], piece.torque[kept], velocity, repeats, skipped)
+    velocity = None if piece.velocity is None else piece.velocity[rows]
+    skipped = None if piece.skipped is None else np.diff(np.cumsum(piece.skipped)[rows], prepend=0)
+    return Block(piece.stamp_ns[rows], piece.position[rows], piece.torque[rows], velocity, repeats, skipped)
 
 
 def _frozen(block: Block) -> Block:

@@ -83,7 +83,6 @@ import struct
 import time
 import zlib
 from contextlib import suppress
-from types import TracebackType
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -466,9 +465,7 @@ class RingReader:
         """Return this reader."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Detach."""
         self.memory.close()
 

@@ -123,7 +123,7 @@ class RingSink:
             self.writer.put(cycle)
         except (ValueError, struct.error) as error:
             raise RecordingError(self._path, f"recording failed: {error}") from error
-        return self._wait() if self._lock_step else self._kept()
+        return self._wait() if self._lock_step else self._keeps_up()
 
     def event(self, stamp_ns: int, level: int, message: str) -> bool:
         """Record one event behind the samples put so far; result and errors as for `put`."""
@@ -131,7 +131,7 @@ class RingSink:
             self.writer.event(stamp_ns, level, message)
         except struct.error as error:
             raise RecordingError(self._path, f"recording failed: {error}") from error
-        return self._wait() if self._lock_step else self._kept()
+        return self._wait() if self._lock_step else self._keeps_up()
 
     def close(self, *, complete: bool = True) -> None:
         """Announce the last record to the recorder; does not wait for it, and does nothing the second time."""
@@ -142,7 +142,7 @@ class RingSink:
         """Release the ring's memory; nothing can be put or asked any more."""
         self.writer.memory.close()
 
-    def _kept(self) -> bool:
+    def _keeps_up(self) -> bool:
         """Check that the recorder is running, alive and near enough to the writer."""
         words, written = self._words, self.writer.written
         if written % _LOOK_EVERY == 0 and self._recorder.poll(0):

@@ -38,7 +38,7 @@ def index_motion(db: Database, state: Path, motion: str, arm: str, by: str) -> N
 
 
 def add_motion(db: Database, state: Path, arm: str, text: str, by: str, joints: int) -> Row:
-    """Take an uploaded motion.
+    """Store an uploaded motion, and return its row.
 
     Args:
         db: the registry.

@@ -140,7 +140,7 @@ def arm_folder(state: Path, arm: str) -> Path:
 
 
 def known_arms(state: Path) -> list[str]:
-    """Names of the arms that a state folder remembers something of."""
+    """Return the names of the arms that a state folder has files of."""
     place = state / "arms"
     return sorted(path.name for path in place.iterdir() if not path.name.startswith(".")) if place.is_dir() else []
 

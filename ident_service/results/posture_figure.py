@@ -179,16 +179,16 @@ def _hull(points: Array) -> Array:
     """Return the corners of the convex hull of points, shape (points, 2), in order (Andrew's monotone chain)."""
     rows = sorted({(x, y) for x, y in points.tolist()})
 
-    def half(way: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        kept: list[tuple[float, float]] = []
-        for x, y in way:
-            while len(kept) > 1:
-                (xa, ya), (xb, yb) = kept[-2:]
+    def half(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        corners: list[tuple[float, float]] = []
+        for x, y in points:
+            while len(corners) > 1:
+                (xa, ya), (xb, yb) = corners[-2:]
                 if (xb - xa) * (y - ya) - (yb - ya) * (x - xa) > 0.0:
                     break
-                kept.pop()
-            kept.append((x, y))
-        return kept
+                corners.pop()
+            corners.append((x, y))
+        return corners
 
     if len(rows) < 3:
         return np.array(rows)

@@ -35,20 +35,20 @@ def rows_and_filter(options: Identification) -> tuple[str, ...]:
     if "choose" in (smoothing.cutoff, smoothing.decimate, options.edge):
         chosen = "Rows and filter: chosen for each recording from the spectra of its positions; its ends are left out."
         return (chosen,)
-    thinned = f", thinned out to one of {_said(smoothing.decimate)}" if smoothing.decimate != 1 else ""
-    rows = f"All rows: every sample of a recording but {_said(options.edge)} s at its ends and at gaps{thinned}."
+    thinned = f", thinned out to one of {_words(smoothing.decimate)}" if smoothing.decimate != 1 else ""
+    rows = f"All rows: every sample of a recording but {_words(options.edge)} s at its ends and at gaps{thinned}."
     slow = f"is not faster than {reversal.speed:g} rad/s (or m/s)" if reversal.speed else "stands still"
     near = f", and without those within {reversal.window:g} s of them" if reversal.window else ""
     rows_moving = f"Away from standstill: without rows in which a drive of that joint {slow}{near}."
     if smoothing.method == "butterworth":
-        low_pass = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_said(smoothing.cutoff)} Hz"
+        low_pass = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_words(smoothing.cutoff)} Hz"
     else:
-        low_pass = f"Savitzky-Golay polynomials of degree {smoothing.order}, cut-off {_said(smoothing.cutoff)} Hz"
+        low_pass = f"Savitzky-Golay polynomials of degree {smoothing.order}, cut-off {_words(smoothing.cutoff)} Hz"
     position = f"Position, velocity and acceleration: through {low_pass}."
     if options.period is not None:
         return rows, rows_moving, position, f"Position and torque: averaged over periods of {options.period:g} s."
     if smoothing.filter_torque:
-        other = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_said(smoothing.cutoff)} Hz"
+        other = f"a zero-phase Butterworth low-pass of order {smoothing.order} at {_words(smoothing.cutoff)} Hz"
         torque = f"Measured torque: through {'the same low-pass' if smoothing.method == 'butterworth' else other}."
     else:
         torque = "Measured torque: as recorded, so that its noise counts as error."
@@ -94,7 +94,7 @@ def wrapped(sentences: Iterable[str]) -> list[str]:
     return [line for sentence in sentences for line in textwrap.wrap(sentence, 100, subsequent_indent="  ")]
 
 
-def _said(value: float | str) -> str:
+def _words(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
 
@@ -109,7 +109,7 @@ WHAT_THEN = (
 
 
 def implausible_links(estimate: Estimate) -> tuple[str, ...]:
-    """Return the links whose chosen values are implausible: which value, and beside which bound.
+    """Return a sentence for each link whose chosen values are implausible: the value and its bound.
 
     Args:
         estimate: with link values; one without, or with values that a prior or custom knowledge asked for, has none

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from threading import RLock
-from types import TracebackType
 from typing import Final, Self
 
 from drivers.can.bus_load import exact
@@ -96,9 +95,7 @@ class CanBusServer:
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the wire and all its connections."""
         self.close()
 

@@ -321,5 +321,5 @@ class WireLink:
     def _keep(self, taken: list[tuple[Frame, bool]]) -> None:
         for frame, _ in taken:
             if frame.error:
-                self._watch.heard(frame)
+                self._watch.observe(frame)
             self._waiting.append(frame)

@@ -188,13 +188,13 @@ class TorqueLoop:
         self._motor.drive(self._personality.torque(fraction * demand, self._objects), now_ns)
 
     def _add(self, acts: float, now_ns: int) -> None:
-        """Note the torque [counts] that acts from now on, for the mean that is told."""
+        """Note the torque [counts] that acts from now on, for the mean that is reported."""
         acted, since_ns = self._acting
         self._sum += acted * (now_ns - since_ns)
         self._acting = acts, now_ns
 
     def tell_mean(self, now_ns: int) -> None:
-        """Tell the mean torque since it was told last: a position loop changes it several times in a cycle."""
+        """Report the mean torque since the last report: a position loop changes it several times in a cycle."""
         if not self._motor.holds:
             return
         self._add(self._acting[0], now_ns)

@@ -394,10 +394,10 @@ class _Run:
             due.append(overdue)
         return max(0, min(due) - now_ns) * 1e-9
 
-    def _send_ready_frames(self, sent: Sequence[Sent], asked_ns: int | None = None) -> None:
+    def _send_ready_frames(self, sent: Sequence[Sent], requested_ns: int | None = None) -> None:
         """Send what is ready, the lowest identifiers first, as a bus would, but no position too late."""
         now = self._clock.now_ns()
-        too_late = asked_ns is not None and now - asked_ns > self._given_up_ns
+        too_late = requested_ns is not None and now - requested_ns > self._given_up_ns
         ready = []
         for item in sent:
             if too_late and self._emulator.is_feedback(item):

@@ -1,7 +1,7 @@
 """Emulate one motor puck: its properties, positions of 22 bits, torques of 14 bits, and its power stage.
 
-IDLE shorts the windings. TORQUE follows torque frames, clipped at MT without a word; only the safety puck raises it, a
-host that tries is not obeyed. In its monitor (STAT 0) a puck knows its first properties only. An error of its own
+IDLE shorts the windings. TORQUE follows torque frames, clipped at MT without a report; only the safety puck sets it,
+and a host that tries is ignored. In its monitor (STAT 0) a puck knows its first properties only. An error of its own
 (STAT 1) leaves the windings open until STAT is set to 2 again; what real pucks do then is not documented.
 """
 
@@ -102,7 +102,7 @@ class EmulatedPuck:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Return that a puck has no timer."""
+        """Return None: a puck has no timer."""
         return None
 
     @property
@@ -141,7 +141,7 @@ class EmulatedPuck:
         return Traffic.FEEDBACK if address.group and address.destination == Group.POSITIONS else Traffic.OTHER
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Take torques, answer a GET, obey a SET."""
+        """Process a frame of the host: torques, a GET, which is answered, or a SET."""
         if frame.error or frame.remote or frame.extended:
             return []
         address = address_of(frame.identifier)
@@ -164,7 +164,7 @@ class EmulatedPuck:
         return [reply(self._node, request.number, self._value(name, now_ns), wide=self._properties.is_wide(name))]
 
     def set_mode(self, mode: Mode, now_ns: int) -> None:
-        """Follow the safety puck."""
+        """Take the mode that the safety puck sets."""
         if self._stat is not Status.READY:
             return
         self._told = 0
@@ -190,7 +190,7 @@ class EmulatedPuck:
         """Do nothing: a puck limits torque by its counts alone."""
 
     def fail(self, code: int, now_ns: int, *, lasting: bool = False) -> list[Frame]:
-        """Have an error: STAT 1, no torque."""
+        """Set an error: STAT 1, no torque."""
         self._stat, self._mode, self._told = Status.ERROR, Mode.IDLE, 0
         self.values["ERROR"] = code & 0x7FFF
         self._lasting = self._lasting or lasting
@@ -206,7 +206,7 @@ class EmulatedPuck:
         self._safety.ignores_heartbeat = deaf
 
     def warn(self, warned: bool, now_ns: int) -> list[Frame]:
-        """Have the supply's voltage warned of, or not."""
+        """Set or clear the warning of the supply's voltage."""
         self._safety.low_supply(warned)
         return []
 
@@ -216,7 +216,7 @@ class EmulatedPuck:
         return []
 
     def reboot(self, now_ns: int) -> list[Frame]:
-        """Restart by itself: it is in its monitor, without torque, and has lost its position."""
+        """Restart the firmware: it is in its monitor, without torque, and has lost its position."""
         self._stat, self._mode, self._told, self._offset = Status.RESET, Mode.IDLE, 0, 0
         self.motor.power_up(now_ns)
         return []

@@ -149,7 +149,7 @@ class EmulatedSafetyPuck:
         return self._taken()
 
     def tick(self, now_ns: int) -> list[Frame]:
-        """Miss a heartbeat, take the power of an arm that stays too fast, or have a person press a key."""
+        """Process what is due: a missed heartbeat, an arm that stays too fast, a key that a person presses."""
         self._now_ns = now_ns
         silent = self._traffic_ns is not None and now_ns - self._traffic_ns >= self._heartbeat_ns
         if self.mode is SafetyMode.ACTIVE and silent and not self.ignores_heartbeat:

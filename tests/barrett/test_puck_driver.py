@@ -229,7 +229,7 @@ def test_an_emergency_stop_shows_within_a_status_period_and_only_a_person_clears
         assert all(word & AxisStatus.POWERED for word in bench.cycles(3, NONE).status)
 
 
-def test_a_velocity_fault_is_told_with_its_cause_before_any_consequence(bench: Bench) -> None:
+def test_a_velocity_fault_is_reported_with_its_cause_before_any_consequence(bench: Bench) -> None:
     with bench.arm as arm:
         arm.enable()
         bench.cycles(10, NONE)
@@ -401,7 +401,7 @@ def test_unequal_firmware_is_refused() -> None:
         arm.enable()
     other = Bench(wam())
     with_firmware(other, 4, 40)
-    with pytest.raises(DriverError, match=r"P has not one number in all pucks.*puck 4 40"):
+    with pytest.raises(DriverError, match=r"property P has another number in some pucks.*puck 4 40"):
         other.arm.open()
 
 

@@ -135,7 +135,7 @@ def test_an_answer_survives(welcome: packets.Welcome) -> None:
     assert packets.unpack_welcome(packets.pack_welcome(welcome)) == welcome
 
 
-def test_another_version_is_told_from_noise() -> None:
+def test_another_version_is_distinguished_from_noise() -> None:
     data = bytearray(packets.pack_hello(packets.Hello("x")))
     data[4] = 99
     with pytest.raises(DriverError, match="version 99"):

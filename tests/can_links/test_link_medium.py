@@ -145,7 +145,7 @@ def test_a_full_queue_takes_no_more() -> None:
     assert [medium.offer(sender, Frame(0x100), 0) for _ in range(QUEUE + 2)] == [True] * QUEUE + [False] * 2
 
 
-def test_who_does_not_listen_loses_frames_and_is_told_before_the_next_one() -> None:
+def test_who_does_not_listen_loses_frames_and_is_warned_before_the_next_one() -> None:
     medium, (sender, listener) = on_wire(2)
     for k in range(INBOX + 5):
         medium.offer(sender, Frame(k % 0x700), k)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import can
 import pytest
+from helpers.replay import LoggedFrame, ReplayLink, read_session
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from link_bench import frames, process, wait_for
@@ -16,7 +17,6 @@ from drivers.can.bus_state import BUS_OFF
 from drivers.can.can_frame import Frame
 from drivers.can.frame_log import SessionLog
 from drivers.can.frame_log_process import OrderedLog
-from drivers.canopen.replay import LoggedFrame, ReplayLink, read_session
 from drivers.clock import RealClock, VirtualClock
 from ident_service.errors import DriverError, RecordingError
 

@@ -250,14 +250,14 @@ def test_a_crowded_wire_says_so(wire: CanBusServer) -> None:
     end_of(wire.name).close()
 
 
-def test_an_end_of_another_version_is_told_so(wire: CanBusServer) -> None:
+def test_an_end_of_another_version_is_reported(wire: CanBusServer) -> None:
     with address.connect(wire.name) as sock:
         sock.settimeout(PATIENCE)
         sock.send(packets.pack_hello(Hello("old"))[:4] + b"\0" + bytes(40))
         assert packets.unpack_welcome(sock.recv(MAX_PACKET_BYTES)).answer == packets.OTHER_VERSION
 
 
-def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
+def test_something_else_at_the_address_is_distinguished_from_a_wire(name: str) -> None:
     with address.listen(name) as listener:
         listener.setblocking(True)
         answers = [b"HTTP/1.1 200 OK", packets.pack_welcome(packets.Welcome(packets.OTHER_VERSION))]
@@ -272,7 +272,7 @@ def test_something_else_at_the_address_is_told_from_a_wire(name: str) -> None:
                         end.result(PATIENCE)
 
 
-def test_who_does_not_read_loses_frames_and_is_told_and_holds_nobody_up(wire: CanBusServer) -> None:
+def test_who_does_not_read_loses_frames_is_warned_and_holds_nobody_up(wire: CanBusServer) -> None:
     sleeper, sender, listener = end_of(wire.name), end_of(wire.name), end_of(wire.name)
     count = 5000
     for k in range(count):

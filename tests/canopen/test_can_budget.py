@@ -10,7 +10,7 @@ from can_arms import EDS, wam_driver
 
 from drivers.can.bus_load import Budget, unstuffed, worst
 from drivers.canopen import object_dictionary as od
-from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, budget, frame_cost
+from drivers.canopen.bus_load import EMERGENCY_SLOTS, HEARTBEAT_STATE, budget, frame_line
 from drivers.canopen.object_dictionary import Entry
 from drivers.canopen.pdo_mapping import HEARTBEAT, RPDO1, SYNC, TPDO1
 from ident_service.config.can_bus import CanBus
@@ -40,7 +40,7 @@ MAPS: list[tuple[Frames, int, int, int]] = [
 
 @pytest.mark.parametrize(("frames", "least", "typical", "most"), MAPS)
 def test_the_published_maps_cost_what_was_published(frames: Frames, least: int, typical: int, most: int) -> None:
-    costs = [frame_cost(cob_id, slots, BUS) for cob_id, slots in frames]
+    costs = [frame_line("", (cob_id,), tuple(slots), 1.0, BUS).each for cob_id, slots in frames]
     assert sum(cost.unstuffed for cost in costs) == pytest.approx(least * 1e-6)
     assert sum(cost.worst for cost in costs) == pytest.approx(most * 1e-6)
     # Means depend on which values are typical; a third of a per cent of the bus at 1 kHz.
@@ -71,7 +71,7 @@ def test_pucks_cost_what_was_published(lengths: list[int], least: int, most: int
     ],
 )
 def test_mean_lengths_are_near_the_published_ones(frames: Frames, mean: float) -> None:
-    costs = [frame_cost(cob_id, slots, BUS).typical for cob_id, slots in frames]
+    costs = [frame_line("", (cob_id,), tuple(slots), 1.0, BUS).each.typical for cob_id, slots in frames]
     assert 1e6 * sum(costs) / len(costs) == pytest.approx(mean, abs=1.5)
 
 
@@ -113,7 +113,7 @@ def test_the_typical_load_counts_too() -> None:
     assert not bus.fits
 
 
-def test_over_budget_is_told_with_remedies_that_hold() -> None:
+def test_over_budget_is_reported_with_remedies_that_hold() -> None:
     driver = wam_driver(torque_frames="single")
     over = budget(driver, 1000.0)
     assert not over.fits

@@ -186,7 +186,7 @@ def test_the_identified_parameters_are_those_of_the_simulated_wam(arms: Path) ->
         ("drives: [{node: 1, rated_torque: 0.01, max_torque: 0.5, max_speed: 1}]", "50 times rated_torque"),
     ],
 )
-def test_mistakes_are_told_with_their_place(arms: Path, driver: str, complaint: str) -> None:
+def test_mistakes_are_reported_with_their_place(arms: Path, driver: str, complaint: str) -> None:
     (arms / "bare.eds").write_text("[DeviceInfo]\n[DummyUsage]\nDummy0003=0\n", encoding="utf-8")
     path = extended(arms, driver)
     with pytest.raises(ConfigError) as caught:

@@ -100,7 +100,7 @@ def test_a_silent_drive_grows_old_and_keeps_its_position() -> None:
     assert bus.drives[3].position == 1
 
 
-def test_status_words_are_told_when_they_change() -> None:
+def test_status_words_are_reported_when_they_change() -> None:
     bus = codec()
     for word in (0x1637, 0x1637, 0x1E37, 0x1637, 0x16B7, 0x0218):
         bus.receive(status(5, word, -123))
@@ -171,7 +171,7 @@ def test_heartbeats_tell_who_lives_and_who_has_booted() -> None:
     assert bus.drives[1].nmt == NmtState.PRE_OPERATIONAL
 
 
-def test_strangers_and_a_second_host_are_told_once() -> None:
+def test_strangers_and_a_second_host_are_reported_once() -> None:
     bus = codec()
     for _ in range(3):
         bus.receive(position(9, 1))
@@ -246,7 +246,7 @@ def test_a_flood_hides_neither_an_emergency_nor_a_second_host() -> None:
     assert len(events) < 300
 
 
-def test_a_drive_that_stops_following_its_torque_is_told_of() -> None:
+def test_a_drive_that_stops_following_its_torque_is_reported() -> None:
     bus = codec()
     for status in (0x0227, 0x1227, 0x0227, 0x1227, 0x0221):
         bus.receive(Frame(0x281, struct.pack("<Hh", status, 0)))

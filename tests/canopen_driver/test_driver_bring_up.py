@@ -290,7 +290,7 @@ def stop_when(bench: Bench, word: int, act: Callable[[], None]) -> None:
     tap.send = sending  # type: ignore[method-assign]
 
 
-def test_a_node_that_reboots_is_told_of_and_is_enabled_only_after_opening_again() -> None:
+def test_a_node_that_reboots_is_reported_and_is_enabled_only_after_opening_again() -> None:
     bench = Bench(weightless_config())
     with bench.arm as arm:
         arm.enable()

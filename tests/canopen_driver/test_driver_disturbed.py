@@ -156,7 +156,7 @@ def test_a_position_is_one_that_was_sent() -> None:
     [Frame(0x080), Frame(0x201, bytes(4)), Frame(0x302, bytes(3)), Frame(0x000, b"\x80\x00"), Frame(0x77F, b"\x05")],
     ids=["SYNC", "torque", "control word", "NMT", "heartbeat"],
 )
-def test_a_second_host_is_told_of_at_once_and_again_after_enabling(frame: Frame) -> None:
+def test_a_second_host_is_reported_at_once_and_again_after_enabling(frame: Frame) -> None:
     with running() as (arm, tap):
         for _ in range(2):
             tap.disturb([frame], drives_hear=False)

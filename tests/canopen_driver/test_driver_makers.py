@@ -361,7 +361,7 @@ def test_torques_of_32_bits_act_once_the_mode_has_what_it_needs() -> None:
         ({"rated_torque": 0.15, "max_torque": 0.2}, r"wrong by 9.8"),
     ],
 )
-def test_what_a_description_lacks_for_them_is_told_before_anything_is_written(
+def test_what_a_description_lacks_for_them_is_reported_before_anything_is_written(
     changes: dict[str, Any], words: str
 ) -> None:
     bench = Bench(ipos(**changes), ipos())

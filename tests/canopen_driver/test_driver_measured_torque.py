@@ -53,7 +53,7 @@ def pushed(config: ArmConfig, fault: str = "", cycles: int = 200) -> tuple[list[
 
 
 @pytest.mark.parametrize("coupled", [False, True])
-def test_told_in_every_cycle_it_is_what_acted_until_the_stamp(coupled: bool) -> None:
+def test_reported_in_every_cycle_it_is_what_acted_until_the_stamp(coupled: bool) -> None:
     samples, truths = pushed(config("cyclic", coupled=coupled))
     measured = np.array([sample.measured_torque for sample in samples])
     acted = np.array([truth.torque for truth in truths])  # from the stamp of the same cycle on
@@ -62,7 +62,7 @@ def test_told_in_every_cycle_it_is_what_acted_until_the_stamp(coupled: bool) -> 
     np.testing.assert_allclose(differences, 0.0, atol=1e-12)
 
 
-def test_told_with_the_status_it_comes_now_and_then() -> None:
+def test_reported_with_the_status_it_comes_now_and_then() -> None:
     samples, truths = pushed(config(None))
     assert samples[-1].measured_torque is not None
     measured = np.array([np.full(2, np.nan) if s.measured_torque is None else s.measured_torque for s in samples])
@@ -89,7 +89,7 @@ def test_a_single_report_is_not_believed() -> None:
     assert all(s.torque_difference is not None and np.abs(s.torque_difference).max() < 2 * STEP for s in samples)
 
 
-def test_without_measurement_nothing_is_told() -> None:
+def test_without_measurement_nothing_is_reported() -> None:
     for found in (config("none"), config(None, eds={"name": "bare.eds", "text": EDS.replace("[6077]", "[5F77]")})):
         assert isinstance(found.driver, CanopenDriver)
         assert found.driver.torque_reports == "none"

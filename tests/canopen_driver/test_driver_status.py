@@ -45,7 +45,7 @@ def is_status(frame: Frame) -> bool:
     return frame.identifier in (0x281, 0x282)
 
 
-def test_a_drive_whose_status_report_stays_away_is_told_of_after_two_to_three_periods(
+def test_a_drive_whose_status_report_stays_away_is_reported_after_two_to_three_periods(
     running: tuple[CanopenArm, Tapped],
 ) -> None:
     arm, tap = running

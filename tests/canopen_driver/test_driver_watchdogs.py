@@ -112,8 +112,8 @@ def test_a_drive_that_ignores_its_watchdog_is_seen_and_the_other_is_not(kind: st
     check = bench.check()
     assert check.verdict is Verdict.FAILED
     turn, slide = check.measures
-    assert turn.kept
-    assert (slide.value, slide.kept) == (None, False)
+    assert turn.within_limits
+    assert (slide.value, slide.within_limits) == (None, False)
     assert "goes on after" in slide.what
     assert "slide: drive 2" in check.reason
     bench.arm.close()

@@ -371,7 +371,7 @@ def test_a_look_ends_when_a_drive_restarts() -> None:
             arm.exchange(None)
 
 
-def test_a_latched_fault_is_told_and_does_not_keep_it_from_being_zeroed() -> None:
+def test_a_latched_fault_is_reported_and_does_not_keep_it_from_being_zeroed() -> None:
     bench = Bench()
     bench.behind.inject(DriveFault("emergency", 1, size=0x4310))
     bench.settle(100)

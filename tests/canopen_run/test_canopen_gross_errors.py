@@ -76,7 +76,7 @@ def test_three_times_the_torque_of_motor_1_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_a_gear_ratio_twice_too_large_is_told_and_leads_to_the_scale() -> None:
+def test_a_gear_ratio_twice_too_large_is_reported_and_leads_to_the_scale() -> None:
     check = checked(wam(ratio=2.0), wam())["direction"]
     assert check.reason.startswith("j1, ")
     assert " respond to torque 0.24, " in check.reason

@@ -38,7 +38,7 @@ def behind(folder: Path, *, brakes: bool = True) -> tuple[LockStepArm, CanopenAr
 def test_what_was_asked_of_the_kernel_is_given_back() -> None:
     code = """
 import gc, os
-from ident_service.motion.realtime import asked
+from ident_service.motion.realtime import temporary_privileges
 def state(): return os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled(), gc.get_freeze_count()
 before = state()
 with asked(1) as granted:

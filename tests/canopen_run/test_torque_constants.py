@@ -149,7 +149,9 @@ def _with_body(config: ArmConfig, body: dict[str, Any]) -> ArmConfig:
         (["--payload", "loaded.mcap=hand.yaml"], "link: 'hand' is none of shoulder, elbow"),
     ],
 )
-def test_what_cannot_be_is_told(runs: Path, words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_reported(
+    runs: Path, words: list[str], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     Path("bad.yaml").write_text("mass: -1\ncenter_of_mass: [0, 0, 0]\n")
     Path("hand.yaml").write_text("mass: 1\ncenter_of_mass: [0, 0, 0]\nlink: hand\n")
     assert identify(*FILES, *words, "--out", "nothing") == 2

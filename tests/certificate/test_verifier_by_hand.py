@@ -90,7 +90,7 @@ def fails(document: Document, message: str) -> None:
     assert (result.verdict, result.message) == ("failed", message)
 
 
-def test_a_witness_is_told_with_all_that_it_meets() -> None:
+def test_a_witness_is_reported_with_all_that_it_meets() -> None:
     result = verified(feasible())
     assert result.verdict == "feasible", result.message
     assert result.message == (
@@ -336,7 +336,7 @@ def test_conditions_are_bounded_in_size_and_number() -> None:
     fails(document, "certificate.blocks: more than 5000")
 
 
-def test_names_of_conditions_are_printable_short_and_told_apart() -> None:
+def test_names_of_conditions_are_printable_short_and_distinguished() -> None:
     document = feasible()
     certificate = document["feasibility"]["certificate"]
     certificate["blocks"] = [number("n" * 200, {"m1": "1"})]
@@ -490,7 +490,7 @@ def test_a_line_for_a_terminal_has_at_most_500_characters() -> None:
     assert clean("a\x1b" + 600 * "x") == "a?" + 498 * "x"
 
 
-def test_what_is_told_of_a_file_is_one_line_of_bounded_length() -> None:
+def test_what_is_reported_of_a_file_is_one_line_of_bounded_length() -> None:
     document = feasible()
     document["feasibility"]["certificate"] = {"kind": "undecided", "reason": "why\n" + 1000 * "x"}
     result = verified(document)

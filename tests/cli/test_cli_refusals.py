@@ -45,55 +45,6 @@ def refused(place: Path, ident: Ident, words: tuple[object, ...], code: int, mes
     return in_words
 
 
-@pytest.mark.parametrize("verb", [("config", "check"), ("base",), ("simulate",)])
-def test_unknown_key(place: Path, ident: Ident, verb: tuple[str, ...]) -> None:
-    arm = quick_arm(place, ("gravity:", "gravitiy:"))
-    line = (
-        arm.read_text()
-        .splitlines()
-        .index("gravitiy: [0, -9.81, 0] # m/s^2; the joints turn about the base's z, which lies level")
-        + 1
-    )
-    refused(place, ident, (*verb, arm), 2, f"{arm}:{line}:1: gravitiy: unknown key 'gravitiy'")
-
-
-def test_lower_above_upper(place: Path, ident: Ident) -> None:
-    arm = quick_arm(place, ("position: [-1.8, 1.8]", "position: [103, -103]"))
-    ended = refused(place, ident, ("config", "check", arm), 2, "lower bound 103 is not below upper bound -103")
-    assert f"{arm}:" in ended.err
-
-
-def test_all_mistakes_at_once(place: Path, ident: Ident) -> None:
-    arm = quick_arm(
-        place,
-        ("gravity:", "gravitiy:"),
-        ("position: [-1.8, 1.8]", "position: [103, -103]"),
-        ("name: planar2", "nome: x"),
-    )
-    ended = refused(place, ident, ("config", "check", arm), 2, "unknown key 'gravitiy'")
-    for message in ("is not below upper bound", "unknown key 'nome'", "'name' is missing"):
-        assert message in ended.err
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("simulate", "nowhere.yaml"),
-        ("base", "nowhere.yaml"),
-        ("config", "check", "nowhere.yaml"),
-        ("feasible", "nowhere.json"),
-        ("correct", "nowhere.json", "--out", "{place}/c.json"),
-        ("identify", "nowhere.mcap", "--arm", "planar2", "--out", "{place}/out"),
-        ("identify", "nowhere.csv", "--arm", "planar2"),
-        ("identify", "{run}/identification.mcap", "--arm", "nowhere.yaml", "--out", "{place}/out"),
-        ("identify", "{run}/identification.mcap", "--arm", "planar2", "--validate", "nowhere.mcap"),
-    ],
-)
-def test_missing_file(place: Path, quick: Commissioned, ident: Ident, words: tuple[str, ...]) -> None:
-    given = tuple(word.format(place=place, run=quick.folder) for word in words)
-    refused(place, ident, given, 2, "nowhere.")
-
-
 def identify(place: Path, quick: Commissioned, recording: Path) -> tuple[object, ...]:
     return ("identify", recording, "--arm", quick.arm, "--out", place / "out")
 

@@ -262,7 +262,7 @@ def test_a_table_in_yaml_is_the_same_table(tmp_path: Path) -> None:
         ("t.xml", "<mujoco><worldbody><body><joint type='odd'/></body></worldbody></mujoco>", "t.xml: not an MJCF"),
     ],
 )
-def test_a_source_with_a_mistake_is_told_and_leaves_nothing(
+def test_a_source_with_a_mistake_is_reported_and_leaves_nothing(
     name: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / name).write_text(text)
@@ -357,7 +357,7 @@ def test_a_bad_body_is_named_and_the_good_one_kept(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
-def test_all_that_no_urdf_says_is_told_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_that_no_urdf_says_is_reported_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config, said = described(tmp_path, BARS, capsys)
     text = (tmp_path / "bars.yaml").read_text()
     for key in (

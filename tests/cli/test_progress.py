@@ -88,7 +88,7 @@ def test_the_time_left_goes_by_what_is_done(
     assert estimate(8.0, Mark(10.0, "begun", 0.0), mark, now) == pytest.approx(expected)
 
 
-def test_a_time_is_told_in_the_unit_that_fits() -> None:
+def test_a_time_is_reported_in_the_unit_that_fits() -> None:
     said = [time_left(seconds, 7.4) for seconds in (None, 0.2, 44.0, 600.0, 7200.0)]
     assert said == ["7 s", "about 1 s left", "about 44 s left", "about 10 min left", "about 2.0 h left"]
 

@@ -150,7 +150,7 @@ def test_tables_with_known_covariances_are_tested(tmp_path: Path) -> None:
     assert drifts[1].joint.p == pytest.approx(7.989e-11, rel=1e-3)
 
 
-def test_constrained_values_without_their_origin_are_said(commissioned: Path, ident: Ident) -> None:
+def test_constrained_values_without_their_origin_are_stated(commissioned: Path, ident: Ident) -> None:
     content = json.loads((commissioned / "again" / "parameters.json").read_text())
     del content["base_parameters"]["unconstrained_values"]
     old = commissioned / "old.json"

@@ -122,7 +122,7 @@ def test_what_is_identical_has_not_changed() -> None:
     assert found.verdict == "unchanged"
 
 
-def test_what_nobody_saw_is_left_out_and_said() -> None:
+def test_what_nobody_saw_is_left_out_and_stated() -> None:
     rng = np.random.default_rng(6)
     S = covariance(8)
     first, second = drawn(rng, S), drawn(rng, S)

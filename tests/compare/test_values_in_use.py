@@ -117,7 +117,9 @@ def test_tested_and_used_values_are_both_shown(commissioned: Path, tmp_path: Pat
     assert "tested: unconstrained values" in page
 
 
-def test_another_way_to_the_values_is_a_note_with_its_size(commissioned: Path, tmp_path: Path, ident: Ident) -> None:
+def test_another_method_for_the_values_is_a_note_with_its_size(
+    commissioned: Path, tmp_path: Path, ident: Ident
+) -> None:
     accepted = commissioned / "accepted"
     content = json.loads((accepted / "parameters.json").read_text())
     content["base_parameters"]["values"] = content["base_parameters"]["unconstrained_values"]

@@ -75,7 +75,6 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
     [
         pytest.param("version: 1", "version: 1\ncolour: red", "colour", "unknown key 'colour'", id="unknown key"),
         pytest.param("two: {a: 0.5,", "two: {b: 0.5,", "b: 0.5", "unknown key 'b'", id="unknown key in a DH row"),
-        pytest.param("{order: 3,", "{ordr: 3,", "ordr", "unknown key 'ordr'", id="unknown key in a nested section"),
         pytest.param("seed: 3}", "seed: 3, use_all: 1}", "use_all", "unknown key", id="unknown key in a motion"),
         pytest.param(
             "kind: simulated,", "kind: simulated, tick: 1,", "tick", "unknown key", id="unknown key in a driver"
@@ -97,15 +96,7 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
         ),
         pytest.param("control: {rate: 1000}", "control: fast", "control", "must be a mapping", id="text for a section"),
         pytest.param("gravity: [0, 0, -9.81]", "gravity: 9.81", "gravity", "must be a list", id="number for a vector"),
-        pytest.param("-9.81]", "down]", "down]", "must be a number [m/s^2], not 'down'", id="word in a vector"),
         pytest.param("-9.81]", "-9.81, 0]", "gravity", "at most 3", id="vector too long"),
-        pytest.param(
-            "rate: 1000",
-            "rate: '1000'",
-            "rate",
-            "is text, and a number is needed; leave out the quotes",
-            id="text for a number",
-        ),
         pytest.param("periods: 2", "periods: '2'", "periods", "a whole number is needed", id="text for a whole number"),
         pytest.param(
             "order: 3", "order: true", "order", "must be a whole number, not true", id="truth for a whole number"
@@ -118,7 +109,6 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
         pytest.param("home: 0", "home: north", "home", "not an angle: 'north'", id="word for an angle"),
         pytest.param("alpha: pi/2", "alpha: pi/0", "alpha", "divided by zero", id="angle divided by zero"),
         pytest.param("rate: 1000", "rate: 1e999", "rate", "finite number", id="infinite number"),
-        pytest.param("rate: 1000", "rate: .nan", "rate", "must be a number [Hz], not '.nan'", id="not a number"),
         pytest.param("rate: 1000", "rate: 1e9", "rate", "at most 10000 [Hz], not 1e+09", id="rate of no loop"),
         pytest.param(
             "prior: {m1: 1.0}",
@@ -127,17 +117,13 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
             "at most 100000 [Hz], not 1e+09",
             id="rate of no recording",
         ),
-        pytest.param("rate: 1000", "rate: -1", "rate", "greater than 0", id="negative rate"),
         pytest.param("order: 3", "order: 9", "order", "at most 8, not 9", id="number too large"),
         pytest.param("name: tiny", "name: ../etc", "name", "is not a name", id="name that is a path"),
         pytest.param("version: 1", "version: 2", "version", "must be 1, not 2", id="version of the future"),
-        pytest.param("convention: standard", "convention: odd", "convention", "'standard'", id="unknown choice"),
-        pytest.param("kind: seeded", "kind: wobble", "validation", "'wobble'", id="unknown kind of motion"),
         pytest.param("version: 1\n", "", "format", "'version' is missing", id="missing key at the top"),
         pytest.param("convention: standard\n    ", "", "dh:", "'convention' is missing", id="missing key inside"),
         pytest.param(", q0: 0}\n      two", "}\n      two", "one: {a: [", "'q0' is missing", id="missing middle"),
         pytest.param("home: 0", "home: 1.5", "one: {position", "home 1.5 lies outside", id="home outside limits"),
-        pytest.param("  dh:\n", "  urdf: no.urdf\n  dh:\n", "urdf: no", "no such file", id="missing mechanism file"),
         pytest.param("prior: {m1: 1.0}", "prior: no.json", "prior", "no such file", id="missing prior file"),
         pytest.param(
             "prior: {m1: 1.0}",
@@ -163,11 +149,7 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
             "must be one, two",
             id="motion joints",
         ),
-        pytest.param(
-            "  two: {position", "  six: {position", "joints:\n  one", "one, six are not those", id="joint names"
-        ),
         pytest.param("[0.1, 0.2]}", "[0.1]}", "torque_noise", "1 values for 2 joints", id="wrong length per joint"),
-        pytest.param("name: tiny", "name: tiny\nname: huge", "name: huge", "'name' stands twice", id="duplicate key"),
         pytest.param("{rate: 1000}", "{rate: 1, rate: 2}", "rate: 2", "'rate' stands twice", id="duplicate key inside"),
         pytest.param("[0, 0, -9.81]", "&g [0, 0, -9.81]", "&g", "anchors and aliases", id="anchor"),
         pytest.param("upper: [1, 1, 1]", "upper: [1, *g, 1]", "*g", "anchors and aliases", id="alias"),
@@ -179,7 +161,6 @@ def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
         pytest.param("{rate: 1000}", "!ref {rate: 1000}", "!ref", "tag", id="tag of a mapping"),
         pytest.param("[0, 0, -9.81]", "!ref [0, 0, -9.81]", "!ref", "tag", id="tag of a list"),
         pytest.param("{rate: 1000}", "{rate: [1000}", "}\nidentification: {s", "expected", id="bracket left open"),
-        pytest.param("name: tiny", "name: tiny: tinier", ": tinier", "mapping values", id="not YAML"),
     ],
 )
 def test_one_mistake_is_reported_where_it_stands(tmp_path: Path, old: str, new: str, mark: str, message: str) -> None:
@@ -322,7 +303,6 @@ def test_several_documents_in_one_file_are_refused_where_the_second_begins(tmp_p
         pytest.param('{"names": ["m1"], "values": ["heavy"]}', "not a JSON object", id="word for a number"),
         pytest.param('{"names": ["m1", "m2"], "values": [1]}', "2 names but 1 values", id="lengths"),
         pytest.param('{"names": ["m1", "m1"], "values": [1, 2]}', "stands twice", id="name twice"),
-        pytest.param('{"names": ["m1"], "values": [NaN]}', "finite number", id="not a number"),
         pytest.param('{"names": ["m1"], "values": [1' + "0" * 400 + "]}", "not a JSON object", id="beyond floats"),
         pytest.param("[" * 200_000, "not a JSON object", id="deep"),
     ],

@@ -179,7 +179,7 @@ TAKEN = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("old", "new", "said"), REFUSED)
 @pytest.mark.parametrize("verb", [("config", "check"), ("base",), ("new",)])
-def test_what_a_urdfs_parser_refuses_is_told_with_its_line_and_in_our_words(
+def test_what_a_urdfs_parser_refuses_is_reported_with_its_line_and_in_our_words(
     tmp_path: Path, old: str, new: str, said: str, verb: tuple[str, ...], capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert old in URDF
@@ -205,7 +205,7 @@ def test_nothing_is_refused_that_the_parser_takes(old: str, new: str) -> None:
     require_urdf(TextFile(name="r.urdf", text=text))
 
 
-def test_of_many_mistakes_the_first_are_told() -> None:
+def test_of_many_mistakes_the_first_are_reported() -> None:
     text = URDF.replace('"0 0 1"', '"x"').replace('lower="-1" upper="1" velocity="1" effort="10"', 'lower="y"')
     text = text.replace('rpy="0 0 0"', 'rpy="z"').replace('"revolute"', f'"{"w" * 5000}"')
     with pytest.raises(ModelError, match=r"^r\.urdf:4: .*r\.urdf:7: .*r\.urdf:7: .*; and 2 more$") as caught:

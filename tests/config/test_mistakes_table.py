@@ -264,7 +264,7 @@ def test_what_cannot_move_is_never_called_good(
     assert not any(line.endswith("good") for line in told)
 
 
-def test_a_mesh_that_no_clearance_can_be_computed_from_is_told_before_preflight(
+def test_a_mesh_that_no_clearance_can_be_computed_from_is_reported_before_preflight(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arms = Path(__file__).resolve().parents[2] / "configs"

@@ -299,7 +299,9 @@ def test_what_is_replaced_is_kept(full: Path, tmp_path: Path, good: bytes) -> No
 
 
 @pytest.mark.parametrize("moves", [0, 1, 3, 5, 6])
-def test_a_restore_that_is_killed_is_told_and_done_again(full: Path, tmp_path: Path, good: bytes, moves: int) -> None:
+def test_a_restore_that_is_killed_is_reported_and_done_again(
+    full: Path, tmp_path: Path, good: bytes, moves: int
+) -> None:
     file = tmp_path / "b.tar"
     file.write_bytes(good)
     child = fork()

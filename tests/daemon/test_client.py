@@ -259,7 +259,7 @@ def test_every_kind_that_the_api_tells_is_an_error_of_the_tree() -> None:
         DiskFull("no room"),
     ],
 )
-def test_an_error_that_is_told_is_the_one_that_was_raised(error: IdentError) -> None:
+def test_an_error_that_is_reported_is_the_one_that_was_raised(error: IdentError) -> None:
     again = error_of(type(error).__name__, str(error))
     assert type(again) is type(error)
     assert str(again) == str(error)

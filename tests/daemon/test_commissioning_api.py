@@ -1,4 +1,4 @@
-"""The ladder through the API, on the small simulated arm in virtual time: real processes, real folders."""
+"""The commissioning workflow through the API, on the small simulated arm in virtual time, with real processes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from daemon.conftest import Asked, checked_before, known_arm, patient_text, quic
 from daemon.verbs_bench import with_run
 
 from ident_service.daemon.dependencies import Service
-from ident_service.daemon.jobs.outcome import told_samples
+from ident_service.daemon.jobs.outcome import printed_samples
 from ident_service.daemon.jobs.queue import Progress
 from ident_service.daemon.jobs.requests import Run
 from ident_service.daemon.live_stream import live_events
@@ -219,7 +219,7 @@ def test_what_only_looks_needs_no_word(
     assert key in daemon.get(f"/api/v1/jobs/{job['id']}/result").json()["answer"]
 
 
-def test_positions_of_an_arm_at_rest_are_told_while_they_are_read(daemon: Asked, arm: str, tmp_path: Path) -> None:
+def test_positions_of_an_arm_at_rest_are_reported_while_they_are_read(daemon: Asked, arm: str, tmp_path: Path) -> None:
     job = daemon.begin({"kind": "watch", "arm": arm, "seconds": 0.5})
     assert daemon.follow(job["id"])["state"] == "done"
     row = rows.known_job(daemon.service.db, job["id"])
@@ -240,9 +240,9 @@ def test_positions_of_an_arm_at_rest_are_told_while_they_are_read(daemon: Asked,
     # A line that is being written is told when it is whole.
     log = (daemon.service.state / "jobs" / job["id"] / "log").read_bytes()
     (tmp_path / "log").write_bytes(log[:-10])
-    first, offset = told_samples(tmp_path, 0)
+    first, offset = printed_samples(tmp_path, 0)
     (tmp_path / "log").write_bytes(log)
-    rest, end = told_samples(tmp_path, offset)
+    rest, end = printed_samples(tmp_path, offset)
     assert (first, rest, end) == (told[:-1], told[-1:], len(log))
 
 

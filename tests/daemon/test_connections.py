@@ -124,7 +124,7 @@ def test_headers_bodies_and_idle_lines_have_a_time() -> None:
     book.end()
 
 
-def test_a_request_that_comes_before_the_last_one_is_told_of_keeps_its_time() -> None:
+def test_a_request_that_comes_before_the_last_one_is_reported_keeps_its_time() -> None:
     book = Book(8)
     assert book.come(NEAR, 0)
     book.headers_received((NEAR, 0), body=False)
@@ -276,7 +276,7 @@ def test_descriptors_are_raised_and_leave_a_reserve(monkeypatch: pytest.MonkeyPa
     assert len(given) == 1
 
 
-def test_the_doors_know_who_waits(daemon: Asked) -> None:
+def test_the_request_guard_knows_who_waits(daemon: Asked) -> None:
     book = daemon.app.user_middleware[0].kwargs["connections"]
     peer = ("127.0.0.1", 5)
     ours, theirs = socket.socketpair()

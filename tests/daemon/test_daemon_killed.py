@@ -140,7 +140,7 @@ def test_thirty_kills(state: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_an_arm_that_is_held_when_the_daemon_is_killed_is_told_of_and_let_down_by_the_next(
+def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_by_the_next(
     state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nothing of the next daemon waits for the process that holds the arm, but what needs the arm, and that says so."""

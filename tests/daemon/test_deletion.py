@@ -13,7 +13,7 @@ from daemon.conftest import Asked, known_arm, quick_text, serving
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
-from ident_service.daemon.web.arm_pages import ladder
+from ident_service.daemon.web.arm_pages import commissioning_workflow
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations import deletion
 from ident_service.operations.acceptance import accept
@@ -90,14 +90,14 @@ def test_the_page_of_the_arm_forgets_what_is_deleted(filled: Asked) -> None:
     arm = load_arm(
         filled.service.state / str(db.rows("SELECT folder FROM arms WHERE name = 'quick'")[0]["folder"]) / "arm.yaml"
     )
-    rungs = ladder(db, filled.service.state, arm)
-    assert (rungs.run, rungs.identified) == (FIRST, SECOND)
+    workflow = commissioning_workflow(db, filled.service.state, arm)
+    assert (workflow.run, workflow.identified) == (FIRST, SECOND)
     assert [one["kind"] for one in delete(filled, f"runs/{FIRST}")[1]["error"]["dependents"]] == ["identification"]
     assert delete(filled, f"runs/{SECOND}")[0] == 200
-    rungs = ladder(db, filled.service.state, arm)
-    assert (rungs.run, rungs.identified) == (FIRST, None)
+    workflow = commissioning_workflow(db, filled.service.state, arm)
+    assert (workflow.run, workflow.identified) == (FIRST, None)
     assert delete(filled, f"runs/{FIRST}?anyway=true")[0] == 200
-    assert ladder(db, filled.service.state, arm).run is None
+    assert commissioning_workflow(db, filled.service.state, arm).run is None
 
 
 def test_what_is_in_use_is_not_deleted(filled: Asked, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,7 +42,7 @@ def numbers(news: list[Any]) -> list[int]:
     return [one.number for one in news if one.number is not None]
 
 
-def test_what_happens_is_told_once_and_in_order(daemon: Asked, watch: EventPoller) -> None:
+def test_what_happens_is_reported_once_and_in_order(daemon: Asked, watch: EventPoller) -> None:
     db = daemon.service.db
     seen, late = watch.begin(None), watch.begin(None)
     watch.look()

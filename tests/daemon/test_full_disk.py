@@ -257,7 +257,7 @@ def wait_for(found: Callable[[], Any]) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is_held(small: Path) -> None:
+def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_reported_while_it_is_held(small: Path) -> None:
     state = small  # the log of the daemon lies beside it, on another disk
     checked_before(state, held_text())
     with daemon_process(state) as (_, client):
@@ -298,7 +298,7 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_told_while_it_is
 @pytest.mark.campaign
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_fault_of_an_arm_that_is_held_is_told_before_it_is_supported(
+def test_a_fault_of_an_arm_that_is_held_is_reported_before_it_is_supported(
     state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     late = "driver:\n  faults: [{kind: late_cycle, at: 100, duration: 1, size: 0.006}]\n"

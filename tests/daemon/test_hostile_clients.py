@@ -103,7 +103,7 @@ def test_answers_that_strangers_do_not_read_keep_nobody_out() -> None:
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_the_doors_know_who_does_not_read(state: Path, known: bool) -> None:
+def test_the_request_guard_knows_who_does_not_read(state: Path, known: bool) -> None:
     book = Book(8)
     with serving(state) as daemon:
         daemon.app.user_middleware[0].kwargs["connections"] = book

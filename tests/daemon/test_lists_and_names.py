@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from daemon.conftest import Asked, quick_text
-from daemon.test_doors_shut import refusal
+from daemon.test_access_control import refusal
 
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database, audit_log, note

@@ -88,7 +88,7 @@ def test_rules_say_who_is_told_and_what_to_do() -> None:
             assert label in rule["expr"] or "ident_arm_" in rule["expr"], rule["alert"]
 
 
-def test_prometheus_finds_the_rules_and_the_door() -> None:
+def test_prometheus_finds_the_rules_and_the_service() -> None:
     document = yaml.safe_load((FOLDER / "prometheus.yml").read_text(encoding="utf-8"))
     assert [(FOLDER / name).is_file() for name in document["rule_files"]] == [True]
     (job,) = document["scrape_configs"]

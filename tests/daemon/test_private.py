@@ -204,7 +204,7 @@ def test_a_stop_by_root_stops_and_leaves_the_owner_what_it_writes(anothers: Path
 
 @pytest.mark.slow
 @as_root
-def test_the_closed_folder_of_another_user_is_told_in_words(
+def test_the_closed_folder_of_another_user_is_reported_in_words(
     anothers: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     reaching = (("stop",), ("stop", "planar2"), ("pause", "planar2"), ("jobs", "list"))

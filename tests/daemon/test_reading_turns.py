@@ -330,7 +330,7 @@ def test_a_request_that_raises_while_it_waits_for_its_turn_ends_its_connection()
     assert errors == []  # no traceback for a mistake of a client's
 
 
-def test_a_torn_request_is_told_once_and_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_torn_request_is_reported_once_and_without_a_traceback(caplog: pytest.LogCaptureFixture) -> None:
     async def ask() -> bytes:
         async with served(digest) as port, asyncio.timeout(SOON):
             read, write = await asyncio.open_connection("127.0.0.1", port)

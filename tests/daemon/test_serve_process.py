@@ -136,7 +136,7 @@ def test_a_manager_hears_ready_alive_and_stopping(state: Path, tmp_path: Path) -
             assert process.wait(60) == 0
 
 
-def test_without_a_manager_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_manager_nothing_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     notify_systemd("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere/at/all")
@@ -166,7 +166,7 @@ def test_what_would_be_open_is_not_served(
     assert not (state / "token").exists()
 
 
-def test_tls_that_cannot_be_spoken_is_said_before_anything_begins(
+def test_tls_that_cannot_be_spoken_is_stated_before_anything_begins(
     state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def made(name: str, *more: str) -> tuple[Path, Path]:
@@ -255,7 +255,7 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     assert door(folder, {"folder": str(folder), "words": words})[0] == 2
 
 
-def test_a_child_behind_a_door_is_told_and_heard(tmp_path: Path) -> None:
+def test_a_child_behind_a_socket_is_commanded_and_read(tmp_path: Path) -> None:
     path, folder = tmp_path / "door", tmp_path / "job"
     folder.mkdir()
     with pytest.raises(UsageError, match=r"ident-motion\.socket"):

@@ -66,7 +66,7 @@ def test_a_stop_and_what_is_read_do_not_wait_for_who_writes(daemon: Asked, state
     assert max(line["at"] for line in lines) - min(line["at"] for line in lines) < SOON
 
 
-def test_a_stop_of_no_arm_is_told_so_and_no_look_up_refuses_one(
+def test_a_stop_of_no_arm_is_reported_and_no_look_up_refuses_one(
     daemon: Asked, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answer = daemon.post("/api/v1/arms/none/stop")

@@ -84,10 +84,10 @@ def test_what_is_left_open_is_little(units: Path, name: str) -> None:
     assert float(found[1]) <= EXPOSURE[name], said
 
 
-def test_the_daemon_can_reach_the_door_of_motions() -> None:
+def test_the_daemon_can_reach_the_socket_of_motions() -> None:
     socket, daemon = ((UNITS / name).read_text(encoding="utf-8") for name in ("ident-motion.socket", "ident.service"))
-    (door,) = re.findall(r"^ListenStream=(.+)$", socket, re.M)
-    assert f"--motion-door {door}" in daemon
+    (path,) = re.findall(r"^ListenStream=(.+)$", socket, re.M)
+    assert f"--motion-socket {path}" in daemon
     # The manager makes the folder as root: who is to go through needs the right of others.
     (mode,) = re.findall(r"^DirectoryMode=(.+)$", socket, re.M)
     assert int(mode, 8) & 0o001

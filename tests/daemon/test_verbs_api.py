@@ -1,4 +1,4 @@
-"""Verbs over the API that are no steps of the ladder: what each does, and what it refuses."""
+"""Verbs over the API that are no steps of the commissioning workflow: what each does, and what it refuses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from daemon.conftest import Asked, quick_text, serving
-from daemon.test_doors_shut import refusal
+from daemon.test_access_control import refusal
 from daemon.verbs_bench import ON_A_BUS, answered, on_a_bus, singular_copy, unstable_text, with_arms, with_run
 
 from ident_service.daemon.jobs.commands import command

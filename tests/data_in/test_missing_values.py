@@ -37,7 +37,7 @@ def written(folder: Path, lost: set[int], rows: int = 1500) -> Path:
     return path
 
 
-def test_a_missing_value_is_refused_with_the_way_out(tmp_path: Path) -> None:
+def test_a_missing_value_is_refused_with_the_remedy(tmp_path: Path) -> None:
     for row, said in ((5, "''"), (6, "nan"), (8, "' NA'")):
         path = written(tmp_path, {row})
         with pytest.raises(RecordingError, match=rf"line {row + 2}\b.*{said}.*recording\.missing: skip leaves such"):

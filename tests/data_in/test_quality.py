@@ -126,7 +126,9 @@ def test_what_is_trimmed_is_not_judged() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [4096, 1, 50])
-def test_stamps_of_arrival_are_told_from_stamps_of_sampling(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stamps_of_arrival_are_distinguished_from_stamps_of_sampling(
+    samples: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     taken = moving(jittered(500, 1_000_000, 0.3))
     arrived = moving(MILLISECONDS[:500])
     arrived.block.stamp_ns[:] = taken.block.stamp_ns

@@ -125,7 +125,7 @@ def test_one_file_to_fit_and_to_validate(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 3e-4])
-def test_standstill_at_the_ends_is_left_out_and_said(tmp_path: Path, noise: float) -> None:
+def test_standstill_at_the_ends_is_left_out_and_stated(tmp_path: Path, noise: float) -> None:
     path = written(tmp_path / "run.csv", still=(700, 460), noise=noise)
     said: list[str] = []
     found = identify_files(Request(described(tmp_path), (path,), cut_standstill=True), tmp_path / "out", said.append)

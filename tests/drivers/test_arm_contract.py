@@ -353,7 +353,7 @@ def test_what_zeroing_says_does_not_depend_on_the_arm_being_open(bench, request)
 
 
 @pytest.mark.parametrize("backend", ["relative", "pucks"])
-def test_a_position_is_told_only_by_an_arm_that_knows_it(backend):
+def test_a_position_is_reported_only_by_an_arm_that_knows_it(backend):
     bench = canopen(config=relative_config()) if backend == "relative" else pucks(zeroed=False)
     for act in (bench.arm.open, bench.arm.look().open):
         with pytest.raises(PositionUnknown):

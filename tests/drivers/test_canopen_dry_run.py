@@ -58,7 +58,7 @@ def test_a_dry_run_tells_exactly_what_opening_writes(name: str) -> None:
     assert len(places(told)) > 20
 
 
-def test_every_change_is_told_with_both_values() -> None:
+def test_every_change_is_reported_with_both_values() -> None:
     config = arm_of("maxon_epos4_50-8_0110h.eds")
     found = planned(Bench(config), config)
     text = planned_text(config, found)
@@ -72,7 +72,7 @@ def test_every_change_is_told_with_both_values() -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_drive_that_would_be_refused_is_told_so(name: str) -> None:
+def test_a_drive_that_would_be_refused_is_reported(name: str) -> None:
     config = arm_of(name, measured_torque="none")
     found = planned(Bench(config), config)
     assert places(found) == []

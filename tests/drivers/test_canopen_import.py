@@ -144,7 +144,7 @@ def test_opening_never_stores() -> None:
         assert not [one for one in written if one[1] in (0x1010, 0x1011)]
 
 
-def test_a_zero_that_must_be_lost_with_power_is_not_stored_and_what_is_lacking_is_told() -> None:
+def test_a_zero_that_must_be_lost_with_power_is_not_stored_and_what_is_lacking_is_reported() -> None:
     config = weightless_config()
     bench = Bench(config)
     objects = bench.behind.emulator.faces[1].objects  # type: ignore[attr-defined]

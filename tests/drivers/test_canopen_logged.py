@@ -11,14 +11,14 @@ import can
 import numpy as np
 import pytest
 from contract_bench import bench_config
-from test_canopen_looking import Bench
+from helpers.replay import ReplayLink, read_session
+from test_canopen_monitoring import Bench
 
 from drivers.arm import Arm, Sample, StopKind
 from drivers.axis_status import AxisStatus
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.canopen.driver import CanopenArm
-from drivers.canopen.replay import ReplayLink, read_session
 from drivers.clock import VirtualClock
 from ident_service.errors import DriverError
 from sim_backend.arm import from_config

@@ -78,7 +78,7 @@ def test_drives_with_a_torque_mode_say_what_they_can(name: str) -> None:
 
 
 @needs_sheets
-def test_what_is_told_of_an_epos4_is_what_its_makers_files_say() -> None:
+def test_what_is_reported_of_an_epos4_is_what_its_makers_files_say() -> None:
     config = arm_of("maxon_epos4_50-8_0110h.eds")
     (first, _) = bus_probe(config, (), Bench(config).links).probed  # type: ignore[arg-type]
     assert first.can is not None
@@ -113,7 +113,7 @@ def test_a_drive_without_torques_that_takes_positions_is_told_how() -> None:
     assert "what helps:\n  speedy.eds: positions can be streamed: `driver: {streams: position, ...}` at 100" in told
 
 
-def test_a_more_trusted_watchdog_and_further_axes_are_told_of() -> None:
+def test_a_more_trusted_watchdog_and_further_axes_are_reported() -> None:
     text = EDS + "".join(f"\n[{index}]\nDataType=6\nAccessType=ro\n" for index in ("6841", "7041"))
     config = arm_of("", text=text, torque_frames="shared", drive={"watchdog": "heartbeat"})
     told = probed(Bench(config), config)
@@ -200,7 +200,7 @@ def test_the_command_judges_files_without_a_bus(tmp_path: Path, capsys: pytest.C
 
 @needs_sheets
 @pytest.mark.parametrize("name", [*CAPABLE, *REFUSED])
-def test_a_file_that_is_cut_off_is_told_to_be_so(name: str) -> None:
+def test_a_file_that_is_cut_off_is_reported(name: str) -> None:
     text, config = sheet(name)["text"], weightless_config()
     assert data_sheet(text).cut_off == ""
     for percent in (20, 50, 95):
@@ -386,14 +386,14 @@ def test_the_command_probes_a_bus_of_python_can(tmp_path: Path, capsys: pytest.C
 
 
 @needs_sheets
-def test_a_drive_that_cannot_keep_a_zero_is_told_so() -> None:
+def test_a_drive_that_cannot_keep_a_zero_is_reported() -> None:
     config = arm_of("maxon_epos4_50-8_0110h.eds")
     at_home = config.model_copy(update={"driver": config.driver.model_copy(update={"zero": "at_home"})})  # type: ignore[union-attr]
     text = probed(Bench(config), at_home)
     assert "to change       driver.zero: at_home: it has no 1020h" in text
 
 
-def test_what_a_probe_found_is_kept_and_what_differs_is_told(tmp_path: Path) -> None:
+def test_what_a_probe_found_is_kept_and_what_differs_is_reported(tmp_path: Path) -> None:
     path, can = tmp_path / "arms" / "a" / "drives.json", {"identity": {"vendor": 1}, "mode": 10, "asked": True}
     drive = {"title": "drive 1", "node": 3, "silent": "", "can": can}
     assert keep_outcome(path, {"drives": [drive]}) == []

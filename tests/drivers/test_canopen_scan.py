@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from contract_bench import canopen_config
-from test_canopen_looking import Bench, Tap
+from test_canopen_monitoring import Bench, Tap
 
 from drivers.arm import StopKind
 from drivers.can.can_frame import Frame
@@ -74,7 +74,7 @@ def test_drives_that_were_just_powered() -> None:
     assert "     1  1     configured       switch on disabled          sends no heartbeat\n" in text
 
 
-def test_errors_and_nmt_states_are_told_in_words() -> None:
+def test_errors_and_nmt_states_are_reported_in_words() -> None:
     bench = Bench()
     with bench.arm as arm:
         arm.enable()
@@ -200,7 +200,7 @@ class Late(Tap):
         return super().receive(deadline_ns)
 
 
-def test_a_slow_node_is_asked_again_and_what_it_refuses_is_said() -> None:
+def test_a_slow_node_is_asked_again_and_what_it_refuses_is_stated() -> None:
     bench = Bench()
     found = bus_scan(bench.config, lambda _: [Late(bench.behind.link(0), bench.sent)])
     line = found.lines[-1]

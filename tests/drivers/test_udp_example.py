@@ -127,7 +127,7 @@ def test_the_examples_controller_lets_go_of_an_arm_whose_host_is_silent(controll
         assert words[-1] == AxisStatus.WATCHDOG
 
 
-def test_a_controller_that_falls_silent_ages_and_one_that_is_not_there_is_told(controller: Controller) -> None:
+def test_a_controller_that_falls_silent_ages_and_one_that_is_not_there_is_reported(controller: Controller) -> None:
     arm = example().from_config(config(controller.port))
     with arm:
         controller.mute = True

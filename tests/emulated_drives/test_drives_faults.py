@@ -87,7 +87,7 @@ def test_a_frozen_and_a_mirrored_encoder(enabled: Host) -> None:
     assert enabled.cycle(200, 0)[1] == pytest.approx(-true_counts(enabled)[0], abs=1)
 
 
-def test_torque_with_the_wrong_sign_is_told_with_the_right_one(enabled: Host) -> None:
+def test_torque_with_the_wrong_sign_is_reported_with_the_right_one(enabled: Host) -> None:
     inject(enabled, "torque_sign joint=elbow")
     enabled.cycle(100, 100)
     assert [m.torque for m in enabled.arm.emulator.body.motors] == pytest.approx([0.1, -0.1])
@@ -105,7 +105,7 @@ def test_stuck_torque(enabled: Host) -> None:
             enabled.cycle(50, 50)
 
 
-def test_saturation_is_told(enabled: Host) -> None:
+def test_saturation_is_reported(enabled: Host) -> None:
     inject(enabled, "torque_saturation joint=elbow size=0.01")
     enabled.cycle(1000, 1000)
     assert [enabled.read(n, 0x6077, 0, "h") for n in (1, 2)] == [1000, 300]

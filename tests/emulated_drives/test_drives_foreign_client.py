@@ -137,7 +137,7 @@ def test_heartbeat_emergency_and_fault_reset(bus: Bus) -> None:
     assert node.emcy.wait(0x0000, 2.0).register == 0
 
 
-def test_an_unknown_interface_is_said_so(tmp_path: Path) -> None:
+def test_an_unknown_interface_is_reported(tmp_path: Path) -> None:
     config = drives_config(tmp_path, buses=[{"interface": "no_such_interface"}])
     with pytest.raises(OSError, match="bus 0: no_such_interface can0"):
         emulate(config, seconds=0.01)

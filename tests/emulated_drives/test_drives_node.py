@@ -60,7 +60,7 @@ def test_a_stopped_node_does_not_serve(host: Host) -> None:
     assert host.listen(10) == []
 
 
-def test_a_lost_heartbeat_is_told_acted_on_and_forgiven(enabled: Host) -> None:
+def test_a_lost_heartbeat_is_reported_acted_on_and_forgiven(enabled: Host) -> None:
     for node in (1, 2):
         assert enabled.write(node, 0x1016, 1, "I", HOST << 16 | 50) == 0
     # Awaiting begins with the first one heard; what does not move has nothing to stop.

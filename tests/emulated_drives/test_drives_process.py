@@ -196,7 +196,7 @@ def test_a_fault_and_an_interface_are_checked_before_anything_runs(
 
 
 @pytest.mark.slow
-def test_what_to_type_meanwhile_is_said_at_the_beginning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_to_type_meanwhile_is_stated_at_the_beginning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Pucks answer no `bus scan`, and the drives have gone when the command ends."""
     arm, wire = tmp_path / "my wam.yaml", f"begin-{tmp_path.name}-{os.getpid()}"
     section = f"driver: {{kind: barrett, bus: {{interface: ident_wire, channel: {wire}}}}}\n"

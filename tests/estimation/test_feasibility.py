@@ -357,7 +357,7 @@ def test_conditions_that_contradict_each_other_are_a_no_and_a_typed_error() -> N
         feasibility_correction(np.array([1.0]), base, conditions)
 
 
-def test_shapes_and_names_are_checked_at_the_door() -> None:
+def test_shapes_and_names_are_checked_on_entry() -> None:
     base, conditions = contradiction()
     with pytest.raises(ParameterError, match=r"beta\.shape=\(2,\) but there are 1 base parameters"):
         feasibility_test(np.zeros(2), base, conditions)

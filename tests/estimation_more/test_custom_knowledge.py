@@ -19,13 +19,12 @@ from ident_service.config.arm import Constraints
 from ident_service.config.load import arm_from_json, load_arm
 from ident_service.errors import ConfigError, UsageError
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
-from ident_service.estimation.feasible.convex import available_solvers, convex_least_squares
+from ident_service.estimation.feasible.convex import available_solvers, convex_least_squares, second_opinion
 from ident_service.estimation.feasible.feasible_set import feasible_set
 from ident_service.estimation.feasible.priors import Prior
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.least_squares import ordinary_least_squares
-from ident_service.estimation.second_opinion import second_opinion
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.operations.identification import Request, identify_files
@@ -320,7 +319,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("module", WRONG)
-def test_what_is_wrong_is_said_in_one_sentence_with_its_place(setting: Setting, tmp_path: Path, module: str) -> None:
+def test_what_is_wrong_is_stated_in_one_sentence_with_its_place(setting: Setting, tmp_path: Path, module: str) -> None:
     code, words = WRONG[module]
     arm = written(tmp_path, module, code)
     with pytest.raises(ConfigError, match=words) as refused:

@@ -252,7 +252,7 @@ def test_presliding_and_stribeck_velocity_are_found() -> None:
     assert np.all(worse > 1.2 * left(fitted))
 
 
-def test_friction_that_is_not_there_is_left_out_and_said() -> None:
+def test_friction_that_is_not_there_is_left_out_and_stated() -> None:
     bare, _, delta = rubbing(plain_friction(presliding=0.0), TERMS[:4])
     recording = rubbed(bare, delta, np.zeros(2))
     left_out = rubbing(plain_friction(presliding=0.0, stribeck_velocity=NO_STRIBECK))[0]
@@ -398,7 +398,7 @@ def test_two_deviations_are_95_percent_where_few_reversals_tell_the_shape(
 
 
 @pytest.mark.slow
-def test_a_shape_told_by_few_reversals_has_few_degrees_of_freedom() -> None:
+def test_a_shape_shown_by_few_reversals_has_few_degrees_of_freedom() -> None:
     model, base, delta = rubbing(FIT)
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
     names = [base.names[column] for column in base.base]
@@ -439,7 +439,7 @@ def test_friction_that_is_not_there_adds_no_doubt_of_its_shape() -> None:
     assert np.isinf(added.degrees).all()
 
 
-def test_a_number_at_the_end_of_its_search_is_said() -> None:
+def test_a_number_at_the_end_of_its_search_is_stated() -> None:
     shape = plain_friction(presliding=(0.05, 0.01), stribeck_velocity=(0.8, 0.02))
     assert at_search_bounds(shape, ("shoulder", "elbow"), ("coulomb", "stribeck")) == (
         "shoulder: its pre-sliding distance of 0.05 is the largest that is searched",

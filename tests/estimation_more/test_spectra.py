@@ -47,7 +47,7 @@ def test_noise_lowers_the_cut_off_to_where_it_is_a_few_percent_of_the_accelerati
     assert cutoffs[1] > cutoffs[2] > cutoffs[3] >= 1.0
 
 
-def test_noise_that_the_filter_passes_is_told_with_the_way_out() -> None:
+def test_noise_that_the_filter_passes_is_reported_with_the_remedy() -> None:
     model = arm_model(load_arm("planar2"))
 
     def told(recording: SampledRecording, **smoothing: object) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Workspace
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.limit_proof import certified_along, certified_clearance, posture_clearance
+from ident_service.excitation.limit_proof import certified_along, certified_clearance
 from ident_service.excitation.trajectory import FourierPath, FourierSeries, Path, PosturePath
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.capsule_distances import CapsuleModel
@@ -75,7 +75,6 @@ def test_without_pairs_everything_is_clear(wam7: ArmModel) -> None:
     clear = certified_clearance(collision, excitation(wam7, "identification").path, 1.0)
     assert clear.proven
     assert (clear.lower_bound, clear.pair, clear.time) == (np.inf, None, None)
-    assert posture_clearance(collision, np.zeros(7)) == (np.inf, None)
 
 
 @pytest.mark.parametrize("name", ["wam7", "planar2", "threelink"])
@@ -86,12 +85,6 @@ def test_the_shipped_motions_keep_clear(name: str, purpose: Any) -> None:
         CollisionModel(model), excitation(model, purpose).path, model.config.workspace.clearance
     )
     assert clear.proven
-
-
-def test_a_posture_has_its_closest_pair() -> None:
-    distance, pair = posture_clearance(swinging(-1.0), np.array([-0.5]))
-    assert distance == pytest.approx(0.9 - np.sin(0.5))
-    assert pair == "j1 - obstacle floor"
 
 
 def test_a_sliding_joint_without_limits_proves_nothing() -> None:
@@ -194,7 +187,7 @@ def test_a_crossing_between_samples_is_not_missed(seed: int, frequency: float, r
 
 
 @given(seed=st.integers(0, 2**32 - 1), ways=st.integers(1, 3))
-def test_a_crossing_on_the_way_between_postures_is_not_missed(seed: int, ways: int) -> None:
+def test_a_crossing_on_the_segment_between_postures_is_not_missed(seed: int, ways: int) -> None:
     rng = np.random.default_rng(seed)
     path = PosturePath(
         rng.normal(size=(ways + 1, 1)), rng.uniform(0.01, 0.3, size=ways), float(rng.choice([0.0, 0.013]))

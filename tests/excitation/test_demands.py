@@ -212,7 +212,7 @@ def test_seeded_motions_use_their_share_of_the_limits(seed: int, harmonics: int,
     assert asked.violations(model.chain.names, roomy) == []
 
 
-def test_an_arm_too_weak_for_its_own_weight_is_told_so() -> None:
+def test_an_arm_too_weak_for_its_own_weight_is_reported() -> None:
     config = load_arm("planar2").model_dump(by_alias=True)
     config["joints"]["shoulder"]["torque"] = 1.0
     with pytest.raises(MotionRefused, match="gravity alone asks for more than 70%"):

@@ -117,7 +117,7 @@ def test_nor_in_the_ramps(seed: int) -> None:
 @pytest.mark.slow
 @settings(max_examples=4)
 @given(seed=SEEDS)
-def test_nor_on_ways_between_postures(seed: int) -> None:
+def test_nor_on_segments_between_postures(seed: int) -> None:
     model = random_arm(seed, 2)
     path = random_posture_path(seed, 2)
     assert_bounds(demands(path, model), sampled(path, model, 1000))

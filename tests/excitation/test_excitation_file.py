@@ -179,7 +179,7 @@ def test_every_mistake_in_a_fourier_motion_is_named(place: tuple[Any, ...], valu
         (("dwell",), ..., "'dwell' is missing"),
     ],
 )
-def test_every_mistake_in_ways_between_postures_is_named(place: tuple[Any, ...], value: Any, message: str) -> None:
+def test_every_mistake_in_segments_between_postures_is_named(place: tuple[Any, ...], value: Any, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         excitation_from_json(json.dumps(mutilated(content_of(2), place, value)))
 

@@ -49,7 +49,7 @@ def rows_at_the_recording_s_rate(path: FourierPath, base: BaseParameters = BASE)
     return np.concatenate([rows.T / sigma for rows, sigma in zip(H, NOISE.deviation, strict=True)])
 
 
-def test_least_squares_estimates_scatter_as_told() -> None:
+def test_least_squares_estimates_scatter_as_predicted() -> None:
     W, rng, replicates = rows_at_the_recording_s_rate(PATH), np.random.default_rng(0), 1000
     solve = np.linalg.pinv(W)
     errors = solve @ rng.normal(size=(len(W), replicates))

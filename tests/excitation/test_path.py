@@ -55,7 +55,7 @@ def test_the_bound_of_the_fifth_derivative_is_reached_by_a_single_sine() -> None
     np.testing.assert_allclose(path.crackle, [0.3 * rate**5], rtol=1e-12)
 
 
-def test_the_bound_of_the_fifth_derivative_is_reached_where_a_way_begins() -> None:
+def test_the_bound_of_the_fifth_derivative_is_reached_where_a_segment_begins() -> None:
     path = PosturePath(np.array([[0.0, 0.0], [1.0, -2.0]]), np.array([2.0]), 0.0)
     np.testing.assert_allclose(path.crackle, np.array([1.0, 2.0]) * 10080.0 / 2.0**5, rtol=1e-12)
 
@@ -145,7 +145,7 @@ def test_every_posture_is_visited_at_rest_for_the_dwell(seed: int, postures: int
 
 @settings(max_examples=60)
 @given(seed=SEEDS, share=st.floats(0.0, 1.0))
-def test_ways_between_postures_are_straight(seed: int, share: float) -> None:
+def test_segments_between_postures_are_straight(seed: int, share: float) -> None:
     path = random_posture_path(seed, joints=3, postures=2)
     position, velocity, *_ = path.at(path.dwell + share * path.times[0])
     way = path.points[1] - path.points[0]
@@ -188,7 +188,7 @@ def test_what_is_no_repetition_is_refused(periods: int, ramp: float) -> None:
         (np.zeros((3, 2)), np.array([1.0, np.nan])),
     ],
 )
-def test_ways_that_do_not_belong_to_postures_are_refused(points: Array, times: Array) -> None:
+def test_segments_that_do_not_belong_to_postures_are_refused(points: Array, times: Array) -> None:
     with pytest.raises(ModelError, match="do not belong to one motion"):
         PosturePath(points, times, 0.0)
 

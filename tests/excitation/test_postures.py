@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.excitation.design import complete_task, family
+from ident_service.excitation.design import complete_task, family, safe_posture
 from ident_service.excitation.optimal_design import Problem, usable_limits
-from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import within_limits
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel

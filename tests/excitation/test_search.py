@@ -13,9 +13,8 @@ import pytest
 from design_bench import quick, small
 
 from ident_service.errors import UsageError
-from ident_service.excitation.design import complete_task, design_motion, family
+from ident_service.excitation.design import complete_task, design_motion, family, safe_posture
 from ident_service.excitation.optimal_design import Problem
-from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import Budget, Progress, SearchResult, search, within_limits
 
 GRID = 60
@@ -184,7 +183,7 @@ def test_work_is_counted_in_one_process_only() -> None:
 
 
 @pytest.mark.slow
-def test_progress_is_told() -> None:
+def test_progress_is_reported() -> None:
     found, told = searched(3)
     assert [progress.phase for progress in told] == ["starts"] * 3 + ["polish"] * 3
     assert [progress.finished for progress in told][-1] == found.finished == 3

@@ -22,12 +22,18 @@ from ident_service.excitation.active_limits import (
     stiffer_gains,
 )
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import complete_task, criterion_of, design_motion, family, per_period
+from ident_service.excitation.design import (
+    Prover,
+    complete_task,
+    criterion_of,
+    design_motion,
+    family,
+    per_period,
+    safe_posture,
+)
 from ident_service.excitation.limit_proof import certified_clearance, proof_of, scale_to_verified, violations
-from ident_service.excitation.mending import Prover
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import Problem, Task
-from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import Candidate, local_search, random_variables
 from ident_service.excitation.tracking import cases, segment_tube_width, track
 from ident_service.excitation.trajectory import FourierPath, PosturePath
@@ -272,7 +278,7 @@ def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller
     assert not violations(mended.result[1], model, task.limits)
 
 
-def test_the_parts_of_a_long_way_show_the_error_of_the_whole() -> None:
+def test_the_parts_of_a_long_segment_show_the_error_of_the_whole() -> None:
     model = small(joints={"elbow": {"velocity": 0.1}})
     path = PosturePath(np.array([[0.0, 0.0], [0.6, 0.5], [0.0, 0.0]]), np.array([9.0, 11.0]), 0.0)
     whole = track(path, model, 0.2).error

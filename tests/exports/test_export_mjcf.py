@@ -130,7 +130,7 @@ def test_names_with_markup_come_back() -> None:
     assert_same(found, torque_of(arm, states, ("drive_inertia", "viscous")))
 
 
-def test_what_the_format_lacks_is_said_in_the_file_and_in_the_answer() -> None:
+def test_what_the_format_lacks_is_stated_in_the_file_and_in_the_answer() -> None:
     arm = true_arm("threelink")
     text, lost = mjcf_export(arm.model, arm.delta, "arm.xml")  # type: ignore[arg-type]
     assert lost == ("torque offset (fo) of every joint", "velocity limits")

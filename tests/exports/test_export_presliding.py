@@ -99,7 +99,7 @@ def test_a_header_that_turns_otherwise_is_refused(monkeypatch: pytest.MonkeyPatc
         c_header(arm)
 
 
-def test_what_has_no_state_says_so_and_tables_have_the_ways() -> None:
+def test_what_has_no_state_says_so_and_tables_have_the_presliding_lengths() -> None:
     arm = with_ways("planar2")
     made = {one.format: one for one in export_texts(arm, ["urdf", "mjcf", "sdf", "json", "csv", "c"])}
     way = "pre-sliding of dry friction (distance: shoulder 0.01 rad): here it reverses at once"
@@ -132,7 +132,7 @@ def test_arms_without_it_have_no_word_of_it() -> None:
     np.testing.assert_array_equal(model.friction(dq, model.turned(still, dq)), model.friction(dq))
 
 
-def test_the_ways_of_a_parameter_file_go_into_the_model(tmp_path: Path) -> None:
+def test_the_presliding_lengths_of_a_parameter_file_go_into_the_model(tmp_path: Path) -> None:
     arm = with_ways("planar2")
     assert arm.delta is not None
     content = {

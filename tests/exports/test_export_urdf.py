@@ -368,7 +368,7 @@ def test_bodies_move_as_pinocchio_moves_them() -> None:
     np.testing.assert_allclose(moved(body, rotation, translation)[[9, 6, 7, 8, 0, 1, 3, 2, 4, 5]], there, atol=1e-12)
 
 
-def test_what_is_no_body_is_told_from_what_is() -> None:
+def test_what_is_no_body_is_distinguished_from_what_is() -> None:
     body = random_body(np.random.default_rng(3))
     assert is_real(body)
     assert is_real(moved(body, np.eye(3), np.array([100.0, 0.0, 0.0])))

@@ -115,7 +115,7 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_all_formats_are_written_and_what_they_lack_is_said(
+def test_all_formats_are_written_and_what_they_lack_is_stated(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code_of("export", run, "--out", tmp_path / "out") == 0

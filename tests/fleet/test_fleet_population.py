@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.fleets import Kind, kind, write_recording
+from helpers.fleets import Kind, held_out_errors, kind, write_recording
 
 from ident_service import __version__
 from ident_service.estimation.least_squares import ordinary_least_squares, torque_error
@@ -24,7 +24,6 @@ from ident_service.fleet.population import (
     HeldOut,
     Population,
     arm_fit,
-    held_out_errors,
     pooled_fit,
     population,
     unlike,
@@ -297,7 +296,7 @@ def test_factors_that_are_gone_are_named(fleet: dict[str, list[Row]], tmp_path: 
         store.write(f"factors/{key}.npz", Path(STORE.url, "factors", f"{key}.npz").read_bytes())
     found = arm_results.arm_fits(Leaves.of(keys), DESCRIBED, store, np.zeros(DESCRIBED.base.size))
     assert found == (keys[0],)
-    assert arm_results.fits_told(found) == (keys[0],)
+    assert arm_results.reported_fits(found) == (keys[0],)
 
 
 def test_pooling_is_judged_by_its_gain() -> None:

@@ -133,7 +133,7 @@ def test_a_change_that_makes_no_torque_is_no_alarm() -> None:
     assert not found.changed
 
 
-def test_a_slow_drift_is_found_and_told_from_a_step() -> None:
+def test_a_slow_drift_is_found_and_distinguished_from_a_step() -> None:
     """Find a drift that no single date shows: from week to week it is less than the noise."""
     values = fleet(5)
     for week in range(COUNT):

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
-from helpers.fleets import BEGIN, WEEK, DrawnRecording, Kind, kind, write_recording
+from helpers.fleets import BEGIN, WEEK, DrawnRecording, Kind, held_out_errors, kind, write_recording
 
 from ident_service.estimation.least_squares import torque_error
 from ident_service.fleet.factor import Described, Merged, Settled, _reduced, merge, settle, unpacked
@@ -23,7 +23,6 @@ from ident_service.fleet.identify import identify_fleet
 from ident_service.fleet.population import (
     ArmFit,
     arm_fit,
-    held_out_errors,
     population,
     variance_shares,
 )

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ident_service.config.load import load_arm
+from ident_service.fleet.factor import Described, Merged
+from ident_service.fleet.population import ArmFit, error_on, pooled_fit
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.chain import Array
@@ -308,3 +310,11 @@ def _add_rows(
         if begin < count:
             library.flush()
             writer._chunk_start_ns, writer._chunk_bytes = int(stamps[begin]), 0
+
+
+def held_out_errors(
+    alone: ArmFit, unseen: Merged, prior: tuple[Array, Array, Array], scale: Array, described: Described
+) -> tuple[float, float]:
+    """Torque errors of an arm alone and pooled on recordings that it was not fitted to [percent]."""
+    pooled = pooled_fit(alone, prior, scale)
+    return error_on(unseen, alone.fit, described), error_on(unseen, pooled, described)

@@ -174,7 +174,7 @@ def test_a_person_asks_by_the_command_and_a_drier_joint_is_found(
 @pytest.mark.parametrize(
     "step", ["run", *(pytest.param(step, marks=pytest.mark.campaign) for step in ("check", "identify"))]
 )
-def test_a_kill_in_the_midst_is_told_and_nothing_moves_by_itself(accepted: str, state: Path, step: str) -> None:
+def test_a_kill_in_the_midst_is_reported_and_nothing_moves_by_itself(accepted: str, state: Path, step: str) -> None:
     path = "/api/v1/reidentifications"
     with daemon_process(state) as (process, client):
         client.post("/api/v1/arms", {"description": description(seed=34), "replace": True})

@@ -132,7 +132,7 @@ def test_an_arm_without_geometry_has_no_distances(wam7: ArmModel) -> None:
     np.testing.assert_array_equal(fast.pull(np.zeros((0, 3))), np.zeros((3, 7)))
 
 
-def test_shapes_are_checked_at_the_door(wam7: ArmModel) -> None:
+def test_shapes_are_checked_on_entry(wam7: ArmModel) -> None:
     fast = CapsuleModel(wam7)
     with pytest.raises(ModelError, match="does not belong to the last distances"):
         fast.pull(np.zeros((27, 3)))

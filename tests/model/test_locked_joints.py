@@ -346,7 +346,7 @@ def test_an_export_keeps_the_whole_tree() -> None:
             assert exported.inertias[k].isApprox(original.inertias[k])
 
 
-def test_a_locked_link_without_inertia_is_told_apart() -> None:
+def test_a_locked_link_without_inertia_is_distinguished() -> None:
     model = arm(PANDA, tip="panda_hand")
     assert model.prior is not None
     delta = model.prior.copy()

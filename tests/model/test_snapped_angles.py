@@ -50,7 +50,9 @@ def base_of(path: Path) -> BaseParameters:
     return base_parameters(model.chain, model.layout)
 
 
-def test_rounded_angles_are_told_and_snapped(exact: Path, rounded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rounded_angles_are_reported_and_snapped(
+    exact: Path, rounded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     right, faint = base_of(exact), base_of(rounded)
     assert faint.size > right.size
     assert remarks_on_angles(right) == ()

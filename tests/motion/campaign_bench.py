@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from helpers.local_commands import LocalCommands
 from motion_bench import Story, WatchedArm, bench_config
 
 from ident_service.config.arm import ArmConfig
@@ -25,7 +26,6 @@ from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.urdf import urdf_text
-from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import Sink, run
 from ident_service.motion.safety_monitor import MAX_AGE

@@ -11,7 +11,7 @@ from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import MotionRefused
 from ident_service.excitation.trajectory import FourierPath, FourierSeries, PosturePath
 from ident_service.motion.sequencer import Paused
-from ident_service.motion.speed_scaling import ScaledMotion, SpeedChange
+from ident_service.motion.speed_scaling import ScaledMotion
 from ident_service.motion.stop_trajectory import after, stop
 from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest
 
@@ -69,12 +69,9 @@ def random_reference(rng: np.random.Generator, limits: MotionLimits, path: Motio
     """The motion itself, or one of the ways that are made of it."""
     motion = PathReference(path)
     time = float(rng.uniform(0.0, motion.duration))
-    match str(rng.choice(["path", "slowed", "speed change", "way", "paused", "resumed", "approach"])):
+    match str(rng.choice(["path", "slowed", "way", "paused", "resumed", "approach"])):
         case "slowed":
             return ScaledMotion(motion, float(rng.uniform(0.1, 1.0))), "slowed"
-        case "speed change":
-            factors = (float(rng.uniform(0.1, 1.0)), float(rng.choice([0.2, 0.9, 1.0])))
-            return SpeedChange(motion, time, factors, path_peaks(path), limits), "speed change"
         case "paused":
             return Paused(motion, time, limits), "paused"
         case "way" | "resumed" | "approach" as kind:
@@ -136,20 +133,6 @@ def reached(draw: st.DrawFn) -> Reached:
         stopping, kind = stop(state, limits), f"stop out of {kind}"
         state = stopping.at(float(rng.uniform(0.0, stopping.duration)))
     return Reached(limits, state, kind)
-
-
-@dataclass(frozen=True)
-class PathPeaks:
-    """Largest sizes of a path's derivatives, each of shape (joints,)."""
-
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-
-
-def path_peaks(path: Motion) -> PathPeaks:
-    """Found on a fine grid."""
-    return PathPeaks(*_peaks(path)[2:])
 
 
 def _peaks(path: Motion) -> list[Array]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.local_commands import LocalCommands
 from motion_bench import JOINTS, LOOKED, Story, WatchedArm, bench_config
 
 from drivers.arm import StopKind
@@ -17,7 +18,7 @@ from ident_service.errors import ArmFault, MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
-from ident_service.motion.command_channel import ControlFile, Homing, LocalCommands, SupervisedCommands
+from ident_service.motion.command_channel import ControlFile, Homing, SupervisedCommands
 from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
 from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.lowering import SPEED, lowest_point
@@ -279,7 +280,7 @@ def test_an_arm_that_does_not_follow_is_lowered_until_it_rests(after: str) -> No
 
 
 @pytest.mark.slow
-def test_a_way_home_ends_held() -> None:
+def test_a_path_home_ends_held() -> None:
     rig = Rig(on_a_table())
     rig.arm.open()
     controls = Person(rig.arm, stop=10**9, confirm=1000)
@@ -339,7 +340,7 @@ def test_a_held_arm_is_led_home_and_held_there() -> None:
     assert rig.arm.stops == [StopKind.TORQUE_OFF]
 
 
-def test_the_way_home_of_a_held_arm_can_be_stopped_and_is_held_again() -> None:
+def test_the_path_home_of_a_held_arm_can_be_stopped_and_is_held_again() -> None:
     rig = Rig(on_a_table())
     assert led(rig, stop_again=300).stages == [Homing.GOING, Homing.ENDED]
     assert (np.abs(rig.column("position", rig.told(LOWERS) - 10, rig.told(LOWERS)) - rig.limits.home) > 0.025).any()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from helpers.local_commands import LocalCommands
 
-from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LEASE_SECONDS, LocalCommands, StopCondition
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LEASE_SECONDS, StopCondition
 
 
 def test_a_function_can_stop_a_run() -> None:

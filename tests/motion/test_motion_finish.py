@@ -121,7 +121,7 @@ def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pa
         arm.close()
 
 
-def test_the_way_back_is_as_slow_as_the_run(make: Callable[..., Bench]) -> None:
+def test_the_return_is_as_slow_as_the_run(make: Callable[..., Bench]) -> None:
     bench = make()
     assert played(bench, Hands(finished=3000), speed=0.4).finished_at is not None
     stamps = bench.story.column("stamp_ns") * 1e-9
@@ -150,7 +150,7 @@ def test_a_run_is_finished_while_it_pauses_and_while_it_goes_on_again(make: Call
         ended_where_it_began(bench)
 
 
-def test_the_way_back_of_a_finished_run_can_be_paused(make: Callable[..., Bench]) -> None:
+def test_the_return_of_a_finished_run_can_be_paused(make: Callable[..., Bench]) -> None:
     free, bench = make(), make()
     played(free, Hands(finished=MIDWAY))
     begin = round(times(free)["returning"] / PERIOD) - LOOKED + 200
@@ -161,7 +161,7 @@ def test_the_way_back_of_a_finished_run_can_be_paused(make: Callable[..., Bench]
     ended_where_it_began(bench)
 
 
-def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench], healthy: Healthy) -> None:
+def test_a_run_on_its_return_is_not_finished_early(make: Callable[..., Bench], healthy: Healthy) -> None:
     whole, bench = healthy.bench, make()
     cycle = round(times(whole)["returning"] / PERIOD) - LOOKED + 50
     report = played(bench, Hands(finished=cycle))
@@ -170,7 +170,7 @@ def test_a_run_on_its_way_back_is_not_finished_early(make: Callable[..., Bench],
     assert bench.arm.cycle == whole.arm.cycle
 
 
-def test_one_way_is_not_finished_early(make: Callable[..., Bench]) -> None:
+def test_a_single_trajectory_is_not_finished_early(make: Callable[..., Bench]) -> None:
     ways = []
     away = {"joints": {name: joint | {"home": 0.6} for name, joint in JOINTS.items()}}
     for hands in (Hands(), Hands(finished=30)):
@@ -208,7 +208,7 @@ def test_a_stop_is_not_finished(make: Callable[..., Bench]) -> None:
     assert bench.story.states[-3:] == ["exciting", "stopping", "stopped"]
 
 
-def test_where_the_straight_way_back_is_not_free_the_run_goes_on(
+def test_where_the_straight_return_is_not_free_the_run_goes_on(
     make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free = ClearanceChecker.require_clear
@@ -236,7 +236,7 @@ def test_where_the_straight_way_back_is_not_free_the_run_goes_on(
     ended_where_it_began(bench)
 
 
-def test_without_any_way_a_finish_ends_as_a_pause_does(
+def test_without_any_return_a_finish_ends_as_a_pause_does(
     make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(self: Paused, *_: Any) -> Any:
@@ -252,7 +252,7 @@ def test_without_any_way_a_finish_ends_as_a_pause_does(
     assert bench.story.states[-3:] == ["paused", "stopping", "stopped"]
 
 
-def test_the_way_back_keeps_clear(make: Callable[..., Bench]) -> None:
+def test_the_return_keeps_clear(make: Callable[..., Bench]) -> None:
     """A ball in the middle of the straight way home: with it that way is none."""
     bodies = {
         name: [{"from": (-0.45, 0.0, 0.0), "to": (0.0, 0.0, 0.0), "radius": 0.02}] for name in ("shoulder", "elbow")

@@ -87,6 +87,6 @@ def test_the_sentence_names_the_motor() -> None:
     assert fault.message.startswith(f"motor 2: a torque of {wanted[1]:.4g} N m was requested, the limit is 0.5: ")
 
 
-def test_a_joint_alone_is_told_as_before() -> None:
+def test_a_joint_alone_is_reported_as_before() -> None:
     one = SafetyMonitor(NAMES, replace(coupled_limits(), motors=None), PERIOD, HOME)
     is_fault(one.torque(1.01 * LIMITS.torque * np.array([1.0, 0.0]))[1], "torque_saturated", 0)

@@ -73,7 +73,7 @@ def test_what_is_no_number_or_outside_the_limits_ends_it_and_the_last_position_s
         np.testing.assert_array_equal(leaves, before)
 
 
-def test_a_measured_torque_beyond_the_limit_is_told_and_stops_the_arm_when_it_stays() -> None:
+def test_a_measured_torque_beyond_the_limit_is_reported_and_stops_the_arm_when_it_stays() -> None:
     seen = bench()
     assert seen.see(HOME, torque=MOST)[1] is None
     faults = [seen.see(HOME, torque=MOST + 0.01 * unit(1))[1] for _ in range(FAULTS["torque_exceeded"].often + 1)]

@@ -268,7 +268,7 @@ def test_a_fault_is_found_and_names_its_joint(code: str, joint: int) -> None:
 
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("trigger", OTHER_TRIGGERS, ids=lambda trigger: trigger.__name__)
-def test_a_fault_is_found_in_other_ways_too(trigger: Callable[[int], Fault | None], joint: int) -> None:
+def test_a_fault_is_found_by_other_signs_too(trigger: Callable[[int], Fault | None], joint: int) -> None:
     is_fault(trigger(joint), OTHER_TRIGGERS[trigger], joint)
 
 
@@ -326,7 +326,7 @@ def test_a_sentence_names_all_joints_with_numbers_and_limits() -> None:
 
 
 @pytest.mark.parametrize(("joint", "unit_of_torque"), [(0, "N m"), (1, "N")])
-def test_torques_are_told_in_the_unit_of_the_joint(joint: int, unit_of_torque: str) -> None:
+def test_torques_are_reported_in_the_unit_of_the_joint(joint: int, unit_of_torque: str) -> None:
     def told(fault: Fault | None) -> str:
         assert fault is not None
         return fault.message
@@ -358,7 +358,7 @@ def test_a_torque_that_jumps_is_led_there(sent: Array) -> None:
     np.testing.assert_allclose(guard.torque(sent + np.array([0.5, -8.0]))[0], sent + np.array([0.5, -2.0]))
 
 
-def test_the_worse_of_two_faults_of_a_torque_is_told() -> None:
+def test_the_worse_of_two_faults_of_a_torque_is_reported() -> None:
     guard = Bench().guard
     codes = []
     for cycle in range(22):
@@ -417,7 +417,7 @@ def test_the_arm_touches_neither_boxes_nor_itself(position: tuple[float, float],
     assert fault.message.startswith(f"{pair}: touch, ")
 
 
-def test_a_velocity_is_told_with_its_joint_and_unit() -> None:
+def test_a_velocity_is_reported_with_its_joint_and_unit() -> None:
     bench = Bench(revolute=(True, False))
     assert bench.guard.about(0, "moves at {} too long", 0.5) == "shoulder: moves at 0.5 rad/s too long"
     assert bench.guard.about(1, "moves at {} too long", 0.25) == "elbow: moves at 0.25 m/s too long"

@@ -186,12 +186,12 @@ class Heard(FrozenEncoderObserver):
         return super().update(direction, *others)
 
 
-def test_the_observer_of_owed_ways_is_told_which_way_each_position_went() -> None:
+def test_the_observer_gets_the_direction_of_each_position() -> None:
     model = bench_model()
     assert model.prior is not None
     dynamics = InverseDynamics(model.chain, model.layout, model.prior)
     heard = Heard(dynamics, LIMITS, PERIOD, np.array([0.8, 0.3]), np.full(2, 1e-5))
-    bench, step = Bench(owed=heard), 1e-5 * np.array([1.0, -1.0])
+    bench, step = Bench(encoder_observer=heard), 1e-5 * np.array([1.0, -1.0])
     for position, valid in ((HOME, (True, True)), (HOME + step, (True, True)), (HOME, (True, False))):
         bench.see(position, valid=valid, answer=STILL)
     assert heard.directions == [[0.0, 0.0], [1.0, -1.0], [-1.0, 0.0]]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.local_commands import LocalCommands
 from motion_bench import ELBOW, JOINTS, SHOULDER, bench_model
 from run_bench import HOLD, HOME, LIMITS, PERIOD, Bench
 
@@ -15,7 +16,6 @@ from drivers.arm import StopKind
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.motion.clearance import just_inside, relaxed_limits
-from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.run import RunReport, follow
 from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.state_machine import State
@@ -71,7 +71,7 @@ def test_no_joint_is_faster_than_a_tenth_of_its_limit(make: Callable[..., Bench]
 @pytest.mark.slow
 @pytest.mark.parametrize("destination", list(Destination))
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_from_a_little_outside_the_way_leads_inwards_only(
+def test_from_a_little_outside_the_path_leads_inwards_only(
     make: Callable[..., Bench], destination: Destination, side: float
 ) -> None:
     bench = make(**standing(side * OUT, 0.5))
@@ -99,7 +99,7 @@ def test_there_is_nothing_to_leave_inside(make: Callable[..., Bench]) -> None:
     refused(make(**standing(1.0, 0.0)), "nothing to leave", Destination.INSIDE)
 
 
-def test_a_push_outwards_on_the_way_in_stops_the_arm(make: Callable[..., Bench]) -> None:
+def test_a_push_outwards_on_the_path_inwards_stops_the_arm(make: Callable[..., Bench]) -> None:
     bench = make(**standing(OUT, 0.5))
     away = np.array([0.08, 0.0])  # more than it may give way
     bench.arm.shown = lambda sample: replace(
@@ -111,7 +111,7 @@ def test_a_push_outwards_on_the_way_in_stops_the_arm(make: Callable[..., Bench])
 
 
 @pytest.mark.slow
-def test_a_stop_on_the_way_home_is_a_stop(make: Callable[..., Bench]) -> None:
+def test_a_stop_on_the_path_home_is_a_stop(make: Callable[..., Bench]) -> None:
     bench, switches = make(**standing(-1.2, 1.0)), LocalCommands()
     bench.arm.before_exchange = lambda cycle: setattr(switches, "stop", cycle > 1500)
     assert go(bench, controls=switches).state is State.STOPPED
@@ -120,7 +120,7 @@ def test_a_stop_on_the_way_home_is_a_stop(make: Callable[..., Bench]) -> None:
 
 
 @pytest.mark.slow
-def test_a_pause_on_the_way_home_ends_at_home(make: Callable[..., Bench]) -> None:
+def test_a_pause_on_the_path_home_ends_at_home(make: Callable[..., Bench]) -> None:
     bench, switches = make(**standing(-1.2, 1.0)), LocalCommands()
     bench.arm.before_exchange = lambda cycle: setattr(switches, "pause", 1500 < cycle < 3000)
     assert go(bench, controls=switches).state is State.DONE
@@ -128,7 +128,7 @@ def test_a_pause_on_the_way_home_ends_at_home(make: Callable[..., Bench]) -> Non
     assert (np.abs(positions(bench)[-1] - HOME) < 0.05).all()
 
 
-def test_a_way_through_an_obstacle_is_refused(make: Callable[..., Bench]) -> None:
+def test_a_path_through_an_obstacle_is_refused(make: Callable[..., Bench]) -> None:
     bench = make(**standing(-1.2, 0.0))
     bench.model = bench_model(
         geometry={"elbow": [{"from": [-0.45, 0, 0], "to": [0, 0, 0], "radius": 0.03}]},

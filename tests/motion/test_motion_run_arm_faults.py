@@ -163,7 +163,7 @@ def test_a_fault_carries_the_last_samples(make: Callable[..., Bench]) -> None:
 
 
 @pytest.mark.parametrize("begin", [100, 1900])
-def test_the_way_out_and_the_way_back_are_guarded_too(make: Callable[..., Bench], begin: int) -> None:
+def test_approach_and_return_are_guarded_too(make: Callable[..., Bench], begin: int) -> None:
     bench = make(Fault(begin, FaultKind.NAN_POSITION, 1))
     assert bench.fault().code == "feedback_not_finite"
     assert bench.story.states[-2] == ("approaching" if begin < MIDWAY else "returning")

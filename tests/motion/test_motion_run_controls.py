@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.local_commands import LocalCommands
 from motion_bench import LOOKED
 from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy
 
 from drivers.arm import StopKind
 from ident_service.errors import ArmFault, MotionRefused
-from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LocalCommands
+from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS
 from ident_service.motion.control_loop import HOLD_SPEED, REST_CYCLES, REST_SPEED
 from ident_service.motion.faults import LOWER, LOWER_AFTER, SETTLE, ActiveFaults
 from ident_service.motion.run import RunReport, run
@@ -126,7 +127,7 @@ def test_a_stop_is_obeyed_in_a_pause_too(make: Callable[..., Bench], pause: tupl
     no_step_anywhere(bench)
 
 
-def test_no_way_back_ends_the_pause(make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_return_ends_the_pause(make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(self: Paused, *_: Any) -> Any:
         yield
         raise MotionRefused("it swings")
@@ -288,7 +289,7 @@ def test_rest_is_seen_in_all_samples_before_a_run(make: Callable[..., Bench]) ->
     bench.nothing_was_enabled()
 
 
-def test_a_warning_is_told_once_and_counted(make: Callable[..., Bench]) -> None:
+def test_a_warning_is_reported_once_and_counted(make: Callable[..., Bench]) -> None:
     bench = make(*(Fault(cycle, FaultKind.LOST_FEEDBACK, 1) for cycle in (700, 800, 900)))
     report = played(bench, LocalCommands())
     assert report.warnings == {"lost_feedback": 3}

@@ -76,7 +76,7 @@ def test_events_that_cannot_be_kept_end_nothing(make: Callable[..., Bench]) -> N
     assert bench.story.events == []
 
 
-def test_every_notice_of_a_drive_is_told_and_recorded_and_stops_nothing(make: Callable[..., Bench]) -> None:
+def test_every_notice_of_a_drive_is_reported_and_recorded_and_stops_nothing(make: Callable[..., Bench]) -> None:
     bench, words = make(), ["node 1: FF01h one", "node 2: FF02h another"]
     cycles = {MIDWAY: words[0], MIDWAY + 300: words[1]}
 
@@ -218,7 +218,7 @@ def test_an_interrupt_takes_the_torque(make: Callable[..., Bench], where: str) -
     assert bench.story.states[-1] == "faulted"
 
 
-def test_torque_is_taken_before_anything_is_told(make: Callable[..., Bench]) -> None:
+def test_torque_is_taken_before_anything_is_reported(make: Callable[..., Bench]) -> None:
     bench = make(Fault(MIDWAY, FaultKind.NAN_POSITION, 0))
     stops: dict[str, int] = {}
     bench.story.at_event = lambda message: stops.setdefault(message, len(bench.arm.stops)) and None

@@ -94,7 +94,7 @@ def test_no_run_begins_with_a_motion_made_for_another_arm(make: Callable[..., Be
     _refused(make(), "made for another description", replace(MOTION, arm_sha256="0" * 64))
 
 
-def test_a_bus_that_is_silent_from_the_start_is_told_as_such(make: Callable[..., Bench]) -> None:
+def test_a_bus_that_is_silent_from_the_start_is_reported_as_such(make: Callable[..., Bench]) -> None:
     bench = make(Fault(3, FaultKind.BUS_GONE))
     with pytest.raises(DriverError, match="bus is gone"):
         run(bench.arm, bench.model, MOTION, bench.story)

@@ -42,7 +42,7 @@ def states_in(state: State, latch: ActiveFaults | None = None) -> StateMachine:
 
 
 @pytest.mark.parametrize(("current", "wanted"), list(product(State, State)), ids=lambda state: state.value)
-def test_exactly_the_lawful_ways_are_open(current: State, wanted: State) -> None:
+def test_exactly_the_transitions_of_the_table_are_allowed(current: State, wanted: State) -> None:
     states = states_in(current)
     if (current.value, wanted.value) in WAYS:
         states.enter(wanted)
@@ -69,7 +69,7 @@ def test_every_state_is_reached_and_left() -> None:
     assert {state for ways in TRANSITIONS.values() for state in ways} == set(State)
 
 
-def test_who_wants_to_know_is_told() -> None:
+def test_observers_get_every_state() -> None:
     told: list[State] = []
     states = StateMachine(ActiveFaults(), told.append)
     states.enter(State.CHECKED)

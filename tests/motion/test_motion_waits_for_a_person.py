@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign_pucks import bench_puck_config
+from helpers.local_commands import LocalCommands
 from motion_bench import Story
 
 from drivers.barrett.driver import BarrettArm
@@ -14,7 +15,6 @@ from ident_service.config.arm import ArmConfig
 from ident_service.errors import ArmFault, MotionRefused
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import WAITS_FOR, run
 from ident_service.motion.state_machine import State

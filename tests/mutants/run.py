@@ -57,9 +57,9 @@ GROUPS = {
             "tests/motion/test_motion_guard_thresholds.py",
             "tests/motion/test_motion_guard_table.py",
             "tests/motion/test_motion_guard.py",
-            "tests/motion/test_motion_told.py",
-            "tests/motion/test_motion_owed.py",
-            "tests/motion/test_motion_owed_runs.py",
+            "tests/motion/test_motion_drive_events.py",
+            "tests/motion/test_motion_encoder_observer.py",
+            "tests/motion/test_motion_encoder_observer_runs.py",
         ),
     ),
     "stop": Group(

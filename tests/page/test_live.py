@@ -82,7 +82,7 @@ def test_a_tail_gives_each_flushed_sample_once(tmp_path: Path, most: int) -> Non
     tail.close()
 
 
-def test_a_torn_end_waits_and_damage_is_told(tmp_path: Path) -> None:
+def test_a_torn_end_waits_and_damage_is_reported(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "run.mcap", NAMES, "<robot/>", 0) as writer:
         for k in range(500):
             writer.sample(cycle(k))

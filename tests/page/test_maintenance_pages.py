@@ -110,7 +110,7 @@ def test_an_alarm_needs_a_note_to_be_acknowledged(daemon: Asked) -> None:
     assert "Drift alarm" not in daemon.get("/").text
 
 
-def test_the_ladder_says_re_identify_when_something_asks_for_it(daemon: Asked) -> None:
+def test_the_workflow_says_re_identify_when_something_asks_for_it(daemon: Asked) -> None:
     enter(daemon, "operator")
     db = daemon.service.db
 

@@ -167,7 +167,7 @@ def test_every_page_answers_whole_and_escaped(daemon: Asked, commissioned: Path,
     assert shown >= 12  # description, fault, note, detail, log, audit, alarm, cause, what was done, by whom
 
 
-def test_strangers_are_led_to_the_way_in(daemon: Asked, commissioned: Path) -> None:
+def test_strangers_are_led_to_the_login(daemon: Asked, commissioned: Path) -> None:
     for address in [*addresses(commissioned), "/new", f"/compare?reference=a&other={ARM}"]:
         answer = daemon.get(address)
         assert answer.status_code == 303, address

@@ -158,7 +158,7 @@ def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], p
     assert path.count("L") == len(view["clearance"]["samples"]) - 1
 
 
-def test_distances_are_told_while_the_arm_is_on_its_way(shown: tuple[Browser, Reached, str], page: Page) -> None:
+def test_distances_are_reported_while_the_arm_is_on_its_way(shown: tuple[Browser, Reached, str], page: Page) -> None:
     _, reached, _ = shown
     page.add_init_script(COUNTED)
     confirm_page(page, reached, "rehearse")
@@ -263,7 +263,7 @@ def test_without_webgl_times_and_distances_stay(shown: tuple[Browser, Reached, s
     expect(page.locator("#viewer-itself")).to_contain_text(" mm, ")
 
 
-def test_what_cannot_be_shown_is_said(shown: tuple[Browser, Reached, str], page: Page) -> None:
+def test_what_cannot_be_shown_is_stated(shown: tuple[Browser, Reached, str], page: Page) -> None:
     _, reached, _ = shown
     page.route("**/view?motion=own*", lambda route: route.fulfill(status=409, json={"error": {"message": "no limits"}}))
     confirm_page(page, reached)

@@ -67,7 +67,7 @@ def test_it_is_held_moved_and_identified_with_its_payload_and_results_say_so(
 
 
 @pytest.mark.slow
-def test_a_payload_that_is_not_on_is_told_before_anything_moves(
+def test_a_payload_that_is_not_on_is_reported_before_anything_moves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Taken off again by the simulator, as a person who forgot to mount it."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from motion.motion_bench import JOINTS, TRUTH, bench_config
 
 from drivers.arm import Arm, ArmDescription, Sample, StopKind
 from drivers.clock import VirtualClock
@@ -25,33 +26,13 @@ from sim_backend.faults import Fault
 Array = np.ndarray
 NAMES = ("shoulder", "elbow")
 LIMIT = np.array([40.0, 15.0])
-PRIOR = {"Lxx1": 0.002, "Lyy1": 0.168, "Lzz1": 0.168, "lx1": -0.5, "m1": 2.0, "Ia1": 0.02}
-PRIOR |= {"Lxx2": 0.001, "Lyy2": 0.084, "Lzz2": 0.084, "lx2": -0.25, "m2": 1.0, "Ia2": 0.01}
-TRUTH = PRIOR | {"m1": 2.1, "lx1": -0.51, "fv1": 0.3, "fc1": 0.3, "fv2": 0.1, "fc2": 0.1}
-GAINS = {"following_error": 0.2, "kp": 400.0, "kd": 40.0, "brake": True}
-SHOULDER = GAINS | {"position": (-1.8, 1.8), "velocity": 2.0, "acceleration": 8.0, "jerk": 80.0, "torque": 40.0}
-ELBOW = GAINS | {"position": (-2.0, 2.0), "velocity": 3.0, "acceleration": 15.0, "jerk": 150.0, "torque": 15.0}
-JOINTS = {"shoulder": SHOULDER | {"home": 0.1}, "elbow": ELBOW | {"home": -0.1}}
 FOREVER = 10**7
 
 
 def flight_config(**changes: Any) -> ArmConfig:
-    """Two links of half a metre in a vertical plane, without geometry; `changes` replace top-level sections."""
-    description = {
-        "format": "ident-arm",
-        "version": 1,
-        "name": "bench",
-        "kinematics": {"dh": {"convention": "standard", "joints": {"shoulder": {"a": 0.5}, "elbow": {"a": 0.5}}}},
-        "gravity": (0.0, -9.81, 0.0),
-        "joints": JOINTS,
-        "prior": PRIOR,
-        "control": {"rate": 500.0},
-        "motions": {
-            "identification": {"kind": "seeded", "seed": 3, "base_frequency": 0.8, "harmonics": 2, "periods": 1}
-        },
-        "driver": {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "torque_resolution": 0.01},
-    }
-    return ArmConfig.model_validate(description | changes)
+    """The arm of the motion tests at 500 Hz with coarser encoders; `changes` replace top-level sections."""
+    driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "torque_resolution": 0.01}
+    return bench_config(**({"control": {"rate": 500.0}, "driver": driver} | changes))
 
 
 def joint_changes(joint: str, **changes: Any) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def test_lateness_with_torque_is_stated_beside_the_look_and_judged() -> None:
 
 
 @pytest.mark.parametrize("away", [0.0, 0.7])
-def test_an_arm_that_is_not_at_home_is_told_so_before_what_is_wrong_there(away: float) -> None:
+def test_an_arm_that_is_not_at_home_is_reported_before_what_is_wrong_there(away: float) -> None:
     flight = Flight()
     assert flight.model.prior is not None
     heavy = flight.model.prior.copy()

@@ -159,7 +159,7 @@ def test_a_simulated_arm_is_new_every_time_and_keeps_none(tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_position_of_other_gears_is_none_and_a_damaged_file_is_said(
+def test_a_position_of_other_gears_is_none_and_a_damaged_file_is_stated(
     config: ArmConfig, behind: LockStepArm, tmp_path: Path
 ) -> None:
     kept = PositionFile(tmp_path, config)

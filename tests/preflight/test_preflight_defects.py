@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flight_bench import FOREVER, TRUTH, Flight, FlightArm, check_of, joint_changes, only_failure, verdicts
+from flight_bench import FOREVER, Flight, FlightArm, check_of, joint_changes, only_failure, verdicts
+from motion.motion_bench import TRUTH
 
 from drivers.arm import Sample, Watchdog
 from drivers.axis_status import AxisStatus
@@ -72,7 +73,7 @@ def test_a_motion_beyond_a_limit_is_refused() -> None:
     slow.motion = flight.motion
     check = only_failure(slow.ticket(), "motion_proven")
     assert "elbow: velocity" in check.reason
-    assert any(one.joint == "elbow" and not one.kept for one in check.measures)
+    assert any(one.joint == "elbow" and not one.within_limits for one in check.measures)
 
 
 def test_gains_that_are_unstable_at_this_rate_keep_the_arm_untouched() -> None:
@@ -178,7 +179,9 @@ def test_a_noisy_encoder_is_not_closed_a_loop_on() -> None:
     )
     check = only_failure(flight.ticket(), "noise")
     # The torque that the gains would make of it reaches the shoulder as well.
-    assert {one.joint for one in check.measures if not one.kept and not one.what.startswith("torque")} == {"elbow"}
+    assert {one.joint for one in check.measures if not one.within_limits and not one.what.startswith("torque")} == {
+        "elbow"
+    }
     assert "shielding" in check.remedy
     untouched(flight)
 
@@ -247,7 +250,7 @@ def test_a_load_that_the_model_does_not_know_shows_in_the_torque_that_holds(load
 
 
 @pytest.mark.parametrize("share", [0.3, 0.1])
-def test_an_arm_that_is_lighter_than_described_is_told_so(share: float) -> None:
+def test_an_arm_that_is_lighter_than_described_is_reported(share: float) -> None:
     truth = TRUTH | {"m1": 2.0 * share, "lx1": -0.5 * share, "m2": share, "lx2": -0.25 * share}
     flight = Flight(changes={"driver": {"kind": "simulated", "truth": truth, "encoder_resolution": 2e-5}})
     assert only_failure(flight.ticket(), "gravity").reason.startswith("the arm is lighter than described")
@@ -301,7 +304,7 @@ def test_a_wrong_gear_ratio_shows_in_what_the_joint_does(ratio: float, shows: st
     flight = Flight(changes=level)
     geared(ratio, 1)(flight.arm)
     check = only_failure(flight.ticket(), "direction")
-    assert {one.joint for one in check.measures if not one.kept and one.what.startswith(shows)} == {"elbow"}
+    assert {one.joint for one in check.measures if not one.within_limits and one.what.startswith(shows)} == {"elbow"}
     response = next(
         one for one in check.measures if one.joint == "elbow" and one.what.startswith("response to torque, measured")
     )

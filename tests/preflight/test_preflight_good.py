@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from flight_bench import LIMIT, PRIOR, TRUTH, Flight, Flown, check_of, verdicts
+from flight_bench import LIMIT, Flight, Flown, check_of, verdicts
 from helpers.forks import fork_plants
+from motion.motion_bench import PRIOR, TRUTH
 
 from drivers.arm import Sample
 from ident_service.cli import main
@@ -20,7 +21,7 @@ from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.ticket import CODES, Ticket, Verdict
 from ident_service.motion.trajectory import Setpoint
-from ident_service.preflight.direction import LEAST_ANSWER
+from ident_service.preflight.active_checks import LEAST_ANSWER
 from ident_service.preflight.preflight import preflight
 from ident_service.preflight.session import trace_of
 
@@ -69,7 +70,7 @@ def test_a_scale_that_cannot_be_judged_is_not_reported_as_if_it_were() -> None:
     assert (judged["shoulder"].least, judged["elbow"].least) == (LEAST_ANSWER, 0.0)
 
 
-def test_the_arm_moves_no_farther_than_told_and_within_its_band_of_torque(good: Flown) -> None:
+def test_the_arm_moves_no_farther_than_announced_and_within_its_band_of_torque(good: Flown) -> None:
     powered = np.array(good.seen[: 121 + len(good.flight.arm.torques)])
     assert (np.abs(powered - powered[0]) < 0.06).all()
     torques = np.array(good.flight.arm.torques)

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from flight_bench import SHOULDER, Flight, FlightArm, check_of, flight_config, joint_changes, only_failure
+from flight_bench import Flight, FlightArm, check_of, flight_config, joint_changes, only_failure
+from motion.motion_bench import SHOULDER
 
 from ident_service.config.motion_limits import motion_limits
 from ident_service.motion.ticket import Ticket, Verdict

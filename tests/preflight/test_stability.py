@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flight_bench import PRIOR, flight_config
+from flight_bench import flight_config
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from motion.motion_bench import PRIOR
 
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm

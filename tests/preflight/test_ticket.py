@@ -108,14 +108,14 @@ def test_any_change_asks_for_a_new_check(other: Callable[[], Subject], reason: s
 
 
 @pytest.mark.parametrize("code", ["motion_fits", "motion_proven", "ways_clear"])
-def test_a_way_home_asks_for_nothing_that_is_about_the_motion(code: str) -> None:
+def test_a_path_home_asks_for_nothing_that_is_about_the_motion(code: str) -> None:
     home = subject_of(MODEL, None, ARM)
     assert ticket(failed(code, "not this motion", "another")).valid_for(home, later()) == []
     assert ticket(failed(code, "not this motion", "another")).valid_for(SUBJECT, later()) != []
 
 
 @pytest.mark.parametrize("check", [failed("direction", "x", "y"), Check("watchdog", Verdict.NEEDS_PERSON)])
-def test_a_way_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
+def test_a_path_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
     home = subject_of(MODEL, None, ARM)
     assert f"failed: {check.code}" in ticket(check).valid_for(home, later())[0]
     assert "the drives are not those that were checked" in ticket().valid_for(

@@ -68,7 +68,7 @@ def test_watching_only_looks() -> None:
     assert seen.cycles == arm.cycle == 2000
 
 
-def test_the_arm_itself_is_not_even_opened_where_another_way_to_look_is_offered() -> None:
+def test_the_arm_itself_is_not_even_opened_where_a_monitoring_arm_is_offered() -> None:
     class Harmful(OnlyLooked):
         def look(self) -> Arm:
             return harmless
@@ -89,7 +89,7 @@ def test_it_says_what_it_saw() -> None:
     assert seen.lost == 99
 
 
-def test_every_sample_is_told_and_watching_ends_when_asked() -> None:
+def test_every_sample_is_reported_and_watching_ends_when_asked() -> None:
     told: list[int] = []
     seen = watch(OnlyLooked(), 60.0, lambda _, sample: told.append(sample.cycle), stop_requested=lambda: len(told) == 7)
     assert told == list(range(7))

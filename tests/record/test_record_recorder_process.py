@@ -84,7 +84,7 @@ def test_lock_step_loses_nothing_at_full_speed(tmp_path: Path, share: float) -> 
 
 
 @pytest.mark.slow
-def test_a_file_that_cannot_be_made_is_refused_at_the_door(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_made_is_refused_on_entry(tmp_path: Path) -> None:
     (tmp_path / "there").touch()
     (tmp_path / "left.partial").touch()
     for name, message in (
@@ -164,7 +164,7 @@ def test_lock_step_does_not_wait_for_ever(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lock_step", [False, True])
-def test_a_full_disk_is_told_with_its_reason(tmp_path: Path, lock_step: bool) -> None:
+def test_a_full_disk_is_reported_with_its_reason(tmp_path: Path, lock_step: bool) -> None:
     recorder = process(tmp_path / "run", lock_step=lock_step)
 
     def loop() -> None:

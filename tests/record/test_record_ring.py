@@ -169,7 +169,7 @@ def test_overruns_are_counted(ring: Callable[..., int]) -> None:
     writer.memory.close()
 
 
-def test_the_end_is_told(ring: Callable[..., int]) -> None:
+def test_the_end_is_reported(ring: Callable[..., int]) -> None:
     for finished, expected in ((True, Closed.FINISHED), (False, Closed.ENDED_EARLY)):
         fd = ring()
         writer = RingWriter(fd)

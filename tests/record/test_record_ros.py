@@ -164,7 +164,7 @@ def test_rosbag2_is_told_how_to_read_the_policies(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("whole", [True, False])
-def test_a_velocity_that_no_drive_told_is_none_for_identification(tmp_path: Path, whole: bool) -> None:
+def test_a_velocity_that_no_drive_reported_is_none_for_identification(tmp_path: Path, whole: bool) -> None:
     path = write_recording(tmp_path / "run.mcap", 500)
     if not whole:
         path.write_bytes(path.read_bytes()[:-2000])

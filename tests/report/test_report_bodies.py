@@ -174,10 +174,10 @@ def test_friction_points_are_the_friction_that_was_put_in(good: Made) -> None:
 
 
 def test_a_model_without_friction_has_none(good: Made) -> None:
-    from ident_service.results.evidence.gathering import FrictionSeen
+    from ident_service.results.evidence.gathering import FrictionCollector
 
     model = replace(good.estimate.model, layout=replace(good.estimate.model.layout, terms=("drive_inertia",)))
     from ident_service.model.base_parameters import base_parameters
 
     estimate = replace(good.estimate, model=model, base=base_parameters(model.chain, model.layout))
-    assert FrictionSeen(estimate).found() == ()
+    assert FrictionCollector(estimate).found() == ()

@@ -53,7 +53,7 @@ def test_every_figure_has_a_sentence_and_a_text_alternative(good: Made) -> None:
     assert len({figure.attributes["id"] for figure in found}) == len(found)
 
 
-def test_how_to_read_them_is_said_once_per_section(good: Made) -> None:
+def test_how_to_read_them_is_stated_once_per_section(good: Made) -> None:
     for name, node in sections(good.page).items():
         hints = [p.words for p in node.all("p") if p.attributes.get("class") == "hint"]
         readings = [words for words in hints if re.search(r"\bGood: .+\. Bad: .+\.", words)]
@@ -249,7 +249,7 @@ def test_a_bound_stands_where_it_binds(good: Made) -> None:
     assert said == [bounds[k][0] if k == 3 else "\u2014" for k in range(len(rows))]
 
 
-def test_what_is_absent_is_said(bare: Made) -> None:
+def test_what_is_absent_is_stated(bare: Made) -> None:
     found = {name: node.words for name, node in sections(bare.page).items()}
     assert "Not physically feasible: no real body has these parameters" in found["verdict"]
     assert "There is no validation recording" in found["verdict"]
@@ -258,7 +258,7 @@ def test_what_is_absent_is_said(bare: Made) -> None:
     assert "no account of its cycles" in found["timing"]
 
 
-def test_without_friction_or_spectra_that_is_said(good: Made) -> None:
+def test_without_friction_or_spectra_that_is_stated(good: Made) -> None:
     recordings = tuple(replace(one, spectra=()) for one in good.evidence.recordings)
     evidence = replace(good.evidence, recordings=recordings, friction=())
     found = {
@@ -268,7 +268,7 @@ def test_without_friction_or_spectra_that_is_said(good: Made) -> None:
     assert "The arm's model has no friction" in found["friction"]
 
 
-def test_uneven_stamps_are_told_in_shares_of_a_period(good: Made) -> None:
+def test_uneven_stamps_are_reported_in_shares_of_a_period(good: Made) -> None:
     first, *others = good.evidence.timing
     worst = 0.35 / first.rate
     uneven = replace(first, largest=worst, edges=np.linspace(0.0, worst, len(first.edges)))

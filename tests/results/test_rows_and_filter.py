@@ -45,7 +45,7 @@ def said(**changes: Any) -> str:
         ({"period": 20}, "Position and torque: averaged over periods of 20 s."),
     ],
 )
-def test_every_setting_that_changes_a_figure_is_said(changes: dict[str, Any], words: str) -> None:
+def test_every_setting_that_changes_a_figure_is_stated(changes: dict[str, Any], words: str) -> None:
     assert words in said(**changes)
 
 

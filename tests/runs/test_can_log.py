@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers.replay import read_session
 from helpers.tickets import write_checked_ticket
 
-from drivers.canopen.replay import read_session
 from ident_service.cli import DONE, FAILED, USAGE, main
 from ident_service.config.load import load_arm, shipped_arms
 

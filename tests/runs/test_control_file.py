@@ -109,9 +109,9 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
 def test_a_stop_reaches_a_motion_that_was_asked_for_before_it(tmp_path: Path, asked: int | None, stops: bool) -> None:
     time = Time()
     assert ControlFile.stop_all(loop_path(tmp_path), time) is None
-    asked_ns = None if asked is None else time.now + asked
+    requested_ns = None if asked is None else time.now + asked
     time.now += 2_000_000_000
-    with ControlFile.take(loop_path(tmp_path), 2.0, time, asked_ns) as loop:
+    with ControlFile.take(loop_path(tmp_path), 2.0, time, requested_ns) as loop:
         assert loop.stop == stops
         assert not loop.pause
         assert loop.lease_ok(0)
@@ -121,19 +121,19 @@ def test_a_stop_before_the_machine_was_started_anew_is_none(tmp_path: Path) -> N
     time = Time()
     ControlFile.stop_all(loop_path(tmp_path), time)
     time.now -= 3_000_000_000
-    with ControlFile.take(loop_path(tmp_path), None, time, asked_ns=time.now - 1) as loop:
+    with ControlFile.take(loop_path(tmp_path), None, time, requested_ns=time.now - 1) as loop:
         assert not loop.stop
 
 
 def test_a_stop_reaches_who_moves_the_arm_and_who_waits_for_it(tmp_path: Path) -> None:
     time = Time()
-    asked_ns = time.now
+    requested_ns = time.now
     with ControlFile.take(loop_path(tmp_path), None, time) as loop:
         time.now += 1
         assert ControlFile.stop_all(loop_path(tmp_path), time) == loop.pid
         assert loop.stop
     time.now += 1
-    with ControlFile.take(loop_path(tmp_path), None, time, asked_ns) as waited:
+    with ControlFile.take(loop_path(tmp_path), None, time, requested_ns) as waited:
         assert waited.stop
     with ControlFile.take(loop_path(tmp_path), None, time, time.now) as later:
         assert not later.stop
@@ -146,7 +146,7 @@ def test_a_stop_that_cannot_be_written_says_so(tmp_path: Path) -> None:
 
 
 def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Path) -> None:
-    time, asked_ns, looks = Time(), 5_000_000_000, [0]
+    time, requested_ns, looks = Time(), 5_000_000_000, [0]
     ControlFile.take(loop_path(tmp_path), None, time).close()
 
     def now() -> int:
@@ -157,7 +157,7 @@ def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Pa
             ControlFile.stop_all(loop_path(tmp_path), time)
         return read
 
-    with ControlFile.take(loop_path(tmp_path), None, now, asked_ns) as loop:
+    with ControlFile.take(loop_path(tmp_path), None, now, requested_ns) as loop:
         assert loop.stop
 
 

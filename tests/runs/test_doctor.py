@@ -100,7 +100,7 @@ def test_what_cannot_be_looked_at_is_unknown_and_no_error(tmp_path: Path) -> Non
     assert {what for what in OF_FILES if found[what].state is State.UNKNOWN} == unknown
 
 
-def test_limits_of_a_user_without_privileges_are_told_with_the_lines_that_mend_them() -> None:
+def test_limits_of_a_user_without_privileges_are_reported_with_the_lines_that_mend_them() -> None:
     # Nobody may not read this checkout; modules that are loaded before are there.
     code = (
         "import os, resource\nfrom ident_service.motion.doctor import *\n"

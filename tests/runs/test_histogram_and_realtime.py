@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 
 from ident_service.config.control import Realtime
 from ident_service.motion.cycle_timing import Histogram
-from ident_service.motion.realtime import LATENCY, STACK, asked, core_numbers
+from ident_service.motion.realtime import LATENCY, STACK, core_numbers, temporary_privileges
 
 CORES = sorted(os.sched_getaffinity(0))
-ASK = "from ident_service.motion.realtime import *; granted = ask(settings=Realtime({}))"
+ASK = "from ident_service.motion.realtime import *; granted = request_privileges(settings=Realtime({}))"
 
 
 @given(times=st.lists(st.integers(0, 10**9), min_size=1, max_size=200), share=st.sampled_from([0.5, 0.99, 0.999]))
@@ -39,7 +39,8 @@ def test_nothing_was_counted_yet() -> None:
 
 def test_what_is_asked_of_the_kernel_is_answered_in_words_and_nothing_fails() -> None:
     code = (
-        "from ident_service.motion.realtime import ask; granted = ask(); print(granted.sentence()); "
+        "from ident_service.motion.realtime import request_privileges; granted = request_privileges(); "
+        "print(granted.sentence()); "
         "import gc; assert not gc.isenabled(); assert granted.collector"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -49,7 +50,8 @@ def test_what_is_asked_of_the_kernel_is_answered_in_words_and_nothing_fails() ->
 def asking(settings: str, rest: str = "") -> str:
     """Ask in a process of its own, as the motion process does, and print what `rest` makes of it."""
     code = (
-        f"from ident_service.motion.realtime import *; granted = ask(settings=Realtime({settings})); {rest or 'pass'}"
+        "from ident_service.motion.realtime import *; "
+        f"granted = request_privileges(settings=Realtime({settings})); {rest or 'pass'}"
     )
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
 
@@ -82,7 +84,7 @@ def test_two_loops_never_share_a_core_of_their_own() -> None:
     assert f"no core of its own: other loops have core {first}" in alone
 
 
-def test_a_core_that_is_not_there_is_said() -> None:
+def test_a_core_that_is_not_there_is_stated() -> None:
     assert "core 8191 refused" in asking("cores=(8191,)", "print(granted.core, granted.sentence())")
 
 
@@ -101,7 +103,7 @@ def test_cores_are_kept_awake_for_as_long_as_the_loop_runs() -> None:
     def held() -> bool:
         return LATENCY in [file.readlink() for file in here.iterdir() if file.is_symlink()]
 
-    with asked() as granted:
+    with temporary_privileges() as granted:
         assert granted.awake
         assert held()
     assert not held()
@@ -124,7 +126,7 @@ def test_heap_and_stack_have_their_pages_before_the_loop_begins() -> None:
 def test_what_was_asked_for_a_while_is_given_back() -> None:
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     for _ in range(2):  # its core is free again
-        with asked(settings=Realtime(cores=tuple(CORES))) as granted:
+        with temporary_privileges(settings=Realtime(cores=tuple(CORES))) as granted:
             if granted.core is None:
                 pytest.skip("loops outside of this test have every core")
             assert os.sched_getaffinity(0) == {granted.core}

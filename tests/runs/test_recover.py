@@ -185,7 +185,7 @@ def test_an_arm_that_somebody_moves_is_not_even_looked_at(
 
 
 @pytest.mark.parametrize(("out", "word"), [(0.15, "--leave-limit"), (0.25, "its zero may be wrong")])
-def test_outside_the_limits_the_way_back_depends_on_how_far(tmp_path: Path, state: Path, out: float, word: str) -> None:
+def test_outside_the_limits_the_return_depends_on_how_far(tmp_path: Path, state: Path, out: float, word: str) -> None:
     config = config_with(tmp_path)
     joints = dict(config.joints)
     joints["shoulder"] = joints["shoulder"].model_copy(update={"position": (-3.0, 3.0), "home": 1.8 + out})
@@ -196,7 +196,7 @@ def test_outside_the_limits_the_way_back_depends_on_how_far(tmp_path: Path, stat
     numbered(found, "Support", word, "`ident home planar2`")
 
 
-def test_an_arm_that_does_not_answer_is_said_to(tmp_path: Path, state: Path) -> None:
+def test_an_arm_that_does_not_answer_is_reported(tmp_path: Path, state: Path) -> None:
     config = config_with(tmp_path)
     arm = make_arm(config)
     with arm:
@@ -265,7 +265,7 @@ def test_home_keeps_the_rules_of_a_run(ident: Callable[..., tuple[int, str]], tm
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_motions_ticket_is_one_for_the_way_home(ident: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+def test_a_motions_ticket_is_one_for_the_path_home(ident: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     assert ident("check", "--confirm", "planar2")[0] == 0
     assert ident("home", "--out", str(tmp_path / "home"))[0] == 0
 

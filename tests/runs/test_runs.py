@@ -128,10 +128,10 @@ def test_a_stop_while_a_run_is_being_prepared_keeps_it_from_beginning(virtual_ar
     checked(virtual_arm, state)
     config = load_arm(virtual_arm)
     motion = excitation(arm_model(config), "identification")
-    ticket, asked_ns = read_ticket(ticket_path(state, config.name)), time.monotonic_ns()
+    ticket, requested_ns = read_ticket(ticket_path(state, config.name)), time.monotonic_ns()
     assert main(["stop", str(virtual_arm), "--state", str(state)]) == 0  # nobody moves it yet
     with pytest.raises(MotionRefused, match="a stop was requested before the arm was energised"):
-        run_motion(config, motion, tmp_path / "run", state, ticket, asked_ns=asked_ns)
+        run_motion(config, motion, tmp_path / "run", state, ticket, requested_ns=requested_ns)
     assert not (tmp_path / "run").exists()
     assert not fault_file(state, config.name).latched()
     assert run_motion(config, motion, tmp_path / "run", state, ticket).report["state"] == "done"
@@ -154,7 +154,7 @@ def test_a_parent_that_hangs_loses_its_lease(started: Started, tmp_path: Path) -
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_a_rehearsal_is_the_same_way_at_a_fifth_of_the_speed(virtual_arm: Path, tmp_path: Path) -> None:
+def test_a_rehearsal_is_the_same_path_at_a_fifth_of_the_speed(virtual_arm: Path, tmp_path: Path) -> None:
     words = ["--out", str(tmp_path / "run"), *checked(virtual_arm, tmp_path / "state")]
     assert main(["rehearse", str(virtual_arm), "--no-key", *words]) == 0
     limits = load_arm(virtual_arm).joints

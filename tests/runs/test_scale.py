@@ -83,7 +83,9 @@ def test_what_a_hand_turned_is_what_the_drives_see_and_is_kept(tmp_path: Path) -
     [(0.5, "transmission.ratios is 2 times too large"), (2.0, "transmission.ratios is 0.5 times too large"),
      (0.8, "the scale is wrong"), (-1.0, "the sign of transmission.ratios is wrong"), (0.0, "does not count")],
 )  # fmt: skip
-def test_a_wrong_scale_is_named_and_a_wrong_sign_told_from_it(tmp_path: Path, scale: float, words: str) -> None:
+def test_a_wrong_scale_is_named_and_a_wrong_sign_distinguished_from_it(
+    tmp_path: Path, scale: float, words: str
+) -> None:
     arm = Handled(np.array([scale, 1.0]))
     shoulder, elbow = check_scale(CONFIG, tmp_path, person(arm, 90.0, 60.0), arm)
     assert (shoulder.good, elbow.good) == (False, True)

@@ -164,7 +164,7 @@ def test_nothing_changes_when_nobody_says_so(config: ArmConfig, behind: LockStep
         make_arm(config).open()
 
 
-def test_latched_faults_are_said(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
+def test_latched_faults_are_stated(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
     set_home(config, state, sure)
     fault_file(state, config.name).latch("drive_restarted", "node 2: has booted")
     behind.inject(DriveFault("reboot", 1))

@@ -98,7 +98,7 @@ def test_error_frames_pass_the_filters_and_bus_off_ends_sending_until_a_restart(
     assert neighbour.heard() == [(0x080, b"")]
 
 
-def test_an_interface_that_goes_down_is_told_with_the_remedy_and_works_again(
+def test_an_interface_that_goes_down_is_reported_with_the_remedy_and_works_again(
     link: Link, vcan: str, neighbour: Neighbour
 ) -> None:
     remedy = f"{vcan}: the interface is down; bring it up: `ip link set {vcan} up type can bitrate 1000000`"
@@ -137,7 +137,7 @@ def test_an_interface_that_is_removed_has_gone(link: Link, vcan: str) -> None:
         assert caught.value.kind == "gone"
 
 
-def test_a_full_transmit_queue_is_told(link: Link, vcan: str, neighbour: Neighbour) -> None:
+def test_a_full_transmit_queue_is_reported(link: Link, vcan: str, neighbour: Neighbour) -> None:
     # A queue without room for a single frame: each is refused with ENOBUFS, as by an adapter that nobody acknowledges.
     command("tc", "qdisc", "add", "dev", vcan, "root", "pfifo", "limit", "0")
     with pytest.raises(BusError, match="the transmit queue is full: no node acknowledges") as caught:
@@ -166,7 +166,7 @@ def test_can_fd_is_refused_by_a_classic_interface_and_goes_over_the_other(opened
     ]
 
 
-def test_frames_that_nobody_fetched_in_time_are_told_as_an_overflow(vcan: str, neighbour: Neighbour) -> None:
+def test_frames_that_nobody_fetched_in_time_are_reported_as_an_overflow(vcan: str, neighbour: Neighbour) -> None:
     (link,) = open_links(arm_on_bus(interface="raw", channel=vcan))
     with closing(link):
         for _ in range(4000):

@@ -112,8 +112,8 @@ class SubprocessJob:
 class UnitChild:
     """Implement `JobProcess` with a process of the service manager, at the other end of a local socket."""
 
-    def __init__(self, words: tuple[str, ...], folder: Path, door: Path) -> None:
-        """Have `ident WORDS` started by the unit that listens at `door`.
+    def __init__(self, words: tuple[str, ...], folder: Path, socket_path: Path) -> None:
+        """Have `ident WORDS` started by the unit that listens at `socket_path`.
 
         Raises:
             UsageError: nobody listens there.
@@ -121,11 +121,11 @@ class UnitChild:
         self._folder = folder
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            self._socket.connect(str(door))
+            self._socket.connect(str(socket_path))
             self._socket.sendall(json.dumps({"folder": str(folder), "words": list(words)}).encode() + b"\n")
         except OSError as error:
             self._socket.close()
-            raise UsageError(f"{door}: {error.strerror}; is the unit ident-motion.socket started?") from None
+            raise UsageError(f"{socket_path}: {error.strerror}; is the unit ident-motion.socket started?") from None
         self._socket.setblocking(False)
         self._ended = False
 

@@ -11,7 +11,7 @@ from typing import Final
 from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.requests import (
     MOVES,
-    Asked,
+    AnyJobRequest,
     Base,
     BusLoad,
     BusProbe,
@@ -111,23 +111,23 @@ class Command:
     waits: bool = True
 
 
-def command(db: Database, state: Path, asked: Asked) -> Command:
+def command(db: Database, state: Path, request: AnyJobRequest) -> Command:
     """Return the command that carries out a request.
 
     Raises:
         UsageError: it names what is not known.
         ConfigError: the arm's description has mistakes.
     """
-    if isinstance(asked, _OF_A_RUN):
-        return _about_a_run(db, state, asked)
-    if isinstance(asked, Judge):
-        return _judgement(db, state, asked)
-    arm = known_arm(db, state, asked.arm)
-    made = None if isinstance(asked, _WITHOUT_FOLDER) else new_id(arm.name)
-    words = [*_VERBS.get(asked.kind, (asked.kind,)), *_words(db, state, asked, arm)]
+    if isinstance(request, _OF_A_RUN):
+        return _about_a_run(db, state, request)
+    if isinstance(request, Judge):
+        return _judgement(db, state, request)
+    arm = known_arm(db, state, request.arm)
+    made = None if isinstance(request, _WITHOUT_FOLDER) else new_id(arm.name)
+    words = [*_VERBS.get(request.kind, (request.kind,)), *_words(db, state, request, arm)]
     if made is not None:
-        words += ["--out", str(state / FOLDERS.get(asked.kind, RUNS) / made)]
-    moves = asked.kind in MOVES
+        words += ["--out", str(state / FOLDERS.get(request.kind, RUNS) / made)]
+    moves = request.kind in MOVES
     if moves:
         words.append("--lease-from-stdin")
     return Command(
@@ -135,9 +135,9 @@ def command(db: Database, state: Path, asked: Asked) -> Command:
         arm.name,
         moves,
         made,
-        resources(arm.config) if moves or isinstance(asked, Watch | Recover | BusScan | BusProbe) else (),
-        HOLD_TO_RUN_SECONDS if isinstance(asked, Rehearse) else LEASE_SECONDS,
-        waits=not isinstance(asked, Zero),
+        resources(arm.config) if moves or isinstance(request, Watch | Recover | BusScan | BusProbe) else (),
+        HOLD_TO_RUN_SECONDS if isinstance(request, Rehearse) else LEASE_SECONDS,
+        waits=not isinstance(request, Zero),
     )
 
 
@@ -158,46 +158,46 @@ def accepted_description(state: Path, arm: str, number: int) -> Path:
     return path
 
 
-def _words(db: Database, state: Path, asked: Asked, arm: KnownArm) -> list[str]:
+def _words(db: Database, state: Path, request: AnyJobRequest, arm: KnownArm) -> list[str]:
     path = str(arm.path)
-    if isinstance(asked, Design):
-        return [path, *_design(db, state, asked)]
-    if isinstance(asked, Identify):
-        recordings = _recordings(db, state, asked.recordings)
-        judged = [f"--validate={one}" for one in _recordings(db, state, asked.validate_on)]
-        judged += _columns(db, state, (*asked.recordings, *asked.validate_on))
-        chosen = {"method": asked.method, "feasible-set": asked.feasible_set, "prior": asked.prior}
-        if asked.as_accepted is not None:
-            path = str(accepted_description(state, arm.name, asked.as_accepted))
+    if isinstance(request, Design):
+        return [path, *_design(db, state, request)]
+    if isinstance(request, Identify):
+        recordings = _recordings(db, state, request.recordings)
+        judged = [f"--validate={one}" for one in _recordings(db, state, request.validate_on)]
+        judged += _columns(db, state, (*request.recordings, *request.validate_on))
+        chosen = {"method": request.method, "feasible-set": request.feasible_set, "prior": request.prior}
+        if request.as_accepted is not None:
+            path = str(accepted_description(state, arm.name, request.as_accepted))
         return [*recordings, "--arm", path, *judged, *_given_options(chosen)]
-    if isinstance(asked, Simulate):
-        motion = [] if asked.motion is None else [f"--motion={motion_path(db, state, asked.motion)}"]
-        return [path, *motion, *_given_options({"seed": asked.seed, "feasible-set": asked.feasible_set})]
-    if isinstance(asked, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
+    if isinstance(request, Simulate):
+        motion = [] if request.motion is None else [f"--motion={motion_path(db, state, request.motion)}"]
+        return [path, *motion, *_given_options({"seed": request.seed, "feasible-set": request.feasible_set})]
+    if isinstance(request, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
         return [path]
-    if isinstance(asked, Fleet):
-        return _fleet(db, state, asked, path)
-    if isinstance(asked, BusLoad):
-        return [path, *_given_options({"rate": asked.rate})]
-    if isinstance(asked, Zero):
+    if isinstance(request, Fleet):
+        return _fleet(db, state, request, path)
+    if isinstance(request, BusLoad):
+        return [path, *_given_options({"rate": request.rate})]
+    if isinstance(request, Zero):
         return [path, "--zero", "--confirm", arm.name]
-    if isinstance(asked, LeaveLimit):
+    if isinstance(request, LeaveLimit):
         return [path, "--leave-limit"]
-    if isinstance(asked, Watch):
-        return [path, f"--seconds={asked.seconds!r}", "--tell-samples"]
-    if isinstance(asked, Check | Run | Rehearse | Preview):
-        motion = [] if asked.motion is None else [str(motion_path(db, state, asked.motion))]
-        if isinstance(asked, Check):
-            return [path, *motion, *(["--home"] if asked.home else []), "--confirm", arm.name]
-        speed = [] if isinstance(asked, Preview) else [f"--speed={asked.speed!r}"]
-        return [path, *motion, *speed, *(_until(asked) if isinstance(asked, Run) else [])]
-    raise AssertionError(asked)
+    if isinstance(request, Watch):
+        return [path, f"--seconds={request.seconds!r}", "--tell-samples"]
+    if isinstance(request, Check | Run | Rehearse | Preview):
+        motion = [] if request.motion is None else [str(motion_path(db, state, request.motion))]
+        if isinstance(request, Check):
+            return [path, *motion, *(["--home"] if request.home else []), "--confirm", arm.name]
+        speed = [] if isinstance(request, Preview) else [f"--speed={request.speed!r}"]
+        return [path, *motion, *speed, *(_until(request) if isinstance(request, Run) else [])]
+    raise AssertionError(request)
 
 
-def _fleet(db: Database, state: Path, asked: Fleet, described: str) -> list[str]:
-    found = recordings_of(db, asked.arms)
+def _fleet(db: Database, state: Path, request: Fleet, described: str) -> list[str]:
+    found = recordings_of(db, request.arms)
     if not found:
-        raise UsageError(f"{', '.join(asked.arms)}: the registry has no recording of such arms; see the list of runs")
+        raise UsageError(f"{', '.join(request.arms)}: the registry has no recording of such arms; see the list of runs")
     if len(found) > _MOST_OF_FLEET:
         raise UsageError(
             f"{len(found)} recordings, and a job takes {_MOST_OF_FLEET}: name fewer arms, or use `ident fleet "
@@ -210,92 +210,97 @@ def _fleet(db: Database, state: Path, asked: Fleet, described: str) -> list[str]
             "fleet identify --names` at the daemon's machine"
         )
     files = [str(run_file(db, state, row["run"], row["name"])) for row in found]
-    again = ["--settle-again"] if asked.settle_again else []
+    again = ["--settle-again"] if request.settle_again else []
     return [*files, f"--arm={described}", f"--names={_OF_RUN}", f"--store={state / 'fleet' / 'store'}", *again]
 
 
-def _until(asked: Run) -> list[str]:
-    if asked.until is None:
+def _until(request: Run) -> list[str]:
+    if request.until is None:
         return []
-    return [f"--until={asked.until.share!r}", *(f"--parameter={one}" for one in asked.until.parameters)]
+    return [f"--until={request.until.share!r}", *(f"--parameter={one}" for one in request.until.parameters)]
 
 
-def _design(db: Database, state: Path, asked: Design) -> list[str]:
-    if asked.seconds is None and asked.starts is None:
+def _design(db: Database, state: Path, request: Design) -> list[str]:
+    if request.seconds is None and request.starts is None:
         raise UsageError("a search ends: give seconds, or starts, or both")
-    after = [f"--after={path}" for path in _as_described(db, state, asked.after)]
-    chosen = {"search-time": asked.seconds, "starts": asked.starts, "seed": asked.seed, "criterion": asked.criterion}
-    parameters = [f"--parameter={expression}" for expression in asked.parameters]
-    return [*after, *parameters, *_given_options({**chosen, "motion": asked.motion})]
+    after = [f"--after={path}" for path in _as_described(db, state, request.after)]
+    chosen = {
+        "search-time": request.seconds,
+        "starts": request.starts,
+        "seed": request.seed,
+        "criterion": request.criterion,
+    }
+    parameters = [f"--parameter={expression}" for expression in request.parameters]
+    return [*after, *parameters, *_given_options({**chosen, "motion": request.motion})]
 
 
 def _about_a_run(
     db: Database,
     state: Path,
-    asked: Report | Export | Verify | Compare | Feasible | Correct | Figures | Payload,
+    request: Report | Export | Verify | Compare | Feasible | Correct | Figures | Payload,
 ) -> Command:
-    folder, arm = run_folder(db, state, asked.run), str(known_run(db, asked.run)["arm"])
-    made = new_id(arm) if asked.kind in DOWNLOADABLE_KINDS else None
-    place = state / (REPORTS if isinstance(asked, Report) else EXPORTS)
-    if isinstance(asked, Verify):
-        described = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
-        words = ["verify", str(run_file(db, state, asked.run, PARAMETERS)), *_given_options({"arm": described})]
-    elif isinstance(asked, Compare):
-        words = ["compare", str(folder), str(run_folder(db, state, asked.other))]
-    elif isinstance(asked, Feasible | Correct):
-        conditions = None if asked.arm is None else str(known_arm(db, state, asked.arm).path)
-        words = [asked.kind, str(run_file(db, state, asked.run, PARAMETERS))]
-        words += _given_options({"feasible-set": asked.feasible_set, "arm": conditions})
-        if isinstance(asked, Correct):
-            words += [f"--metric={asked.metric}", "--out", str(place / str(made) / PARAMETERS)]
-    elif isinstance(asked, Report):
-        words = ["report", str(folder), "--out", str(place / f"{asked.run}.html")]
-    elif isinstance(asked, Payload):
-        words = ["payload", str(folder), *_as_described(db, state, asked.recordings), "--out", str(place / str(made))]
-        words += ["--refit-offsets"] if asked.refit_offsets else []
+    folder, arm = run_folder(db, state, request.run), str(known_run(db, request.run)["arm"])
+    made = new_id(arm) if request.kind in DOWNLOADABLE_KINDS else None
+    place = state / (REPORTS if isinstance(request, Report) else EXPORTS)
+    if isinstance(request, Verify):
+        described = None if request.arm is None else str(known_arm(db, state, request.arm).path)
+        words = ["verify", str(run_file(db, state, request.run, PARAMETERS)), *_given_options({"arm": described})]
+    elif isinstance(request, Compare):
+        words = ["compare", str(folder), str(run_folder(db, state, request.other))]
+    elif isinstance(request, Feasible | Correct):
+        conditions = None if request.arm is None else str(known_arm(db, state, request.arm).path)
+        words = [request.kind, str(run_file(db, state, request.run, PARAMETERS))]
+        words += _given_options({"feasible-set": request.feasible_set, "arm": conditions})
+        if isinstance(request, Correct):
+            words += [f"--metric={request.metric}", "--out", str(place / str(made) / PARAMETERS)]
+    elif isinstance(request, Report):
+        words = ["report", str(folder), "--out", str(place / f"{request.run}.html")]
+    elif isinstance(request, Payload):
+        words = ["payload", str(folder), *_as_described(db, state, request.recordings), "--out", str(place / str(made))]
+        words += ["--refit-offsets"] if request.refit_offsets else []
     else:
-        formats = asked.format if isinstance(asked, Figures) else ",".join(asked.formats)
-        words = [asked.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
-    if made is not None or isinstance(asked, Report):
+        formats = request.format if isinstance(request, Figures) else ",".join(request.formats)
+        words = [request.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
+    if made is not None or isinstance(request, Report):
         # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
-        (place / str(made) if isinstance(asked, Correct) else place).mkdir(parents=True, exist_ok=True)
-    return Command((*words, *_common_options(state)), arm, False, made or asked.run, (), LEASE_SECONDS)
+        (place / str(made) if isinstance(request, Correct) else place).mkdir(parents=True, exist_ok=True)
+    return Command((*words, *_common_options(state)), arm, False, made or request.run, (), LEASE_SECONDS)
 
 
-def _judgement(db: Database, state: Path, asked: Judge) -> Command:
-    run = known_run(db, asked.run)
-    if run["arm"] != asked.arm:
-        raise UsageError(f"the run {asked.run} is about the arm {run['arm']}, not {asked.arm}")
-    accepted = accepted_set(state, asked.arm, asked.against)[1] / PARAMETERS
-    words = ["compare", str(accepted), str(run_folder(db, state, asked.run)), "--keep"]
-    return Command((*words, *_common_options(state)), asked.arm, False, asked.run, (), LEASE_SECONDS)
+def _judgement(db: Database, state: Path, request: Judge) -> Command:
+    run = known_run(db, request.run)
+    if run["arm"] != request.arm:
+        raise UsageError(f"the run {request.run} is about the arm {run['arm']}, not {request.arm}")
+    accepted = accepted_set(state, request.arm, request.against)[1] / PARAMETERS
+    words = ["compare", str(accepted), str(run_folder(db, state, request.run)), "--keep"]
+    return Command((*words, *_common_options(state)), request.arm, False, request.run, (), LEASE_SECONDS)
 
 
-def _recordings(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
-    return [f"{_recording(db, state, one)}{range_words(one)}" for one in asked]
+def _recordings(db: Database, state: Path, request: Sequence[RecordingReference]) -> list[str]:
+    return [f"{_recording(db, state, one)}{range_words(one)}" for one in request]
 
 
 def _recording(db: Database, state: Path, one: RecordingReference) -> Path:
     return run_file(db, state, one.run, one.name or recording_name(db, one.run))
 
 
-def _as_described(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
+def _as_described(db: Database, state: Path, request: Sequence[RecordingReference]) -> list[str]:
     """Return paths as `_recordings` does, for commands that take no columns file.
 
     Raises:
         UsageError: a recording came with one.
     """
-    if _columns(db, state, asked):
+    if _columns(db, state, request):
         raise UsageError(
             "a recording that came with a columns file can be identified from only; for this, say how its "
             "columns are laid out in the arm's description, and upload it without"
         )
-    return _recordings(db, state, asked)
+    return _recordings(db, state, request)
 
 
-def _columns(db: Database, state: Path, asked: Sequence[RecordingReference]) -> list[str]:
+def _columns(db: Database, state: Path, request: Sequence[RecordingReference]) -> list[str]:
     """Return `--columns` options for the uploaded recordings that came with a columns file."""
-    files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in asked}
+    files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in request}
     return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 

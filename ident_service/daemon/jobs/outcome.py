@@ -59,14 +59,14 @@ class ProcessOutput:
 
     Attributes:
         answer: its one JSON object; empty where it had none.
-        log: the end of its output, without samples (`told_samples`).
+        log: the end of its output, without samples (`printed_samples`).
     """
 
     answer: dict[str, Any] = field(default_factory=dict)
     log: str = ""
 
 
-def said(folder: Path, most: int = _LAST) -> ProcessOutput:
+def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
     """Read the answer and the last `most` bytes of the log of a job's process."""
     answer: dict[str, Any] = {}
     try:
@@ -86,8 +86,8 @@ def said(folder: Path, most: int = _LAST) -> ProcessOutput:
     return ProcessOutput(answer, "\n".join(line for line in log.split("\n") if not line.startswith(rows.SAMPLES)))
 
 
-def told_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
-    """Return the samples that a job's process has told since an offset in its log, and the offset to go on from.
+def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
+    """Return the samples that a job's process has printed since an offset in its log, and the offset to go on from.
 
     Each has `joints`, `time` [s] and `position` [rad or m] as the samples of a run have (`live.Thinned`).
     """
@@ -102,41 +102,41 @@ def told_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
     return [json.loads(line.removeprefix(rows.SAMPLES)) for line in marked], offset + len(whole)
 
 
-def outcome(heard: ProcessOutput, exit_code: int | None, asked_to_end: str) -> Outcome:
+def outcome(output: ProcessOutput, exit_code: int | None, end_reason: str) -> Outcome:
     """Return the outcome of a process that has ended.
 
     Args:
-        heard: its output.
+        output: of the process.
         exit_code: as its parent saw it, None where it had another one.
-        asked_to_end: why it was asked to, empty if it was not.
+        end_reason: why it was asked to end; empty if it was not.
     """
-    code = heard.answer.get("exit_code")
+    code = output.answer.get("exit_code")
     if not isinstance(code, int):
         how = "" if exit_code is None else f" (signal {-exit_code})" if exit_code < 0 else f" (exit code {exit_code})"
-        last = heard.log.strip().splitlines()[-1:]
+        last = output.log.strip().splitlines()[-1:]
         words = "; ".join([f"its process ended without a result{how}", *last])
         # A full disk takes the answer, and leaves the exit code.
-        state = "faulted" if exit_code == 4 else "cancelled" if asked_to_end else "failed"
-        return Outcome(state, asked_to_end if state == "cancelled" else words, exit_code)
-    message = _message(heard.answer)
-    if _report(heard.answer).get("state") == STOPPED:
-        return Outcome("cancelled", asked_to_end or "the arm was stopped: a stop was requested", code)
+        state = "faulted" if exit_code == 4 else "cancelled" if end_reason else "failed"
+        return Outcome(state, end_reason if state == "cancelled" else words, exit_code)
+    message = _message(output.answer)
+    if _report(output.answer).get("state") == STOPPED:
+        return Outcome("cancelled", end_reason or "the arm was stopped: a stop was requested", code)
     state = _STATES.get(code, "failed")
-    if asked_to_end and state in ("failed", "refused"):
-        return Outcome("cancelled", "; ".join(filter(None, (asked_to_end, message))), code)
+    if end_reason and state in ("failed", "refused"):
+        return Outcome("cancelled", "; ".join(filter(None, (end_reason, message))), code)
     return Outcome(state, message, code)
 
 
-def interrupted(heard: ProcessOutput, folder: Path | None, *, moves: bool) -> str:
+def interrupted(output: ProcessOutput, folder: Path | None, *, moves: bool) -> str:
     """Describe a job that was running when the service died, from its output and its folder.
 
     Args:
-        heard: output of its process so far.
+        output: output of its process so far.
         folder: that it made, if any.
         moves: whether it is about a motion.
     """
     words = ["the service died while it ran"]
-    code = heard.answer.get("exit_code")
+    code = output.answer.get("exit_code")
     if folder is not None and (folder / ENDED).is_file():
         try:
             ended = json.loads((folder / ENDED).read_text(encoding="utf-8"))
@@ -147,7 +147,7 @@ def interrupted(heard: ProcessOutput, folder: Path | None, *, moves: bool) -> st
         words.append(f"its folder has no {ENDED}: the motion process was killed")
     if isinstance(code, int):
         words.append(f"its process went on and answered with exit code {code}")
-        if message := _message(heard.answer):
+        if message := _message(output.answer):
             words.append(message)
     if folder is not None and folder.is_dir():
         kept = [path.name for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
@@ -180,8 +180,8 @@ def _objections(answer: dict[str, Any]) -> Iterator[str]:
                 f" ({remedy})" if (remedy := check.get("remedy")) else ""
             )
     for key in ("unusable", "objections"):
-        said = answer.get(key)
-        yield from map(str, said if isinstance(said, list) else ())
+        reasons = answer.get(key)
+        yield from map(str, reasons if isinstance(reasons, list) else ())
     if answer.get("feasible") is False:
         yield "these parameters are not feasible"
 
@@ -239,15 +239,15 @@ def forget_unmade(db: Database, state: Path, row: Row) -> None:
         rows.made_nothing(db, row["id"])
 
 
-UNTOLD: Final = "the service died while it ran, and its process"
+END_UNOBSERVED: Final = "the service died while it ran, and its process"
 """Beginning of the detail of an interrupted job whose process has not been seen to end."""
 _LOOK = 0.1  # s between looks at processes of the previous service
 _WAIT = 40.0  # s for one of them to end; a controlled stop and its recording take less
 
 
-def untold(row: Row) -> bool:
+def is_end_unobserved(row: Row) -> bool:
     """Return whether a job was interrupted and its process has not been seen to end."""
-    return row["state"] == "interrupted" and str(row["detail"]).startswith(UNTOLD)
+    return row["state"] == "interrupted" and str(row["detail"]).startswith(END_UNOBSERVED)
 
 
 def mark_interrupted(db: Database, state: Path) -> None:
@@ -256,7 +256,7 @@ def mark_interrupted(db: Database, state: Path) -> None:
         for row in rows.jobs(db, states=rows.LIVE, most=1_000_000):
             running = row["state"] == "running"
             if running:
-                detail = f"{UNTOLD} is being looked for"
+                detail = f"{END_UNOBSERVED} is being looked for"
             elif row["motion"]:
                 detail = "the service ended before it began; nothing has moved, request it again"
             else:
@@ -284,7 +284,7 @@ class Orphan:
     since: float
 
     def standing(self, state: Path) -> str:
-        """Return how it stands, in words that follow `UNTOLD`; empty once it has ended."""
+        """Return how it stands, in words that follow `END_UNOBSERVED`; empty once it has ended."""
         row, moves = self.row, bool(self.row["motion"])
         lives = alive(self.process)
         has = controlling_pid(control_path(state, row["arm"])) if moves else None
@@ -314,7 +314,7 @@ def orphans(db: Database, state: Path) -> list[Orphan]:
             time.monotonic(),
         )
         for row in rows.jobs(db, states=("interrupted",), most=1_000_000)
-        if untold(row)
+        if is_end_unobserved(row)
     ]
 
 
@@ -352,14 +352,14 @@ def explain_interrupted(
                 over(job)
             elif words != told.setdefault(job, " is being looked for"):
                 told[job] = words
-                rows.explain(db, job, f"{UNTOLD}{words}")
+                rows.explain(db, job, f"{END_UNOBSERVED}{words}")
         if left:
             closing.wait(_LOOK)
 
 
 def _explain(db: Database, state: Path, row: Row) -> None:
     folder = folder_of(state, row)
-    detail = interrupted(said(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
+    detail = interrupted(process_output(state / JOBS / row["id"]), folder, moves=bool(row["motion"]))
     try:
         register_outputs(db, state, row, row["created_by"])
     except (IdentError, OSError) as error:

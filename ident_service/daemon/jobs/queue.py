@@ -37,10 +37,10 @@ from ident_service.daemon.jobs.outcome import (
     mark_interrupted,
     orphans,
     outcome,
+    process_output,
     register_outputs,
-    said,
 )
-from ident_service.daemon.jobs.requests import Asked
+from ident_service.daemon.jobs.requests import AnyJobRequest
 from ident_service.daemon.metrics import Metrics
 from ident_service.errors import DiskFull, IdentError, MotionRefused, UsageError
 from ident_service.motion.command_channel import stop_requested_ns
@@ -109,10 +109,10 @@ class LiveJob:
         by: who asked for it.
         own_lease: whether a motion's lease is the service's own.
         renewed: when that was renewed last [s].
-        asked_ns: when it was asked for, on the machine's monotonic clock, which stops at terminals tell, too [ns].
+        requested_ns: when it was asked for, on the machine's monotonic clock, which stops at terminals tell, too [ns].
         entered: whether the registry knows it; before, it keeps its place and nothing else.
         child: its process, once it runs.
-        asked_to_end: why it is to end; empty while it is not.
+        end_reason: why it is to end; empty while it is not.
         since: when that was asked [s].
         told: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
@@ -124,10 +124,10 @@ class LiveJob:
     by: str
     own_lease: bool
     renewed: float
-    asked_ns: int = 0
+    requested_ns: int = 0
     entered: bool = False
     child: JobProcess | None = None
-    asked_to_end: str = ""
+    end_reason: str = ""
     since: float = 0.0
     told: bool = False
     killed: bool = False
@@ -269,7 +269,7 @@ class LiveJobs:
         """Store the process of a job; pass on a stop that was asked for while it was being started."""
         with self._lock:
             live.child = child
-            if live.asked_to_end:
+            if live.end_reason:
                 _send_stop(live)
 
     def conclude(self, live: LiveJob, child: JobProcess) -> None:
@@ -280,7 +280,7 @@ class LiveJobs:
     def ending(self, job: str) -> bool:
         """Return whether a job is to end; a motion then ends when its arm rests."""
         live = self._jobs.get(job)
-        return live is not None and bool(live.asked_to_end)
+        return live is not None and bool(live.end_reason)
 
     # --- leases and stops
 
@@ -297,7 +297,7 @@ class LiveJobs:
         """
         with self._lock:
             live = self._jobs.get(job)
-            if live is None or not live.order.moves or live.asked_to_end:
+            if live is None or not live.order.moves or live.end_reason:
                 return None
             before, live.renewed = live.renewed, self._now()
             if live.child is not None:
@@ -340,8 +340,8 @@ class LiveJobs:
 
     def _end(self, live: LiveJob, why: str) -> None:
         """Ask a job to end; the first reason counts."""
-        if not live.asked_to_end:
-            live.asked_to_end, live.since = why, self._now()
+        if not live.end_reason:
+            live.end_reason, live.since = why, self._now()
         _send_stop(live)
         self.changed.set()
 
@@ -350,7 +350,7 @@ class LiveJobs:
         while not self._over.wait(TICK):
             with self._lock:
                 for live in self._jobs.values():
-                    if live.order.moves and live.entered and not live.asked_to_end:
+                    if live.order.moves and live.entered and not live.end_reason:
                         self._keep_lease(live, self._now() - live.renewed)
 
     def _keep_lease(self, live: LiveJob, silent: float) -> None:
@@ -385,7 +385,7 @@ class Engine:
         state: Path,
         *,
         computing: int = 1,
-        motion_door: Path | None = None,
+        motion_socket: Path | None = None,
         lease_factor: float = 1.0,
         now: Callable[[], float] = time.monotonic,
         metrics: Metrics | None = None,
@@ -396,7 +396,7 @@ class Engine:
             db: the registry.
             state: the state folder.
             computing: how many jobs compute at a time.
-            motion_door: socket of the unit that motions run in; None for processes of our own.
+            motion_socket: socket of the unit that motions run in; None for processes of our own.
             lease_factor: how much longer than usual the service waits for a renewal before it tells the motion's
                 process to stop, which counts by itself; for tests on machines that stall.
             now: the leases' clock [s].
@@ -405,7 +405,7 @@ class Engine:
         self.metrics = Metrics() if metrics is None else metrics
         self.db, self.state, self.audit = db, state, AuditQueue(db)
         self.live = LiveJobs(lease_factor, now, self.metrics.renewed)
-        self._computing, self._door, self._now = computing, motion_door, now
+        self._computing, self._motion_socket, self._now = computing, motion_socket, now
         self._unwritten: set[str] = set()  # jobs whose end waits for room
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
@@ -443,7 +443,7 @@ class Engine:
 
     def create(
         self,
-        asked: Asked,
+        asked: AnyJobRequest,
         by: str,
         *,
         own_lease: bool = False,
@@ -533,7 +533,7 @@ class Engine:
         if row["state"] != "running" or row["started"] is None:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
-        found = progress(said(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
+        found = progress(process_output(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
         return Progress(found.phase, None, None) if self.live.ending(row["id"]) else found
 
     def moving(self) -> list[str]:
@@ -607,7 +607,7 @@ class Engine:
     def _look(self) -> None:
         found = self.live.entered()
         for live in found:
-            if live.order.moves and not live.asked_to_end and self._stopped_at_terminal(live):
+            if live.order.moves and not live.end_reason and self._stopped_at_terminal(live):
                 self.live.end(live.job, "a stop was requested")
             # Running jobs first: a waiting one may have to wait for the registry.
             if live.child is not None:
@@ -620,12 +620,12 @@ class Engine:
         """Return whether a stop was asked for after this motion was, possibly not through this service."""
         stamp = stop_requested_ns(control_path(self.state, str(live.order.arm)))
         # A stamp in the future is from before the machine was started.
-        return live.asked_ns < stamp <= time.monotonic_ns()
+        return live.requested_ns < stamp <= time.monotonic_ns()
 
     def _wait(self, live: LiveJob) -> None:
         """Handle a queued job: end it if asked to, begin it if it is its turn."""
-        if live.asked_to_end:
-            self._finish(live, "cancelled", live.asked_to_end, None)
+        if live.end_reason:
+            self._finish(live, "cancelled", live.end_reason, None)
         elif self.live.free(live, self._computing):
             self._begin(live)
 
@@ -634,14 +634,14 @@ class Engine:
         if not rows.started(self.db, live.job, ""):
             self.live.remove(live)
             return
-        if live.asked_to_end:  # cancelled while the registry was written
-            self._finish(live, "cancelled", live.asked_to_end, None)
+        if live.end_reason:  # cancelled while the registry was written
+            self._finish(live, "cancelled", live.end_reason, None)
             return
         child: JobProcess
         try:
             # The unit for motions also has access to the buses.
-            if live.order.resources and self._door is not None:
-                child = UnitChild(live.order.words, folder, self._door)
+            if live.order.resources and self._motion_socket is not None:
+                child = UnitChild(live.order.words, folder, self._motion_socket)
             else:
                 child = SubprocessJob(live.order.words, folder)
         except (IdentError, OSError) as error:
@@ -653,7 +653,7 @@ class Engine:
 
     def _watch(self, live: LiveJob, child: JobProcess) -> None:
         """Check a running job; end a computation by SIGTERM, then by SIGKILL, and conclude a job that has ended."""
-        if live.asked_to_end and not live.order.moves:
+        if live.end_reason and not live.order.moves:
             if not live.told:
                 live.told = True
                 child.signal(signal.SIGTERM)
@@ -668,10 +668,10 @@ class Engine:
     def _conclude(self, live: LiveJob, child: JobProcess) -> None:
         """Enter what an ended job has made, then the job's end."""
         self.live.conclude(live, child)
-        ended = outcome(said(self.state / JOBS / live.job), child.exit_code, live.asked_to_end)
+        ended = outcome(process_output(self.state / JOBS / live.job), child.exit_code, live.end_reason)
         while True:
             try:
-                self._finish(live, ended.state, self._kept(live, ended.detail), ended.exit_code)
+                self._finish(live, ended.state, self._enter_outputs(live, ended.detail), ended.exit_code)
             except (sqlite3.Error, OSError) as error:
                 # For example a full disk; until there is room, the service must not count as healthy.
                 if live.job not in self._unwritten:  # once, however long it lasts
@@ -684,7 +684,7 @@ class Engine:
                 self._unwritten.discard(live.job)
                 return
 
-    def _kept(self, live: LiveJob, detail: str) -> str:
+    def _enter_outputs(self, live: LiveJob, detail: str) -> str:
         """Enter what a job made; return `detail`, with the error if that failed."""
         try:
             register_outputs(self.db, self.state, rows.known_job(self.db, live.job), live.by)
@@ -721,7 +721,7 @@ class Engine:
         """Queue computations again that waited when the service ended, in their old order."""
         from pydantic import TypeAdapter
 
-        reader: TypeAdapter[Asked] = TypeAdapter(Asked)
+        reader: TypeAdapter[AnyJobRequest] = TypeAdapter(AnyJobRequest)
         for row in rows.queue(self.db):
             try:
                 order = command(self.db, self.state, reader.validate_python(row["request"]))

@@ -283,7 +283,7 @@ class Fleet(BaseJobRequest):
     settle_again: bool = False
 
 
-Asked = Annotated[
+AnyJobRequest = Annotated[
     Base
     | Preview
     | Design

@@ -21,7 +21,7 @@ _OPTIONS_OF_LOOKS = ("--json", "--state", "--seconds=")
 
 
 def main() -> int:
-    """Become the requested command; return only if nothing, or nothing allowed here, was requested."""
+    """Replace this process by the requested command; return only if none, or one not allowed here, was requested."""
     line = bytearray()
     # Byte by byte: the input after the line belongs to the command.
     while not line.endswith(b"\n") and len(line) < _MOST:

@@ -22,9 +22,9 @@ from typing import Final
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import JOBS, accepted_description
-from ident_service.daemon.jobs.outcome import said, untold
+from ident_service.daemon.jobs.outcome import is_end_unobserved, process_output
 from ident_service.daemon.jobs.queue import Engine
-from ident_service.daemon.jobs.requests import Asked, Check, Identify, Judge, RecordingReference, Run
+from ident_service.daemon.jobs.requests import AnyJobRequest, Check, Identify, Judge, RecordingReference, Run
 from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
 from ident_service.operations.acceptance import ARM, accepted_set
 from ident_service.operations.drift_alarms import Verdict, raise_alarm, verdict_of
@@ -217,16 +217,16 @@ class Reidentifications:
 
     def _advance(self, row: Row) -> None:
         job = known_job(self._db, row["job"])
-        if job["state"] in LIVE or untold(job) or self._engine.closing:
+        if job["state"] in LIVE or is_end_unobserved(job) or self._engine.closing:
             return
         judged = row["step"] == "judge" and job["state"] in ("done", "refused")
-        answer = said(self._state / JOBS / job["id"]).answer if judged else {}
+        answer = process_output(self._state / JOBS / job["id"]).answer if judged else {}
         if "verdict" in answer:
             conclude(self._db, row, verdict_of(answer), self._now())
             self._forget(row["id"])
         elif job["state"] != "done":
             state = "failed" if judged else job["state"]
-            self._ended(row, state, f"{row['step']}: {job['detail'] or job['state']}{_kept(row)}")
+            self._ended(row, state, f"{row['step']}: {job['detail'] or job['state']}{_recording_note(row)}")
         elif row["step"] == "check" and row["id"] not in self._stops:
             why = "the service ended between preflight and run; nothing has moved since, request it again"
             self._ended(row, "interrupted", why)
@@ -235,7 +235,7 @@ class Reidentifications:
 
     def _begin_next(self, row: Row) -> None:
         arm, step = row["arm"], row["step"]
-        asked: Asked
+        asked: AnyJobRequest
         if step == "check":
             if row["unattended"]:
                 _require_allowed(known_arm(self._db, self._state, arm).config)
@@ -286,7 +286,7 @@ def _end(db: Database, row: Row, state: str, detail: str, now: float) -> bool:
     return bool(ended)
 
 
-def _kept(row: Row) -> str:
+def _recording_note(row: Row) -> str:
     return f"; the recording is kept in the run {row['recorded']}" if row["step"] in ("identify", "judge") else ""
 
 

@@ -1,17 +1,22 @@
-"""Serve the routes about the service itself: health, metrics, identity, sessions of the page, audit trail."""
+"""Serve the routes about the service itself: health, metrics, identity, sessions of the page, tokens, audit trail.
+
+Tokens are not made over HTTP: whoever got hold of an operator's token could make others, which would outlive its
+revocation. Making one is an act at the state folder (`ident tokens add`). Revoking over HTTP is safe: it cannot lock
+out a person at the state folder.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import Annotated
+from typing import Annotated, Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import PlainTextResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from ident_service import __version__
 from ident_service.daemon.authentication import SESSION_SECONDS, Throttled
-from ident_service.daemon.dependencies import COOKIE, Cookie, Serving, Viewer, address_of, throttled, unknown
+from ident_service.daemon.dependencies import COOKIE, Cookie, Operator, Serving, Viewer, address_of, throttled, unknown
 from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.responses import PAGES, AuditLine, BeforeNumber, HealthAnswer, Most, Page, WhoAnswer
 from ident_service.errors import IdentError
@@ -19,9 +24,11 @@ from ident_service.operations.drift_alarms import alarms
 from ident_service.operations.maintenance_schedule import pending
 from ident_service.registry.database import audit_log
 from ident_service.registry.state_folder import fault_file
+from ident_service.registry.tokens import revoke_token, tokens
 
 router = APIRouter(tags=["service"], responses=failures(), generate_unique_id_function=operation_id)
 AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines
+TokenName = Annotated[str, Path(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
 
 
 class Login(BaseModel):
@@ -31,12 +38,21 @@ class Login(BaseModel):
     token: Annotated[str, Field(min_length=1, max_length=200)]
 
 
+class TokenLine(BaseModel):
+    """Access token; `revoked` is when it was revoked, null while it is valid. The token itself is stored nowhere."""
+
+    name: str
+    role: Literal["viewer", "operator"]
+    created: float
+    revoked: float | None
+
+
 @router.get(
     "/healthz", responses={503: {"model": HealthAnswer, "description": "Queue or schedule is not looked after."}}
 )
 def healthz(service: Serving, response: Response) -> HealthAnswer:
     """Return whether the service looks after its queue and its schedule; asks for no token."""
-    healthy = service.engine.healthy and service.keeper.healthy and not service.engine.closing
+    healthy = service.engine.healthy and service.scheduler.healthy and not service.engine.closing
     response.status_code = 200 if healthy else 503
     return HealthAnswer(healthy=healthy, version=__version__)
 
@@ -68,7 +84,7 @@ def whoami(who: Viewer) -> WhoAnswer:
 def login(service: Serving, request: Request, response: Response, body: Login) -> WhoAnswer:
     """Exchange a token for a session; its cookie cannot be read by scripts and is sent by no other site."""
     try:
-        found = service.gate.log_in(body.token, address_of(request))
+        found = service.authenticator.log_in(body.token, address_of(request))
     except Throttled as error:
         raise throttled(error) from None
     if found is None:
@@ -89,7 +105,7 @@ def login(service: Serving, request: Request, response: Response, body: Login) -
 def logout(service: Serving, response: Response, cookie: Cookie = None) -> None:
     """End the session of the page."""
     if cookie is not None:
-        service.gate.log_out(cookie)
+        service.authenticator.log_out(cookie)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
 
 
@@ -98,3 +114,17 @@ def audit(page: Page, service: Serving, _: Viewer, before: BeforeNumber = None, 
     """List the lines of the audit trail, the newest first."""
     service.engine.audit.flush(AUDIT_SECONDS)
     return [AuditLine(**row) for row in page(most, lambda n: audit_log(service.db, before=before, most=n))]
+
+
+@router.get("/api/v1/tokens")
+def list_tokens(service: Serving, _: Operator) -> list[TokenLine]:
+    """List all tokens that were ever made, the earliest first."""
+    return [TokenLine(**row) for row in tokens(service.db)]
+
+
+@router.post("/api/v1/tokens/{token}/revoke", responses=failures(404))
+def revoke(service: Serving, who: Operator, token: TokenName) -> TokenLine:
+    """Revoke a token and the sessions that it began."""
+    revoke_token(service.db, token, who.name)
+    service.authenticator.refresh()
+    return next(TokenLine(**row) for row in tokens(service.db) if row["name"] == token)

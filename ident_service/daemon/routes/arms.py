@@ -1,4 +1,7 @@
-"""Serve the routes about arms: list, description, faults, acceptances, pause and resume, challenge, motions."""
+"""Serve the routes about arms: descriptions, faults, acceptances, pause and resume, challenge, motions, deletion.
+
+Modules that compute with mechanisms are imported only in the request, so that the service starts without them.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ from base64 import b64decode
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter
 from pydantic import BaseModel, ConfigDict, Field
 
+from ident_service.config.load import load_arm
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_BYTES
 from ident_service.daemon.authentication import CHALLENGE_SECONDS
@@ -21,21 +25,25 @@ from ident_service.daemon.responses import (
     PAGES,
     AcceptanceAnswer,
     AddedArmAnswer,
+    Anyway,
     ArmAnswer,
     ArmLine,
     AskedAnswer,
     BeforeId,
     ChallengeAnswer,
+    DeletionAnswer,
     FaultAnswer,
     Most,
     MotionAnswer,
     Page,
+    deletion_answer,
 )
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import controlling_pid
+from ident_service.operations import deletion
 from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
-from ident_service.operations.description_process import draw_apart, judge_apart
+from ident_service.operations.description_process import describe_apart, draw_apart, judge_apart
 from ident_service.registry import arms as known
 from ident_service.registry import motions
 from ident_service.registry.database import note
@@ -96,6 +104,49 @@ class Rollback(_Body):
     to: Annotated[int, Field(ge=1, lt=10_000)] | None = None
 
 
+class DescriptionAnswer(BaseModel):
+    """Description without mistakes.
+
+    `objections` say why the arm cannot be moved, each with line and column; `good` is whether there are none. `stable`
+    is of the gains, null where they or limits are missing; `text` is all of it for a person.
+    """
+
+    arm: str
+    sha256: str
+    good: bool
+    stable: bool | None
+    objections: list[str]
+    text: str
+
+
+class HomeJoint(BaseModel):
+    """One joint of the posture in which an arm is zeroed: its position [rad or m], and the unit of that."""
+
+    joint: str
+    position: float
+    unit: Literal["rad", "m"]
+
+
+class NewDescription(BaseModel):
+    """URDF of an arm, by name, with its meshes: each file's content in base 64. The arm gets `name`."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: ArmName
+    urdf: FileName
+    files: Annotated[dict[FileName, str], Field(min_length=1, max_length=64)]
+
+
+class NewDescriptionAnswer(BaseModel):
+    """First description of an arm, to be read and corrected: `guessed` says what the URDF did not tell.
+
+    `files` are those that it names; they are sent with it when the arm is added.
+    """
+
+    description: str
+    files: dict[str, str]
+    guessed: list[str]
+
+
 @router.get("/arms")
 def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
     """List all arms by name."""
@@ -144,7 +195,9 @@ def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
 def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
     """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
     name = known.known_arm(service.db, service.state, arm).name
-    return ChallengeAnswer(arm=name, challenge=service.gate.challenge(name, who.name), seconds=CHALLENGE_SECONDS)
+    return ChallengeAnswer(
+        arm=name, challenge=service.authenticator.challenge(name, who.name), seconds=CHALLENGE_SECONDS
+    )
 
 
 @router.get("/arms/{arm}/faults")
@@ -236,6 +289,44 @@ def add_motion(service: Serving, who: Operator, body: MotionUpload) -> MotionAns
 def get_motion(service: Serving, _: Viewer, motion: Id) -> MotionAnswer:
     """Show a motion: its arm, duration and hash."""
     return MotionAnswer(**motions.known_motion(service.db, motion))
+
+
+@router.delete("/motions/{motion}", responses=failures(404, 409))
+def delete_motion(service: Serving, who: Operator, motion: Id, anyway: Anyway = False) -> DeletionAnswer:
+    """Delete a motion; runs keep their copy of it."""
+    return deletion_answer(motion, deletion.delete_motion(service.db, service.state, motion, who.name, anyway=anyway))
+
+
+@router.delete("/arms/{arm}", responses=failures(404, 409))
+def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: Anyway = False) -> DeletionAnswer:
+    """Delete an uploaded arm, and with it its motions, runs, schedules and acceptances."""
+    return deletion_answer(arm, deletion.delete_arm(service.db, service.state, arm, who.name, anyway=anyway))
+
+
+@router.post("/descriptions/new")
+def describe(service: Serving, _: Operator, body: NewDescription) -> NewDescriptionAnswer:
+    """Write a first description of an arm from its URDF and meshes; nothing is kept."""
+    if body.urdf not in body.files:
+        raise UsageError(f"{body.urdf!r} is not among the files; send the URDF with its meshes")
+    with service.checks.place(), TemporaryDirectory(prefix="ident-new-") as place:
+        write_files(Path(place), body.files)
+        return NewDescriptionAnswer(**describe_apart(Path(place) / body.urdf, body.name))
+
+
+@router.post("/descriptions/check")
+def check(service: Serving, _: Operator, body: Description) -> DescriptionAnswer:
+    """Check a description without keeping it; its mistakes are answered with line and column."""
+    with service.checks.place(), known.uploaded(service.state, body.description, body.files) as path:
+        load_arm(path, upload=True)  # finds most mistakes, without a process
+        return DescriptionAnswer(**judge_apart(path))
+
+
+@router.get("/arms/{arm}/home")
+def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
+    """Show the posture in which an arm must stand when it is zeroed; refused for other arms."""
+    from ident_service.operations.recovery import home_posture
+
+    return [HomeJoint(**asdict(one)) for one in home_posture(known.known_arm(service.db, service.state, arm).config)]
 
 
 def _arm(service: Service, arm: str) -> ArmAnswer:

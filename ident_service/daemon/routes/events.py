@@ -1,4 +1,4 @@
-"""Serve the event stream of all arms and jobs, and of the samples of runs that are being recorded."""
+"""Serve event streams: of all arms and jobs with the samples of runs that are being recorded, and of one job."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from fastapi.responses import StreamingResponse
 
 from ident_service.daemon.dependencies import Service, Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, operation_id
+from ident_service.daemon.jobs.requests import Id
 from ident_service.daemon.live import LiveRuns
-from ident_service.daemon.live_stream import RECORDED
+from ident_service.daemon.live_stream import RECORDED, live_events
 from ident_service.daemon.news import EventPoller, ViewerEvent, ViewerPosition
 from ident_service.registry import jobs as rows
 from ident_service.registry.runs import RUNS
 
-router = APIRouter(prefix="/api/v1", tags=["events"], responses=failures(), generate_unique_id_function=operation_id)
+router = APIRouter(prefix="/api/v1", responses=failures(), generate_unique_id_function=operation_id)
 _LOOK = 0.1  # s between news
 _STATE = 0.5  # s between queries for runs that are being recorded
 _BREATH = 10.0  # s without news, after which a comment shows that the connection is up
@@ -35,18 +36,18 @@ LastEvent = Annotated[
         alias="Last-Event-ID",
         ge=0,
         lt=2**62,
-        description="the last `id` that was seen; everything that has happened since is told first",
+        description="the last `id` that was seen; everything that has happened since is while_known first",
     ),
 ]
 After = Annotated[int | None, Query(ge=0, lt=2**62, description="the same, for whoever cannot send that header")]
 Samples = Annotated[bool, Query(description="also `samples` and `doubt` of runs that are recorded")]
 
 
-@router.get("/events", response_class=StreamingResponse, responses=_STREAM)
+@router.get("/events", tags=["events"], response_class=StreamingResponse, responses=_STREAM)
 async def watch_all(
     service: Serving,
     _: Viewer,
-    told: WhileAuthorized,
+    while_known: WhileAuthorized,
     request: Request,
     last_event_id: LastEvent = None,
     after: After = None,
@@ -62,7 +63,22 @@ async def watch_all(
     # The header counts first: a browser that comes again sends it with the address of the first time.
     seen = await run_in_threadpool(watch.begin, after if last_event_id is None else last_event_id)
     live = request.app.state.live if samples else None
-    return StreamingResponse(told(_events(service, watch, seen, live)), media_type="text/event-stream")
+    return StreamingResponse(while_known(_events(service, watch, seen, live)), media_type="text/event-stream")
+
+
+@router.get("/jobs/{job}/live", tags=["jobs"], response_class=StreamingResponse, responses=_STREAM | failures(404))
+async def watch_live(
+    service: Serving, _: Viewer, while_known: WhileAuthorized, request: Request, job: Id
+) -> StreamingResponse:
+    """Watch a job and the run that it records, by server-sent events.
+
+    `job` has its state and log; `samples` has time, position, torque and following error of every joint, one every
+    20 ms; `doubt` has the standard deviations of the parameters so far.
+    """
+    row = await run_in_threadpool(rows.known_job, service.db, job)
+    return StreamingResponse(
+        while_known(live_events(service, request.app.state.live, row)), media_type="text/event-stream"
+    )
 
 
 async def _events(
@@ -107,12 +123,12 @@ class _Recorded:
             for ended in self._jobs.keys() - runs.keys():
                 self._live.forget(ended)
             self._jobs = {job: self._jobs.get(job, (run, 0)) for job, run in runs.items()}
-        told = []
+        while_known = []
         for job, (run, number) in self._jobs.items():
             for frame in self._live.run(job, self._service.state / RUNS / run).since(number):
                 self._jobs[job] = (run, frame.number)
-                told.append(f'event: {frame.kind}\ndata: {{"job": {json.dumps(job)}, {frame.data[1:]}\n\n')
-        return told
+                while_known.append(f'event: {frame.kind}\ndata: {{"job": {json.dumps(job)}, {frame.data[1:]}\n\n')
+        return while_known
 
 
 def _event(one: ViewerEvent) -> str:

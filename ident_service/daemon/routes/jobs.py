@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Viewer, WhileAuthorized
 from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import held_until, said, untold
-from ident_service.daemon.jobs.requests import MOVES, ArmName, Asked, Id
+from ident_service.daemon.jobs.outcome import held_until, is_end_unobserved, process_output
+from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id
 from ident_service.daemon.responses import (
     PAGES,
     BeforeNumber,
@@ -85,7 +85,7 @@ class JobRequest(BaseModel):
     """Job to be done; one that may move an arm needs the confirmation, and its lease renewed from now on."""
 
     model_config = ConfigDict(extra="forbid")
-    job: Asked
+    job: AnyJobRequest
     confirm: Confirmation | None = None
 
 
@@ -96,7 +96,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
         MotionRefused: no confirmation, or one that does not count.
     """
     # The challenge is used up first, so that a name cannot be tried again with it.
-    good = confirm is not None and service.gate.confirm(confirm.challenge, arm, who)
+    good = confirm is not None and service.authenticator.confirm(confirm.challenge, arm, who)
     if confirm is not None and confirm.name != arm:
         raise MotionRefused(
             f"{arm}: the typed name {confirm.name!r} is not this arm's; nothing moves. To move {arm}, type its name "
@@ -172,22 +172,22 @@ def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
 def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
     """Return the end of the log of a job."""
     row = rows.known_job(service.db, job)
-    return PlainTextResponse(said(service.state / JOBS / row["id"], MOST_LOG).log)
+    return PlainTextResponse(process_output(service.state / JOBS / row["id"], MOST_LOG).log)
 
 
 @router.get("/jobs/{job}/result")
 def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
     """Return what the command of a job answered."""
     row = rows.known_job(service.db, job)
-    answer = said(service.state / JOBS / row["id"]).answer
+    answer = process_output(service.state / JOBS / row["id"]).answer
     return JobResult(job=row["id"], answer=_named(answer, service, row))
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
-async def watch_job(service: Serving, _: Viewer, told: WhileAuthorized, job: Id) -> StreamingResponse:
+async def watch_job(service: Serving, _: Viewer, while_known: WhileAuthorized, job: Id) -> StreamingResponse:
     """Watch a job by server-sent events; `job` whenever it changes, until it has ended."""
     row = await run_in_threadpool(rows.known_job, service.db, job)
-    return StreamingResponse(told(_events(service, row["id"])), media_type="text/event-stream")
+    return StreamingResponse(while_known(_events(service, row["id"])), media_type="text/event-stream")
 
 
 @router.post("/jobs/{job}/cancel")
@@ -247,7 +247,7 @@ def job_answer_document(service: Service, row: Row) -> JobAnswer:
     shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
-    moves = bool(row["motion"]) and (row["state"] == "running" or untold(row))
+    moves = bool(row["motion"]) and (row["state"] == "running" or is_end_unobserved(row))
     held = moves and held_arm(service.state, str(row["arm"]))
     if held and progress is not None:  # it ends when a person says so
         progress |= {"fraction": None, "remaining": None}
@@ -266,7 +266,7 @@ def _named(value: Any, service: Service, row: Row) -> Any:
 
 
 def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) -> Any:
-    """Values in which places below the state folder are told relative to it.
+    """Return values in which paths below the state folder are relative to it.
 
     Args:
         value: JSON values.

@@ -235,7 +235,7 @@ def list_reidentifications(
 ) -> list[ReidentificationAnswer]:
     """List re-identifications, the newest first."""
     found = page(most, lambda n: reidentifications(service.db, arm, before=before, most=n))
-    return [_told(service, row) for row in found]
+    return [_answer(service, row) for row in found]
 
 
 @router.post("/reidentifications", status_code=201)
@@ -246,19 +246,21 @@ def begin_reidentification(service: Serving, who: Operator, body: NewReidentific
     """
     arm = _arm(service, body.arm)
     require_confirmed(service, arm, body.confirm, who.name)
-    return _told(service, service.keeper.reidentifications.begin(ReidentificationRequest(arm, body.motion), who.name))
+    return _answer(
+        service, service.scheduler.reidentifications.begin(ReidentificationRequest(arm, body.motion), who.name)
+    )
 
 
 @router.get("/reidentifications/{name}")
 def get_reidentification(service: Serving, _: Viewer, name: Id) -> ReidentificationAnswer:
     """Show a re-identification."""
-    return _told(service, known_reidentification(service.db, name))
+    return _answer(service, known_reidentification(service.db, name))
 
 
 @router.post("/reidentifications/{name}/lease")
 async def renew_reidentification(service: Serving, who: LeaseKeeper, name: Id) -> LeaseAnswer:
     """Renew the lease of a re-identification, for the step that it is at; none is needed where nothing moves."""
-    step = service.keeper.reidentifications.step(name)
+    step = service.scheduler.reidentifications.step(name)
     if step is None:
         row = await run_in_threadpool(known_reidentification, service.db, name)
         step = row["begun_by"], row["job"]
@@ -303,5 +305,5 @@ def _arm(service: Service, arm: str) -> str:
     return known_arm(service.db, service.state, arm).name
 
 
-def _told(service: Service, row: Row) -> ReidentificationAnswer:
+def _answer(service: Service, row: Row) -> ReidentificationAnswer:
     return ReidentificationAnswer(**{**row, "detail": without_paths(row["detail"], str(service.state))})

@@ -1,4 +1,7 @@
-"""Serve the routes about runs: their records, recordings, parameters, files and reports."""
+"""Serve the routes about runs: their records, recordings, parameters, files, reports and exports, and what is deleted.
+
+Old recordings are listed first, and deleted only with `yes`; a run in use is deleted only with `anyway`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,9 @@ from ident_service.daemon.errors import failures, operation_id
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.responses import (
     PAGES,
+    Anyway,
     BeforeId,
+    DeletionAnswer,
     Most,
     Page,
     ParametersAnswer,
@@ -21,8 +26,11 @@ from ident_service.daemon.responses import (
     RunAnswer,
     RunLine,
     SeriesAnswer,
+    deletion_answer,
 )
+from ident_service.daemon.routes.jobs import without_paths
 from ident_service.errors import UnknownId
+from ident_service.operations import deletion, run_archive
 from ident_service.registry import runs
 from ident_service.registry.database import Row
 from ident_service.registry.runs import REPORTS
@@ -45,11 +53,48 @@ _PAGE: dict[int | str, dict[str, Any]] = {
 
 
 class Labels(BaseModel):
-    """Tags and note of a run: whoever looks for it finds it again by them."""
+    """Tags and note of a run, by which it is found in lists."""
 
     model_config = ConfigDict(extra="forbid")
     tags: Annotated[list[Annotated[str, Field(max_length=40)]], Field(max_length=runs.MOST_TAGS)] = []
     note: Annotated[str, Field(max_length=runs.LONGEST_NOTE)] = ""
+
+
+class ExportAnswer(BaseModel):
+    """Export: the job that made it, and the size of each file [bytes]."""
+
+    id: str
+    kind: str
+    arm: str | None
+    job: str
+    made: float | None
+    made_by: str
+    files: dict[str, int]
+
+
+class Pruning(BaseModel):
+    """Number of each arm's newest runs whose recordings are kept; nothing is deleted without `yes`."""
+
+    model_config = ConfigDict(extra="forbid")
+    keep: Annotated[int, Field(ge=1, le=1_000_000)]
+    yes: Annotated[bool, Field(strict=True)] = False
+
+
+class PrunedRecording(BaseModel):
+    """Recording that may be deleted, or was."""
+
+    run: str
+    name: str
+    bytes: int
+
+
+class PruningAnswer(BaseModel):
+    """Recordings that were deleted, or would be; `left_alone` says which folders could not be read, and why."""
+
+    deleted: bool
+    bytes: int
+    recordings: list[PrunedRecording]
+    left_alone: list[str]
 
 
 @router.get("/runs", responses=PAGES)
@@ -107,6 +152,51 @@ def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
     if not path.is_file():
         raise UnknownId(f"the run {run} has no report yet; ask for a job of the kind report")
     return FileResponse(path, media_type="text/html", headers={"Content-Security-Policy": _POLICY})
+
+
+@router.delete("/runs/{run}", responses=failures(404, 409))
+def delete_run(service: Serving, who: Operator, run: Id, anyway: Anyway = False) -> DeletionAnswer:
+    """Delete a run with its recordings and its report."""
+    return deletion_answer(run, deletion.delete_run(service.db, service.state, run, who.name, anyway=anyway))
+
+
+@router.post("/recordings/prune")
+def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
+    """Delete old recordings of runs that nobody accepted and no job needs."""
+    unreadable = runs.rebuild_runs(service.db, service.state)
+    gone = (
+        run_archive.prune(service.db, service.state, body.keep, who.name)
+        if body.yes
+        else run_archive.expendable(service.db, service.state, body.keep)
+    )
+    return PruningAnswer(
+        deleted=body.yes,
+        bytes=sum(one.bytes for one in gone),
+        recordings=[PrunedRecording(run=one.run, name=one.name, bytes=one.bytes) for one in gone],
+        left_alone=without_paths(unreadable, str(service.state)),
+    )
+
+
+@router.get("/exports/{export}")
+def get_export(service: Serving, _: Viewer, export: Id) -> ExportAnswer:
+    """Show an export and its files, by the id that its job names as its run."""
+    row = runs.known_export(service.db, export)
+    return ExportAnswer(
+        id=row["run"],
+        kind=row["kind"],
+        arm=row["arm"],
+        job=row["id"],
+        made=row["ended"],
+        made_by=row["created_by"],
+        files=runs.export_files(service.db, service.state, export),
+    )
+
+
+@router.get("/exports/{export}/files/{name}", response_class=FileResponse, responses=_BINARY)
+def get_exported_file(service: Serving, _: Viewer, export: Id, name: FileName) -> FileResponse:
+    """Download a file of an export; as something to be kept, never as a page."""
+    path = runs.export_file(service.db, service.state, export, name)
+    return FileResponse(path, media_type="application/octet-stream", filename=name)
 
 
 def _labelled(row: Row | None) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from ident_service.config.arm import ArmConfig
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import status_of
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import said
+from ident_service.daemon.jobs.outcome import process_output
 from ident_service.daemon.jobs.requests import MOVES, ArmName, Id
 from ident_service.daemon.maintenance.reidentification import (
     known_reidentification,
@@ -37,7 +37,7 @@ from ident_service.daemon.web.arm_facts import (
     joint_facts,
     motion_svg,
 )
-from ident_service.daemon.web.forms import Form, PageRoute, seen
+from ident_service.daemon.web.forms import Form, PageRoute, see_other
 from ident_service.daemon.web.reidentification_pages import compared
 from ident_service.daemon.web.render import page, picture, when
 from ident_service.errors import IdentError, MotionRefused, UsageError
@@ -97,7 +97,7 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Ladder:
+class CommissioningWorkflow:
     """All commissioning steps of an arm, and what they are about.
 
     Attributes:
@@ -119,7 +119,7 @@ class Ladder:
     comparable: bool
 
 
-def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
+def commissioning_workflow(db: Database, state: Path, config: ArmConfig) -> CommissioningWorkflow:
     """Return the commissioning steps of an arm with their states.
 
     Raises:
@@ -188,7 +188,7 @@ def ladder(db: Database, state: Path, config: ArmConfig) -> Ladder:
         done = {key: done[key] for key in _WITHOUT_ARM}
         upcoming = next((key for key, (finished, _) in done.items() if not finished), "")
     steps = tuple(Step(key, TITLES[key], state_of(key), words, busy.get(key)) for key, (_, words) in done.items())
-    return Ladder(steps, run_id, identified, accepted, exported, reported, comparable)
+    return CommissioningWorkflow(steps, run_id, identified, accepted, exported, reported, comparable)
 
 
 def _comparable(state: Path, config: ArmConfig) -> tuple[bool, str]:
@@ -337,7 +337,7 @@ def _upcoming(service: Service, row: Row, facts: ArmFacts) -> Step | None:
         return None
     try:
         config = known.known_arm(service.db, service.state, row["name"]).config
-        steps = ladder(service.db, service.state, config).steps
+        steps = commissioning_workflow(service.db, service.state, config).steps
     except IdentError:
         return None  # the page of the arm says why
     return next((step for step in steps if step.state in ("busy", "next")), None)
@@ -369,7 +369,7 @@ def take_description(service: Serving, who: Operator, form: Form) -> Response:
         added = arms.add_arm(service, who, arms.NewArm(description=text, replace=replace))
     except IdentError as error:
         return page("new", who, status_of(error), problem=str(error), text=text, replace=replace)
-    return seen(f"/arms/{added.name}")
+    return see_other(f"/arms/{added.name}")
 
 
 @router.get("/arms/{arm}")
@@ -388,7 +388,7 @@ def show_arm(service: Serving, who: Viewer, arm: ArmName) -> Response:
         joints=joint_facts(config),
         seen=_last_look(service, answer.name),
         unread=_failed_look(service, answer.name),
-        rungs=ladder(service.db, service.state, config),
+        workflow=commissioning_workflow(service.db, service.state, config),
         motions=known_motions.motions(service.db, answer.name),
         alarms=_alarms(service, answer.name),
         dues=due,
@@ -414,14 +414,14 @@ def move(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Begin a motion that a person has confirmed; the page of its job keeps its lease from then on."""
     if form.get("kind") == "rehearse":
         raise UsageError("a rehearsal begins when the button of its page is held")
-    asked = _asked(arm, form)
+    asked = _requested_job(arm, form)
     body = {"job": asked, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
     try:
         job = jobs.begin_job(service, who, jobs.JobRequest.model_validate(body))
     except MotionRefused:
         words = "That was not the arm's name, or this page was open for too long. Nothing has moved; try again."
         return _confirmation(service, who, arm, form, words)
-    return seen(f"/jobs/{job.id}?attended=1")
+    return see_other(f"/jobs/{job.id}?attended=1")
 
 
 @router.post("/arms/{arm}/jobs")
@@ -429,15 +429,15 @@ def compute(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respon
     """Queue a job that moves nothing."""
     if form.get("kind") not in _KINDS:
         raise UsageError("choose an action on the page of the arm")
-    job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _asked(arm, form)}))
-    return seen(f"/jobs/{job.id}")
+    job = jobs.begin_job(service, who, jobs.JobRequest.model_validate({"job": _requested_job(arm, form)}))
+    return see_other(f"/jobs/{job.id}")
 
 
 @router.post("/arms/{arm}/ack")
 def acknowledge(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Acknowledge a fault that a person has read."""
     arms.acknowledge(service, who, arm, form.get("code", ""))
-    return seen(f"/arms/{arm}")
+    return see_other(f"/arms/{arm}")
 
 
 @router.post("/arms/{arm}/accept")
@@ -445,7 +445,7 @@ def accept(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
     """Accept the parameters of a run as the arm's, on a person's decision."""
     _require_name(arm, form)
     arms.accept_run(service, who, arm, arms.Acceptance(run=form.get("run", ""), note=form.get("note", "")))
-    return seen(f"/arms/{arm}#accepted")
+    return see_other(f"/arms/{arm}#accepted")
 
 
 @router.post("/arms/{arm}/rollback")
@@ -454,7 +454,7 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
     _require_name(arm, form)
     body = {"note": form.get("note", ""), **({"to": form["to"]} if form.get("to") else {})}
     arms.roll_back(service, who, arm, arms.Rollback.model_validate(body))
-    return seen(f"/arms/{arm}#accepted")
+    return see_other(f"/arms/{arm}#accepted")
 
 
 @router.post("/arms/{arm}/pause")
@@ -463,8 +463,8 @@ def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
     (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
     job, again = form.get("job", ""), form.get("again", "")
     if again:
-        return seen(f"/reidentifications/{known_reidentification(service.db, again)['id']}?attended=1")
-    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+        return see_other(f"/reidentifications/{known_reidentification(service.db, again)['id']}?attended=1")
+    return see_other(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
 @router.post("/arms/{arm}/finish")
@@ -472,7 +472,7 @@ def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Respons
     """End a run early by its regular end."""
     arms.finish(service, who, arm)
     job = form.get("job", "")
-    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+    return see_other(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
 @router.post("/arms/{arm}/supported")
@@ -480,7 +480,7 @@ def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
     """Confirm, on a person's word, that an arm that is held is supported."""
     arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
     job = form.get("job", "")
-    return seen(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+    return see_other(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
 def _last_look(service: Service, arm: str) -> dict[str, Any] | None:
@@ -491,7 +491,7 @@ def _last_look(service: Service, arm: str) -> dict[str, Any] | None:
     if found is None:
         return None
     job = rows.known_job(service.db, found["id"])
-    return {"at": job["ended"], "job": job["id"], **said(service.state / JOBS / job["id"]).answer}
+    return {"at": job["ended"], "job": job["id"], **process_output(service.state / JOBS / job["id"]).answer}
 
 
 def _failed_look(service: Service, arm: str) -> dict[str, Any] | None:
@@ -519,7 +519,7 @@ def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
     ]
 
 
-def _asked(arm: str, form: dict[str, str]) -> dict[str, Any]:
+def _requested_job(arm: str, form: dict[str, str]) -> dict[str, Any]:
     """Return the job that a form asks for; empty fields are left out."""
     kind = form.get("kind", "")
     given = {key: value for key, value in form.items() if value and key in _FIELDS.get(kind, ())}

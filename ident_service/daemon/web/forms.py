@@ -77,13 +77,13 @@ def failure(request: Request, status: int, words: str) -> Response:
     """Return a failure as a page."""
     service = service_of(request)
     cookie = request.cookies.get(COOKIE)
-    who = service.gate.known(None, cookie)
+    who = service.authenticator.known(None, cookie)
     title = HTTPStatus(status).phrase
     words = words.replace(f"{service.state}/", "").encode("utf-8", "replace").decode()
     return page("failure", who, status, title=title, words=words)
 
 
-def seen(address: str) -> RedirectResponse:
+def see_other(address: str) -> RedirectResponse:
     """Redirect to an address after a form (303 See Other)."""
     return RedirectResponse(address, 303)
 

@@ -14,7 +14,7 @@ from ident_service.daemon.jobs.requests import FileName, Id
 from ident_service.daemon.live_stream import READ, RECORDED, log_of
 from ident_service.daemon.routes import jobs
 from ident_service.daemon.web.arm_facts import joint_facts
-from ident_service.daemon.web.forms import Form, PageRoute, seen
+from ident_service.daemon.web.forms import Form, PageRoute, see_other
 from ident_service.daemon.web.render import page
 from ident_service.daemon.web.run_pages import identified_set, run_facts
 from ident_service.errors import IdentError, UnknownId
@@ -109,7 +109,7 @@ def cancel(service: Serving, who: Operator, job: Id, form: Form) -> Response:
     """Cancel a job."""
     del form  # reading the form has checked that it comes from a page of this service
     jobs.cancel_job(service, who, job)
-    return seen(f"/jobs/{job}")
+    return see_other(f"/jobs/{job}")
 
 
 @router.get("/exports/{job}/{name}")

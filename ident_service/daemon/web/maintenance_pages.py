@@ -15,7 +15,7 @@ from ident_service.daemon.errors import status_of
 from ident_service.daemon.jobs.requests import ArmName
 from ident_service.daemon.routes import arms, maintenance
 from ident_service.daemon.routes.maintenance import Number
-from ident_service.daemon.web.forms import Form, PageRoute, seen, words_of
+from ident_service.daemon.web.forms import Form, PageRoute, see_other, words_of
 from ident_service.daemon.web.render import page
 from ident_service.errors import IdentError, UsageError
 from ident_service.operations import maintenance_schedule as planned
@@ -48,7 +48,7 @@ def add_schedule(service: Serving, who: Operator, arm: ArmName, form: Form) -> R
         maintenance.add_schedule(service, who, maintenance.NewSchedule.model_validate(body))
     except (IdentError, ValidationError) as error:
         return _page(service, who, arm, form, error, "schedule")
-    return seen(f"/arms/{arm}/maintenance#schedules")
+    return see_other(f"/arms/{arm}/maintenance#schedules")
 
 
 @router.post("/schedules/{number}/enabled")
@@ -56,7 +56,7 @@ def enable_schedule(service: Serving, who: Operator, number: Number, form: Form)
     """Enable a schedule from now on, or disable it."""
     wanted = maintenance.Enabled(enabled=form.get("wanted") == "enable")
     row = maintenance.enable_schedule(service, who, number, wanted)
-    return seen(f"/arms/{row.arm}/maintenance#schedules")
+    return see_other(f"/arms/{row.arm}/maintenance#schedules")
 
 
 @router.post("/schedules/{number}/remove")
@@ -65,7 +65,7 @@ def remove_schedule(service: Serving, who: Operator, number: Number, form: Form)
     del form  # reading the form has checked that it comes from a page of this service
     arm = planned.known_schedule(service.db, number)["arm"]
     maintenance.remove_schedule(service, who, number)
-    return seen(f"/arms/{arm}/maintenance#schedules")
+    return see_other(f"/arms/{arm}/maintenance#schedules")
 
 
 @router.post("/arms/{arm}/maintenance")
@@ -76,7 +76,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, form: Form) -
         maintenance.add_maintenance(service, who, arm, maintenance.Event.model_validate(body))
     except (IdentError, ValidationError) as error:
         return _page(service, who, arm, form, error, "event")
-    return seen(f"/arms/{arm}/maintenance#due")
+    return see_other(f"/arms/{arm}/maintenance#due")
 
 
 @router.post("/due/{number}/dismiss")
@@ -86,14 +86,14 @@ def dismiss(service: Serving, who: Operator, number: Number, form: Form) -> Resp
     if arm is None:
         raise UsageError(f"nothing of number {number} is due any more")
     maintenance.dismiss_due(service, who, number, maintenance.Remark(note=form.get("note", "").strip()))
-    return seen(f"/arms/{arm}/maintenance#due")
+    return see_other(f"/arms/{arm}/maintenance#due")
 
 
 @router.post("/alarms/{number}/ack")
 def acknowledge(service: Serving, who: Operator, number: Number, form: Form) -> Response:
     """Acknowledge a drift alarm for a person; the accepted set stays as it is."""
     body = maintenance.Remark(note=form.get("note", "").strip())
-    return seen(f"/arms/{maintenance.acknowledge_alarm(service, who, number, body).arm}")
+    return see_other(f"/arms/{maintenance.acknowledge_alarm(service, who, number, body).arm}")
 
 
 def _page(

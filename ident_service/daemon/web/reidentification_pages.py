@@ -23,7 +23,7 @@ from ident_service.daemon.live_stream import log_of
 from ident_service.daemon.maintenance.reidentification import known_reidentification, require_comparable
 from ident_service.daemon.routes import arms, jobs, maintenance
 from ident_service.daemon.web.arm_facts import joint_facts
-from ident_service.daemon.web.forms import Form, PageRoute, seen
+from ident_service.daemon.web.forms import Form, PageRoute, see_other
 from ident_service.daemon.web.render import page
 from ident_service.daemon.web.run_pages import POLICY
 from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
@@ -140,12 +140,12 @@ def compared(db: Database, state: Path, run: str | None, words: str) -> Compared
         if any(file_sha256(folder / name) != named[name] for name in (DOCUMENT, PAGE)):
             return None
         document = json.loads((folder / DOCUMENT).read_bytes())
-        return _told(folder, document["compared"][0]) if verdict_of(document).words == words else None
+        return _comparison(folder, document["compared"][0]) if verdict_of(document).words == words else None
     except (IdentError, OSError, ValueError, LookupError, TypeError):
         return None
 
 
-def _told(folder: Path, pair: dict[str, Any]) -> Compared:
+def _comparison(folder: Path, pair: dict[str, Any]) -> Compared:
     found = [Finding(one["what"], one["joint"], one["sigma"], one["size"], one["meaning"]) for one in pair["findings"]]
     errors = pair["torque_error_percent"]
     both = None if errors is None else (float(errors["reference"]["whole"]), float(errors["own"]["whole"]))
@@ -201,7 +201,7 @@ def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response
         return _confirmation(service, who, arm, form, words)
     if remark:
         note(service.db, who.name, _NOTED, begun.id, note=remark)
-    return seen(f"/reidentifications/{begun.id}?attended=1")
+    return see_other(f"/reidentifications/{begun.id}?attended=1")
 
 
 @router.get("/reidentifications/{name}")
@@ -242,7 +242,7 @@ def cancel(service: Serving, who: Operator, name: Id, form: Form) -> Response:
     except UsageError:
         # Between two steps there is no job to cancel; a stop makes sure that no motion begins any more.
         service.engine.stop(row["arm"], who.name)
-    return seen(f"/reidentifications/{name}?attended=1")
+    return see_other(f"/reidentifications/{name}?attended=1")
 
 
 @router.get("/reidentifications/{name}/comparison")

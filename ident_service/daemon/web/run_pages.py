@@ -20,7 +20,7 @@ from ident_service.daemon.responses import BeforeId
 from ident_service.daemon.routes import runs
 from ident_service.daemon.routes.about import AUDIT_SECONDS
 from ident_service.daemon.web.arm_facts import joint_facts
-from ident_service.daemon.web.forms import Form, PageRoute, seen
+from ident_service.daemon.web.forms import Form, PageRoute, see_other
 from ident_service.daemon.web.render import page
 from ident_service.errors import IdentError, UsageError
 from ident_service.motion.ending import ENDED
@@ -302,7 +302,7 @@ def label(service: Serving, who: Operator, run: Id, form: Form) -> Response:
     """Give a run the tags and the note of a form."""
     tags = form.get("tags", "").replace(",", " ").split()
     found = known.label_run(service.db, run, tags, form.get("note", "").replace("\r\n", "\n").strip(), who.name)
-    return seen(f"/runs/{found['run']}#labels")
+    return see_other(f"/runs/{found['run']}#labels")
 
 
 @router.get("/overlay")

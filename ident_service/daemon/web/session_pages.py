@@ -10,7 +10,7 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from ident_service.daemon.dependencies import Cookie, Near, Serving
 from ident_service.daemon.routes import about
 from ident_service.daemon.routes.jobs import stop_all
-from ident_service.daemon.web.forms import Form, PageRoute, inside, seen
+from ident_service.daemon.web.forms import Form, PageRoute, inside, see_other
 from ident_service.daemon.web.render import (
     STATIC,
     VENDORED,
@@ -37,7 +37,7 @@ def show_login(where: Next = "/") -> Response:
 @router.post("/login")
 def log_in(service: Serving, request: Request, form: Form) -> Response:
     """Exchange the form's token for a session."""
-    where, answer = inside(form.get("next", "/")), seen(inside(form.get("next", "/")))
+    where, answer = inside(form.get("next", "/")), see_other(inside(form.get("next", "/")))
     try:
         about.login(service, request, answer, about.Login(token=form.get("token", "").strip()[:200] or "none"))
     except HTTPException as error:
@@ -50,7 +50,7 @@ def log_in(service: Serving, request: Request, form: Form) -> Response:
 def log_out(service: Serving, form: Form, cookie: Cookie = None) -> Response:
     """End the session."""
     del form  # reading the form has checked that it comes from a page of this service
-    answer = seen("/login")
+    answer = see_other("/login")
     about.logout(service, answer, cookie)
     return answer
 
@@ -77,5 +77,5 @@ async def stop(service: Serving, request: Request, near: Near, cookie: Cookie = 
     """Bring all arms to a controlled stop; the same callers may as for the API's stop."""
     done = await stop_all(service, near)
     back = inside(urlsplit(request.headers.get("referer", "")).path or "/")
-    who = service.gate.known(None, cookie)
+    who = service.authenticator.known(None, cookie)
     return page("stopped", who, arms=done.arms, jobs=done.jobs, back="/" if back == "/stop" else back)

@@ -276,11 +276,11 @@ class ConicProblem:
         around = np.zeros(self.variables)
         status, attempts, iterations, seconds = "", 0, 0, 0.0
         # Orthonormal coordinates make every constraint one of all variables, which costs twenty times as much.
-        close = [way for way in _POSES if not (self.rough and way.around == "orthonormal")]
+        close = [attempt for attempt in _POSES if not (self.rough and attempt.around == "orthonormal")]
         for tolerance in _TOLERANCES[-1:] if self.rough else _TOLERANCES:
-            for way in tuple(close):
-                pose = precondition(self._rows, objective, hessian, around, way.around)
-                result = _solve(pose, way, tolerance)
+            for attempt in tuple(close):
+                pose = precondition(self._rows, objective, hessian, around, attempt.around)
+                result = _solve(pose, attempt, tolerance)
                 attempts, iterations = attempts + 1, iterations + result.iterations
                 seconds += result.solve_time
                 x = pose.point(np.array(result.x))
@@ -289,11 +289,11 @@ class ConicProblem:
                     duals = self._duals(pose, np.array(result.z))
                     return Solution(x, duals, value, iterations, seconds, tolerance, attempts)
                 status = status or str(result.status)
-                if result.status in _FINAL and way.around is None:
+                if result.status in _FINAL and attempt.around is None:
                     raise SolverError(name, str(result.status))
                 if result.status != clarabel.SolverStatus.AlmostSolved:
-                    close.remove(way)
-                if way.around is None and np.all(np.isfinite(x)):
+                    close.remove(attempt)
+                if attempt.around is None and np.all(np.isfinite(x)):
                     around = x
         raise SolverError(name, status)
 
@@ -328,7 +328,7 @@ class CompressedColumns:
         return CompressedColumns(matrix[rows, columns], rows, ends, (matrix.shape[0], matrix.shape[1]))
 
 
-def _solve(pose: ScaledProblem, way: _SolverAttempt, tolerance: float) -> clarabel.DefaultSolution:
+def _solve(pose: ScaledProblem, attempt: _SolverAttempt, tolerance: float) -> clarabel.DefaultSolution:
     A = CompressedColumns.of(-np.vstack([block.F for block in pose.rows]))
     b = np.concatenate([block.f for block in pose.rows])
     hessian = np.diag(pose.hessian) if pose.hessian.ndim == 1 else np.triu(pose.hessian)
@@ -339,8 +339,8 @@ def _solve(pose: ScaledProblem, way: _SolverAttempt, tolerance: float) -> clarab
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     # `AlmostSolved` then means that the loosest tolerance was reached.
     settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = _TOLERANCES[-1]
-    settings.max_step_fraction = way.step
-    settings.equilibrate_max_iter = way.equilibrations
+    settings.max_step_fraction = attempt.step
+    settings.equilibrate_max_iter = attempt.equilibrations
     cones = [_cone(block) for block in pose.rows]
     return clarabel.DefaultSolver(CompressedColumns.of(hessian), pose.objective, A, b, cones, settings).solve()
 

@@ -96,7 +96,7 @@ class Block:
         return self._smallest(delta, np.ones(self.size or len(self.f)))
 
     def smallest_scaled(self, delta: Array) -> float:
-        """Return the largest t with the block at `delta` minus t times its reference scale still positive."""
+        """Return the largest t with the block at `delta` minus t times its reference scale positive semidefinite."""
         return self._smallest(delta, self.references())
 
     def largest_scaled(self, delta: Array) -> float:
@@ -116,7 +116,7 @@ class Block:
 
     @cached_property
     def felt(self) -> NDArray[np.intp]:
-        """The parameters that it is about, as columns of F."""
+        """Return the columns of F that are not zero: the parameters that the block depends on."""
         return np.flatnonzero(np.any(self.F != 0.0, axis=0))
 
     def identity(self) -> Array:
@@ -305,7 +305,7 @@ class _Group:
         self._F, self._f = np.vstack([block.F for block in own]), np.concatenate([block.f for block in own])
 
     def smallest(self, delta: Array) -> Array:
-        """Smallest eigenvalue or number of each block, shape (blocks,)."""
+        """Return the smallest eigenvalue or number of each block, shape (blocks,)."""
         entries = self._F @ delta + self._f
         if self._size == 0:
             return np.asarray(np.minimum.reduceat(entries, self._ends))
@@ -347,7 +347,7 @@ class FeasibleSet:
 
     @cached_property
     def links(self) -> tuple[frozenset[str], ...]:
-        """Numbers of the links that each block is about, as they end the names of its parameters."""
+        """Return the numbers of the links that each block depends on, as they end the names of its parameters."""
         return tuple(frozenset(link_of(self.names[column]) for column in block.felt) for block in self.blocks)
 
     def scaled_margin(self, delta: Array) -> tuple[float, str]:

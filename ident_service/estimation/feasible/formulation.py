@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -27,9 +26,6 @@ MULTIPLIER = 1e-6  # smaller multipliers are the interior-point method's own dis
 OF_TESTS = (np.inf, 1e4, 1e3, 1e2)
 OF_TABLES = (1e4, 1e3, 1e2)  # the nearest feasible table; the paper's table 1 takes masses of thousands of kg to print
 OF_ESTIMATES = (1e2, 1e3, 1e4)
-
-
-Solved = TypeVar("Solved")
 
 
 class LinkParameterMap:
@@ -74,27 +70,6 @@ def insets(conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Array:
         size = max((sizes.get(link, 1.0) for link in links), default=1.0)
         found.append(max(EPSILON * min(1.0, size), _LEAST_INSET))
     return np.array(found)
-
-
-def with_insets(solve: Callable[[Array], Solved], conditions: FeasibleSet, base: BaseParameters, beta: Array) -> Solved:
-    """Solve with insets for the links' sizes, and with the paper's where those are too small for the solver.
-
-    Args:
-        solve: from one inset per block to the solution.
-        conditions: the set.
-        base: grouping of the parameters.
-        beta: unconstrained base parameters, shape (base,).
-
-    Raises:
-        SolverError: neither can be solved.
-    """
-    inside = insets(conditions, base, beta)
-    try:
-        return solve(inside)
-    except SolverError:
-        if (inside == EPSILON).all():
-            raise
-        return solve(np.full_like(inside, EPSILON))
 
 
 def constrain(problem: ConicProblem, block: Block, F: Array, f: Array) -> None:

@@ -18,9 +18,9 @@ from ident_service.estimation.feasible.formulation import (
     active_constraints,
     conflicting_constraints,
     constrain,
+    insets,
     minimise,
     project,
-    with_insets,
 )
 from ident_service.estimation.least_squares import unit_columns
 from ident_service.model.base_parameters import BaseParameters
@@ -160,21 +160,6 @@ def nearest(
         ConditionsError: no parameters at all fulfil the conditions.
         SolverError: the solver stopped without an optimum.
     """
-    return with_insets(
-        lambda inside: _nearest(metric, target, beta, base, conditions, name, reaches, inside), conditions, base, beta
-    )
-
-
-def _nearest(
-    metric: Array,
-    target: Array,
-    beta: Array,
-    base: BaseParameters,
-    conditions: FeasibleSet,
-    name: str,
-    reaches: Sequence[float],
-    inside: Array,
-) -> FeasibleEstimate:
     lift = LinkParameterMap(base)
     n, variables = base.size, len(base.names) + 1
     problem = ConicProblem(variables)
@@ -188,7 +173,7 @@ def _nearest(
     distance[1:, :n] = metric * columns / scale
     problem.second_order(distance, np.concatenate([[0.0], -target / scale]))
     to_delta = np.column_stack([lift.of_beta * columns, lift.of_dependent, np.zeros(len(base.names))])
-    add_conditions(problem, conditions, to_delta, inside)
+    add_conditions(problem, conditions, to_delta, insets(conditions, base, beta))
     size = float(np.max(np.abs(beta), initial=0.0))
     best: FeasibleEstimate | None = None
     failure: SolverError | None = None

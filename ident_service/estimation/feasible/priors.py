@@ -25,7 +25,7 @@ from ident_service.errors import ParameterError, SolverError
 from ident_service.estimation.feasible.central import ChangeEllipsoid
 from ident_service.estimation.feasible.conic import ConicProblem, triangle_entries
 from ident_service.estimation.feasible.feasible_set import Block, FeasibleSet, feasible_set, reference, symmetric
-from ident_service.estimation.feasible.formulation import OF_TESTS, active_constraints, with_insets
+from ident_service.estimation.feasible.formulation import OF_TESTS, active_constraints, insets
 from ident_service.estimation.feasible.nearest import FeasibleEstimate, add_conditions, solve_inside
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base_parameters import BaseParameters
@@ -141,12 +141,6 @@ def solve_with_prior(
     """
     if prior.names != conditions.names:
         raise ParameterError("the prior and the feasible set are about different link parameters")
-    return with_insets(lambda inside: _towards_prior(fit, base, conditions, prior, inside), conditions, base, fit.beta)
-
-
-def _towards_prior(
-    fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior, inside: Array
-) -> FeasibleEstimate:
     sigma = residual_deviation(fit) if prior.sigma is None else prior.sigma
     n, links = len(prior.names), prior.whitened if prior.kind == "entropic" else ()
     rows = len(fit.rho1)
@@ -155,7 +149,7 @@ def _towards_prior(
     problem = ConicProblem(variables)
     to_delta = np.zeros((n, variables))
     to_delta[:, :n] = np.diag(prior.scales)
-    add_conditions(problem, conditions, to_delta, inside)
+    add_conditions(problem, conditions, to_delta, insets(conditions, base, fit.beta))
     residual = np.zeros((rows, variables))
     residual[:, :n] = fit.R1 @ base.K * prior.scales / sigma
     residual[:, n : n + rows] = -np.eye(rows)
@@ -217,7 +211,7 @@ def move_off_boundary(
     delta = np.where(likely.drives > 0.0, likely.drives, delta)
     prior = Prior("entropic", conditions.names, delta, 1.0)
     try:
-        found = with_insets(lambda inside: _within(prior, base, conditions, near, inside), conditions, base, held.beta)
+        found = _within(prior, base, conditions, near, insets(conditions, base, held.beta))
     except (ParameterError, SolverError):
         return held
     beta = base.K @ found

@@ -11,27 +11,17 @@ import base64
 import binascii
 import json
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from itertools import repeat
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ident_service.errors import ParameterError, UsageError
-from ident_service.results.evidence.evidence import (
-    Array,
-    Body,
-    Condition,
-    Estimated,
-    Evidence,
-    Friction,
-    JointTrace,
-    Mask,
-    PosedArm,
-    PredictionTrace,
-    Spectrum,
-    Spike,
-    Timing,
-)
+from ident_service.results.evidence.evidence import Array, Evidence, Mask, PredictionTrace
 from ident_service.results.manifest import write_atomically
 from ident_service.results.parameter_file import require_schema, strict_json
 from ident_service.results.plots import LARGEST
@@ -145,85 +135,44 @@ def _validate(content: Any, path: Path) -> None:
     require_schema(content, "evidence", path, "evidence")
 
 
+# Arrays that are packed, and the shape that they have; None for any length.
+_PACKED: dict[tuple[str, str], tuple[int | None, ...]] = {
+    **{("JointTrace", name): (2, None) for name in ("torque", "predicted", "residual")},
+    ("JointTrace", "velocity"): (None,),
+    ("Spectrum", "correlation"): (None,),
+    **{("Friction", name): (None,) for name in ("velocity", "torque")},
+}
+# What the file says in another form, see `evidence_document`.
+_OTHERWISE = {("Evidence", "joints"), ("Evidence", "revolute"), ("PredictionTrace", "time"), ("Spectrum", "density")}
+
+
 def evidence_document(evidence: Evidence) -> dict[str, Any]:
-    """Return evidence as JSON values."""
-    return {
-        "format": "ident-evidence",
-        "version": 1,
-        "parameters_sha256": evidence.parameters_sha256,
-        "joints": [
-            {"name": name, "revolute": turns} for name, turns in zip(evidence.joints, evidence.revolute, strict=True)
-        ],
-        "estimates": [
-            {
-                "name": one.name,
-                "values": one.values.tolist(),
-                "margin": one.margin,
-                "identification": one.identification,
-                "validation": list(one.validation),
-                "moving": one.moving,
-                "moving_validation": list(one.moving_validation),
-            }
-            for one in evidence.estimates
-        ],
-        "unconstrained": evidence.unconstrained,
-        "constrained": evidence.constrained,
-        "chosen": evidence.chosen,
-        "bounds": [list(names) for names in evidence.bounds],
-        "recordings": [_recording_document(one) for one in evidence.recordings],
-        "friction": [
-            {
-                "velocity": packed(one.velocity),
-                "torque": packed(one.torque),
-                "curve_velocity": one.curve_velocity.tolist(),
-                "curve_torque": one.curve_torque.tolist(),
-                "terms": list(one.terms),
-            }
-            for one in evidence.friction
-        ],
-        "conditions": [
-            {"name": one.name, "links": list(one.links), "margin": one.margin, "scaled": one.scaled}
-            for one in evidence.conditions
-        ],
-        "posed": None if evidence.posed is None else _posed_document(evidence.posed),
-        "timing": [_timing_document(one) for one in evidence.timing],
-        "warnings": list(evidence.warnings),
-    }
-
-
-def _recording_document(one: PredictionTrace) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "sha256": one.sha256,
-        "role": one.role,
-        "width": one.width,
+    """Return evidence as JSON values: fields by their names, arrays packed or as lists."""
+    document = _document(evidence)
+    document["joints"] = [
+        {"name": name, "revolute": turns} for name, turns in zip(evidence.joints, evidence.revolute, strict=True)
+    ]
+    for traced, one in zip(document["recordings"], evidence.recordings, strict=True):
         # Stretches are numbered from the recording's first sample; a jump is a gap.
-        "runs": runs_of(np.round(one.time / one.width - 0.5).astype(np.int64)),
-        "joints": [
-            {
-                "torque": packed(joint.torque),
-                "predicted": packed(joint.predicted),
-                "residual": packed(joint.residual),
-                "velocity": packed(joint.velocity),
-                "standstill": packed_mask(joint.standstill),
-            }
-            for joint in one.joints
-        ],
-        "spectra": [
-            {
-                "frequency": spectrum.frequency.tolist(),
-                # Densities span many powers of ten.
-                "log_density": packed(np.log10(np.maximum(spectrum.density, 1e-30))),
-                "lag": spectrum.lag.tolist(),
-                "correlation": packed(spectrum.correlation),
-                "white": spectrum.white,
-            }
-            for spectrum in one.spectra
-        ],
-        "spikes": [
-            spike and {"time": spike.time, "residual": spike.residual, "position": spike.position.tolist()}
-            for spike in one.spikes
-        ],
+        traced["runs"] = runs_of(np.round(one.time / one.width - 0.5).astype(np.int64))
+        for lines, spectrum in zip(traced["spectra"], one.spectra, strict=True):
+            # Densities span many powers of ten.
+            lines["log_density"] = packed(np.log10(np.maximum(spectrum.density, 1e-30)))
+    return {"format": "ident-evidence", "version": 1, **document}
+
+
+def _document(value: Any, place: tuple[str, str] = ("", "")) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype == bool:
+            return packed_mask(value)
+        return packed(value) if place in _PACKED else value.tolist()
+    if isinstance(value, tuple):
+        return [_document(one) for one in value]
+    if not is_dataclass(value):
+        return value
+    places = [(type(value).__name__, each.name) for each in fields(value)]
+    return {
+        name: _document(getattr(value, name), (kind, name)) for kind, name in places if (kind, name) not in _OTHERWISE
     }
 
 
@@ -233,79 +182,48 @@ def runs_of(numbers: np.ndarray[Any, np.dtype[np.int64]]) -> list[list[int]]:
     return [[int(numbers[b]), int(n)] for b, n in zip(begins, np.diff(begins, append=len(numbers)), strict=True)]
 
 
-def _posed_document(posed: PosedArm) -> dict[str, Any]:
-    bodies = [
-        {
-            "mass": body.mass,
-            "center": body.center.tolist(),
-            "axes": None if body.axes is None else body.axes.tolist(),
-        }
-        for body in posed.bodies
-    ]
-    return {
-        "points": posed.points.tolist(),
-        "branches": [list(branch) for branch in posed.branches],
-        "bodies": bodies,
-    }
-
-
-def _timing_document(one: Timing) -> dict[str, Any]:
-    return {
-        "recording": one.recording,
-        "source": one.source,
-        "edges": one.edges.tolist(),
-        "counts": one.counts.tolist(),
-        "samples": one.samples,
-        "rate": one.rate,
-        "largest": one.largest,
-        "compute": one.compute,
-        "gaps": [list(gap) for gap in one.gaps],
-        "gap_count": one.gap_count,
-        "lost": one.lost,
-        "invalid": list(one.invalid),
-        "oldest": list(one.oldest),
-    }
-
-
 def _evidence(content: Mapping[str, Any]) -> Evidence:
-    joints, estimates = len(content["joints"]), content["estimates"]
-    size = len(content["bounds"])
-    for one in estimates:
-        _require(len(one["values"]) == size, f"estimate {one['name']!r} has {len(one['values'])} values, not {size}")
+    for one in content["recordings"]:
+        count = sum(length for _, length in one["runs"])
+        _require(count <= 1 << 20, f"{one['name']!r} has {count} stretches")
+    found: Evidence = _read(Evidence, content)
+    joints, estimates = len(found.joints), found.estimates
+    for each in estimates:
+        size = len(found.bounds)
+        _require(len(each.values) == size, f"estimate {each.name!r} has {len(each.values)} values, not {size}")
     for key in ("unconstrained", "constrained", "chosen"):
         _require(content[key] < len(estimates), f"{key} is estimate {content[key]} of {len(estimates)}")
-    recordings = tuple(_traced(one, joints) for one in content["recordings"])
-    _require(len(content["timing"]) == len(recordings), "not one timing per recording")
-    _require(len(content["friction"]) in (0, joints), "not one friction per drive")
-    return Evidence(
-        parameters_sha256=content["parameters_sha256"],
-        joints=tuple(joint["name"] for joint in content["joints"]),
-        revolute=tuple(joint["revolute"] for joint in content["joints"]),
-        estimates=tuple(
-            Estimated(
-                one["name"],
-                np.array(one["values"], float),
-                one["margin"],
-                one["identification"],
-                tuple(one["validation"]),
-                one["moving"],
-                tuple(one["moving_validation"]),
-            )
-            for one in estimates
-        ),
-        unconstrained=content["unconstrained"],
-        constrained=content["constrained"],
-        chosen=content["chosen"],
-        bounds=tuple(tuple(names) for names in content["bounds"]),
-        recordings=recordings,
-        friction=tuple(_friction(one) for one in content["friction"]),
-        conditions=tuple(
-            Condition(one["name"], tuple(one["links"]), one["margin"], one["scaled"]) for one in content["conditions"]
-        ),
-        posed=None if content["posed"] is None else _posed(content["posed"], joints),
-        timing=tuple(_timing(one, joints) for one in content["timing"]),
-        warnings=tuple(content["warnings"]),
-    )
+    for traced in found.recordings:
+        _check_recording(traced, joints)
+    _require(len(found.timing) == len(found.recordings), "not one timing per recording")
+    _require(len(found.friction) in (0, joints), "not one friction per drive")
+    for friction in found.friction:
+        _require(len(friction.torque) == len(friction.velocity), "friction points of two lengths")
+        _require(len(friction.curve_velocity) == len(friction.curve_torque), "a friction curve of two lengths")
+    if (posed := found.posed) is not None:
+        points = len(posed.points)
+        _require(points == 1 + 2 * joints and len(posed.bodies) == joints, "the arm's frames and bodies")
+        _require(all(max(branch) < points for branch in posed.branches), "the arm's branches")
+    for timing in found.timing:
+        _require(len(timing.edges) == len(timing.counts) + 1, "a histogram's edges and counts")
+        for key in ("invalid", "oldest"):
+            _require(len(getattr(timing, key)) in (0, joints), f"{key} of {len(getattr(timing, key))} axes")
+    return found
+
+
+def _check_recording(one: PredictionTrace, joints: int) -> None:
+    _require(len(one.joints) == joints, f"{one.name!r} has {len(one.joints)} joints, not {joints}")
+    _require(len(one.spectra) in (0, joints), f"{one.name!r} has {len(one.spectra)} spectra")
+    _require(len(one.spikes) in (0, joints), f"{one.name!r} has {len(one.spikes)} spikes, not {joints}")
+    _require(bool((np.diff(one.time) > 0.0).all()), f"time of {one.name!r} does not increase")
+    for trace in one.joints:
+        lengths = {array.shape[-1] for array in vars(trace).values()}
+        _require(lengths == {len(one.time)}, f"a joint of {one.name!r} has arrays of {sorted(lengths)} stretches")
+    for spectrum in one.spectra:
+        _require(len(spectrum.density) == len(spectrum.frequency), "a spectrum of two lengths")
+        _require(len(spectrum.correlation) == len(spectrum.lag), "an autocorrelation of two lengths")
+    for spike in filter(None, one.spikes):
+        _require(len(spike.position) == joints, f"a spike of {one.name!r} is not of {joints} joints")
 
 
 def _require(holds: bool, words: str) -> None:
@@ -320,89 +238,45 @@ def _numbers(values: Any) -> Array:
     return array
 
 
-def _densities(content: Mapping[str, Any], lines: int) -> Array:
-    logs = unpacked(content, (lines,))
-    _require(bool((np.abs(logs) < _LARGEST_LOG).all()), "a density beyond any of an arm")
-    return np.asarray(10.0**logs)
-
-
-def _traced(content: Mapping[str, Any], joints: int) -> PredictionTrace:
-    _require(len(content["joints"]) == joints, f"{content['name']!r} has {len(content['joints'])} joints, not {joints}")
-    _require(len(content["spectra"]) in (0, joints), f"{content['name']!r} has {len(content['spectra'])} spectra")
-    count = sum(length for _, length in content["runs"])
-    _require(count <= 1 << 20, f"{content['name']!r} has {count} stretches")
-    numbers = np.concatenate([first + np.arange(length) for first, length in content["runs"]])
-    _require(bool((np.diff(numbers) > 0).all()), f"time of {content['name']!r} does not increase")
-    traces = tuple(
-        JointTrace(
-            torque=unpacked(one["torque"], (2, count)),
-            predicted=unpacked(one["predicted"], (2, count)),
-            residual=unpacked(one["residual"], (2, count)),
-            velocity=unpacked(one["velocity"], (count,)),
-            standstill=unpacked_mask(one["standstill"], count),
+def _read(kind: Any, content: Any, place: tuple[str, str] = ("", "")) -> Any:
+    """Read a value of a type from the JSON values that `_document` makes of it, which fit the schema."""
+    if content is None:
+        return None
+    if get_origin(kind) in (Union, UnionType):
+        kind = next(one for one in get_args(kind) if one is not type(None))
+    if get_origin(kind) is tuple:
+        of = get_args(kind)
+        return tuple(
+            _read(one, each) for one, each in zip(repeat(of[0]) if of[-1] is ... else of, content, strict=False)
         )
-        for one in content["joints"]
+    if get_origin(kind) is np.ndarray:
+        if place in _PACKED:
+            return unpacked(content, _PACKED[place])
+        if kind == Mask:
+            return unpacked_mask(content, content["bits"])
+        return np.array(content, np.int64) if kind == NDArray[np.int64] else _numbers(content)
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        return content
+    hints, name = get_type_hints(kind), kind.__name__
+    known = {key: _read(hints[key], content[key], (name, key)) for key in hints if key in content} | _otherwise(
+        name, content
     )
-    spectra = tuple(
-        Spectrum(
-            frequency=_numbers(one["frequency"]),
-            density=_densities(one["log_density"], len(one["frequency"])),
-            lag=_numbers(one["lag"]),
-            correlation=unpacked(one["correlation"], (len(one["lag"]),)),
-            white=one["white"],
-        )
-        for one in content["spectra"]
-    )
-    time = (numbers + 0.5) * content["width"]
-    spikes = content.get("spikes", [])
-    _require(len(spikes) in (0, joints), f"{content['name']!r} has {len(spikes)} spikes, not {joints}")
-    for spike in filter(None, spikes):
-        _require(len(spike["position"]) == joints, f"a spike of {content['name']!r} is not of {joints} joints")
-    return PredictionTrace(
-        *(content["name"], content["sha256"], content["role"], time, content["width"], traces, spectra),
-        tuple(one and Spike(one["time"], one["residual"], _numbers(one["position"])) for one in spikes),
-    )
+    return kind(**known)
 
 
-def _friction(content: Mapping[str, Any]) -> Friction:
-    velocity = unpacked(content["velocity"], (None,))
-    curve = [_numbers(content[key]) for key in ("curve_velocity", "curve_torque")]
-    _require(len(curve[0]) == len(curve[1]), "a friction curve of two lengths")
-    torque = unpacked(content["torque"], (len(velocity),))
-    return Friction(velocity, torque, curve[0], curve[1], tuple(content["terms"]))
-
-
-def _posed(content: Mapping[str, Any], joints: int) -> PosedArm:
-    points = _numbers(content["points"])
-    _require(len(points) == 1 + 2 * joints and len(content["bodies"]) == joints, "the arm's frames and bodies")
-    _require(all(max(branch) < len(points) for branch in content["branches"]), "the arm's branches")
-    bodies = tuple(
-        Body(
-            one["mass"],
-            _numbers(one["center"]),
-            None if one["axes"] is None else _numbers(one["axes"]),
-        )
-        for one in content["bodies"]
-    )
-    return PosedArm(points, tuple(tuple(branch) for branch in content["branches"]), bodies)
-
-
-def _timing(content: Mapping[str, Any], joints: int) -> Timing:
-    _require(len(content["edges"]) == len(content["counts"]) + 1, "a histogram's edges and counts")
-    for key in ("invalid", "oldest"):
-        _require(len(content[key]) in (0, joints), f"{key} of {len(content[key])} axes")
-    return Timing(
-        recording=content["recording"],
-        source=content["source"],
-        edges=_numbers(content["edges"]),
-        counts=np.array(content["counts"], np.int64),
-        samples=content["samples"],
-        rate=content["rate"],
-        largest=content["largest"],
-        compute=content["compute"],
-        gaps=tuple((start, length) for start, length in content["gaps"]),
-        gap_count=content["gap_count"],
-        lost=content["lost"],
-        invalid=tuple(content["invalid"]),
-        oldest=tuple(content["oldest"]),
-    )
+def _otherwise(kind: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the fields that have another form in the file."""
+    match kind:
+        case "Evidence":
+            joints = content["joints"]
+            return {
+                key: tuple(one[word] for one in joints) for key, word in (("joints", "name"), ("revolute", "revolute"))
+            }
+        case "PredictionTrace":
+            numbers = np.concatenate([first + np.arange(length) for first, length in content["runs"]])
+            return {"time": (numbers + 0.5) * content["width"]}
+        case "Spectrum":
+            logs = unpacked(content["log_density"], (None,))
+            _require(bool((np.abs(logs) < _LARGEST_LOG).all()), "a density beyond any of an arm")
+            return {"density": 10.0**logs}
+    return {}

@@ -401,7 +401,7 @@ _CURVE = 160  # samples of a curve, closer together near standstill
 _TERMS: tuple[JointTerm, ...] = tuple(term for term in TERM_SYMBOLS if term != "drive_inertia")
 
 
-class FrictionSeen:
+class FrictionCollector:
     """Collector of friction points against velocity, chunk after chunk, with the estimate's curve."""
 
     def __init__(self, estimate: Estimate) -> None:
@@ -496,12 +496,12 @@ def gather_evidence(
     everyone: list[tuple[Recording, Role]] = [(one, "identification") for one in recordings]
     everyone += [(one, "validation") for one in validation]
     most = max(_STRETCHES // len(everyone), _FEWEST_STRETCHES)
-    friction = FrictionSeen(estimate)
+    friction = FrictionCollector(estimate)
     traced: list[PredictionTrace] = []
     times: list[Timing] = []
     postures = Scatter(_POSTURES)
     for recording, role in everyone:
-        seen = _Seen(estimate, most)
+        seen = _TraceCollector(estimate, most)
         for rows in equation_rows(recording, estimate.model, estimate.base):
             seen.add(rows)
             if role == "identification":
@@ -578,7 +578,7 @@ def _estimates(estimate: Estimate) -> tuple[Estimated, ...]:
     return tuple(found)
 
 
-class _Seen:
+class _TraceCollector:
     """Collector of one recording's traces, chunk after chunk, against the chosen estimate."""
 
     def __init__(self, estimate: Estimate, most: int) -> None:

@@ -178,7 +178,7 @@ def _written(arm: IdentifiedArm) -> str:
 def _preface(arm: IdentifiedArm, name: str) -> str:
     gravity = ", ".join(repr(float(g)) for g in arm.model.chain.gravity)
     terms = ", ".join(arm.model.layout.terms).replace("_", " ") or "none"
-    sigma = f" * Mind: {plain(arm.sigma_said)}.\n *\n" if arm.sigma_said else ""
+    sigma = f" * Mind: {plain(arm.deviations_note)}.\n *\n" if arm.deviations_note else ""
     return f"""\
 /* Dynamics of the arm {plain(arm.model.config.name)} in identified base parameters.
  *
@@ -284,15 +284,15 @@ def _functions(arm: IdentifiedArm) -> list[tuple[str, tuple[str, ...], str, _For
     return found
 
 
-def _turned(tape: ExpressionGraph, share: Array, step: list[Symbol], before: Symbol, way: float) -> Value:
+def _turned(tape: ExpressionGraph, share: Array, step: list[Symbol], before: Symbol, length: float) -> Value:
     """Return the friction state of one drive after one step of Dahl's law (`model/friction_state.py`)."""
     travelled: Value = sum((float(c) * x for c, x in zip(share, step, strict=True) if c), 0.0)
     if not isinstance(travelled, Symbol):
         return before  # a drive that moves no joint
     sign = tape.apply("sign", travelled)
-    if not way > 0.0:
+    if not length > 0.0:
         return sign
-    spent = tape.apply("abs", travelled) * (-1.0 / way)
+    spent = tape.apply("abs", travelled) * (-1.0 / length)
     return sign + (before - sign) * (tape.apply("exp", spent) if isinstance(spent, Symbol) else 1.0)
 
 

@@ -135,7 +135,7 @@ def _document(arm: IdentifiedArm) -> dict[str, Any]:
         "arm": model.config.name,
         "software": f"ident-service {__version__}",
         "parameters_sha256": arm.source,
-        "notes": [*body_notes(arm), *filter(None, (arm.sigma_said,))],
+        "notes": [*body_notes(arm), *filter(None, (arm.deviations_note,))],
         "units": "SI: m, rad, kg, s, N m; torque positive along the joint's axis",
         "gravity": chain.gravity.tolist(),
         "joints": joints,
@@ -254,14 +254,14 @@ def _csv(arm: IdentifiedArm) -> Export:
 
 
 def _c(arm: IdentifiedArm) -> Export:
-    notes = (*presliding_notes(arm), *filter(None, (arm.sigma_said,)))
+    notes = (*presliding_notes(arm), *filter(None, (arm.deviations_note,)))
     return Export("c", f"{c_prefix(arm)}_dynamics.h", c_header(arm), notes=notes)
 
 
 def _notes(arm: IdentifiedArm) -> tuple[str, ...]:
     """Return the notes of the formats with base and link values."""
     notes = (_BASE_ONLY,) if arm.delta is None else body_notes(arm)
-    return (*notes, arm.sigma_said) if arm.sigma_said else notes
+    return (*notes, arm.deviations_note) if arm.deviations_note else notes
 
 
 FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
@@ -364,7 +364,7 @@ def arm_reach(model: ArmModel) -> float:
     ways = np.zeros(chain.joints)
     for k, parent in enumerate(chain.parents):
         before = 0.0 if parent == WORLD else ways[parent] + np.linalg.norm(chain.translation[k])
-        ways[k] = before + _stroke(model, k)
+        ways[k] = before + _travel(model, k)
     return float(np.max(ways + _link_lengths(chain)))
 
 
@@ -372,7 +372,7 @@ def _link_lengths(chain: Chain) -> Array:
     return np.asarray(np.linalg.norm(chain.link_translation, axis=1))
 
 
-def _stroke(model: ArmModel, k: int) -> float:
+def _travel(model: ArmModel, k: int) -> float:
     chain = model.chain
     if chain.revolute[k]:
         return 0.0

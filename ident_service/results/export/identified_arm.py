@@ -55,7 +55,7 @@ class IdentifiedArm:
     motion: RecordedMotion | None = None
 
     @property
-    def sigma_said(self) -> str:
+    def deviations_note(self) -> str:
         """Return what the standard deviations belong to, where it is not the values beside them; else empty."""
         if self.feasible_set == "none" or not any(deviation is not None for deviation in self.sigma):
             return ""

@@ -148,7 +148,7 @@ class RecordedMotion:
         return np.asarray(np.sqrt(np.array(sums) / np.maximum(self.rows, 1.0)))
 
     def in_words(self, model: ArmModel, delta: Array) -> str:
-        """Return that torque at the joints that feel it, the largest first."""
+        """Return the torque of what is lost at each joint that has any, the largest first."""
         torques = self.torque(delta)
         own = np.sqrt(self.information.squared_torques() / np.maximum(self.rows, 1.0))
         told = torques > _TOLD * own

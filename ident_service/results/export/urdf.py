@@ -239,7 +239,7 @@ def original_urdf(model: ArmModel, delta: Array, has: Carried) -> tuple[str, tup
             key: repr(float(drives.of(term)[k])) for term, key in _FRICTION.items() if term in has and has[term][k]
         }
         edits += _dynamics(file.text, joint, written)
-        if kept := _kept(joint, written):
+        if kept := _other_friction(joint, written):
             notes.append(f"joint {model.chain.names[k]} has the {' and '.join(kept)} of the original file")
     return edited(file.text, edits), tuple(notes)
 
@@ -361,7 +361,7 @@ def _removed(link: Element, name: str) -> Edit:
     return Edit(inertial.start, inertial.end, "<!-- its inertia is part of the link that it is fixed to -->")
 
 
-def _kept(joint: Element, written: dict[str, str]) -> list[str]:
+def _other_friction(joint: Element, written: dict[str, str]) -> list[str]:
     """Return the friction attributes of the original file that are neither zero nor replaced."""
     element = joint.first("dynamics")
     old = {} if element is None else element.attributes

@@ -338,7 +338,7 @@ _TIMING_TOP, _TIMING_HEIGHT, _TIMING_BOTTOM = 28.0, 150.0, 40.0
 
 
 def timing_figures(evidence: Evidence, parameters: ParameterFile) -> list[Figure]:
-    """Draw one figure per recording; the parameter file may know the standard deviation of its steps."""
+    """Draw the sample timing of each recording; the parameter file has the standard deviation of its steps, or not."""
     found = parameters.content.get("recording_quality", [])
     known = {one["recording"]: float(one["jitter_seconds"]["standard_deviation"]) for one in found}
     return [

@@ -26,7 +26,7 @@ LIMITS = bench_limits()
 @pytest.mark.slow
 @settings(max_examples=100)
 @given(setpoints(LIMITS), setpoints(LIMITS))
-def test_a_way_keeps_to_every_limit_or_is_refused(start: Setpoint, end: Setpoint) -> None:
+def test_a_trajectory_keeps_to_every_limit_or_is_refused(start: Setpoint, end: Setpoint) -> None:
     try:
         reference = plan_trajectory(start, end, LIMITS)
     except MotionRefused:
@@ -44,7 +44,7 @@ def test_a_way_keeps_to_every_limit_or_is_refused(start: Setpoint, end: Setpoint
 
 @settings(max_examples=100)
 @given(setpoints(LIMITS, 0.3), setpoints(LIMITS, 0.3))
-def test_between_gentle_states_a_way_exists(start: Setpoint, end: Setpoint) -> None:
+def test_between_gentle_states_a_trajectory_exists(start: Setpoint, end: Setpoint) -> None:
     _, _, velocity, _ = sampled(plan_trajectory(start, end, LIMITS))
     assert (np.abs(velocity) <= LIMITS.velocity * (1 + 1e-6)).all()
 
@@ -61,7 +61,7 @@ def test_a_joint_that_ends_as_it_begins_goes_round_while_another_moves() -> None
 @pytest.mark.slow
 @settings(max_examples=100)
 @given(setpoints(LIMITS), setpoints(LIMITS))
-def test_the_extent_of_a_way_is_where_it_goes(start: Setpoint, end: Setpoint) -> None:
+def test_the_extent_of_a_trajectory_is_where_it_goes(start: Setpoint, end: Setpoint) -> None:
     wide = 100.0 * np.ones(2)
     try:
         reference = plan_trajectory(start, end, _with(lower=-wide, upper=wide))
@@ -101,19 +101,19 @@ def test_an_end_that_no_jerk_can_bring_is_refused() -> None:
         plan_trajectory(rest(np.zeros(2)), end, LIMITS)
 
 
-def test_the_way_to_where_one_stands_takes_no_time() -> None:
+def test_the_trajectory_to_where_one_stands_takes_no_time() -> None:
     here = rest(np.array([0.3, -0.2]))
     assert plan_trajectory(here, here, LIMITS).duration == 0.0
     close(plan_trajectory(here, here, LIMITS).at(1.0), here)
 
 
-def test_all_joints_of_a_way_arrive_together() -> None:
+def test_all_joints_of_a_trajectory_arrive_together() -> None:
     reference = plan_trajectory(rest(np.zeros(2)), rest(np.array([1.0, 0.1])), LIMITS)
     velocity = reference.at(0.95 * reference.duration).velocity
     assert (velocity > 1e-4).all()
 
 
-def test_a_way_stands_at_its_end() -> None:
+def test_a_trajectory_stands_at_its_end() -> None:
     reference = plan_trajectory(rest(np.zeros(2)), rest(np.ones(2)), LIMITS)
     assert isinstance(reference, RuckigReference)
     close(reference.at(reference.duration + 5.0), rest(np.ones(2)))

@@ -10,9 +10,8 @@ from design_bench import quick, small
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ident_service.excitation.design import complete_task, family
+from ident_service.excitation.design import complete_task, family, safe_posture
 from ident_service.excitation.optimal_design import Problem
-from ident_service.excitation.postures import safe_posture
 from ident_service.excitation.search import (
     Candidate,
     Interrupted,
@@ -120,7 +119,7 @@ def test_a_polish_makes_nothing_worse_however_early_it_ends(good: Candidate, cal
 
 
 @pytest.mark.slow
-def test_the_same_start_climbs_the_same_way_twice() -> None:
+def test_the_same_start_climbs_alike_twice() -> None:
     x = random_variables(PROBLEM, np.random.default_rng(4), SAFE)
     one, other = (local_search(PROBLEM, x.copy(), SAFE, 4, lambda: None) for _ in range(2))
     assert one.value == other.value

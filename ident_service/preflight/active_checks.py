@@ -1,11 +1,13 @@
-"""Check direction and scale of every joint, by a small jerk-limited motion there and back, one joint at a time.
+"""Check the arm against its model: the torque that holds it, and a small jerk-limited motion of one joint at a time.
 
-Two numbers per joint. How it follows: the displacement measured from dwell to dwell against the one asked for. And how
-it answers torque: measured acceleration against the one that the model expects of the torque that acted,
-`M^-1 (tau - g)`, friction and offset taken out. A loop closes over a wrong encoder scale as if nothing were wrong; only
-the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is wrong runs away from its
-reference, until the guard ends that at twice the amplitude; what it did on the way says whether the sign was why.
+The torque that holds the arm where it stands is compared with the model's gravity torque.
 
+Two numbers tell direction and scale of a joint. How it follows: the displacement measured from dwell to dwell against
+the one asked for. And how it answers torque: measured acceleration against the one that the model expects of the
+torque that acted, `M^-1 (tau - g)`, friction and offset taken out. A loop closes over a wrong encoder scale as if
+nothing were wrong; only the answer to torque shows it, as it shows a wrong gear ratio, squared. A joint whose sign is
+wrong runs away from its reference, until the guard ends that at twice the amplitude; what it did on the way says
+whether the sign was why.
 """
 
 from __future__ import annotations
@@ -16,18 +18,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ident_service.config.motion_limits import MotionLimits, Vector
-from ident_service.errors import MotionRefused
+from ident_service.errors import ArmFault, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
-from ident_service.model.expected_friction import expected_friction
+from ident_service.model.expected_friction import ExpectedFriction, expected_friction
 from ident_service.model.zero_phase import local_polynomial
 from ident_service.motion.clearance import trajectory_clearance
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
-from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, measures
+from ident_service.motion.ticket import Check, Measure, Verdict, check_from_measures, failed, joint_units, measures
 from ident_service.motion.trajectory import Reference, RuckigReference, Setpoint, plan_trajectory, rest
 from ident_service.preflight.delay import CALM, FREQUENCY, Delay, delay_measures, dither
-from ident_service.preflight.session import BAND, CREEP, Rows, Session, Trace
+from ident_service.preflight.session import BAND, CREEP, Rows, Session, Trace, remedy_of
 from ident_service.preflight.stability import INERTIA, drive_matrix, known_drives
+from ident_service.preflight.static_checks import HOLDABLE
 
 AMPLITUDES = (0.04, -0.04, 0.02, -0.02)  # rad or m, the first that is free
 SPEED, ACCELERATION = 0.2, 1.2  # rad/s and rad/s^2, or m: at one metre 0.2 m/s, below the 0.25 of ISO 10218
@@ -406,3 +409,137 @@ def _fitted(columns: Vector, values: Vector, correlated: float) -> tuple[float, 
     variance = float(left @ left) / max(len(values) - columns.shape[1], 1) * correlated
     inverse = np.linalg.inv((columns / size).T @ (columns / size))
     return float(solution[0] / size[0]), float(np.sqrt(variance * inverse[0, 0]) / size[0])
+
+
+SETTLE, HOLD = 0.3, 1.0  # s before the mean is taken, and over which
+_SUNK = 1e-3  # rad or m that a joint must have moved down before a load is reported
+GRAVITY_ERROR = 0.1  # of the torque limit, beside Coulomb friction, which may carry as much of the weight
+_SIGNS = "Check the signs of encoders and torques too."
+REMEDY = (
+    "Compare tool and load on the arm with the description, check that it does not lean on anything, and check "
+    "torque constants and the zero positions of the joints."
+)
+
+
+def holdable(gravity: Vector, model: ArmModel, limits: MotionLimits) -> Check | None:
+    """Return a failed check where the model says that the arm cannot be held in this posture; else None.
+
+    Args:
+        gravity: the model's torque where the arm stands [N m or N], shape (joints,).
+        model: of the arm.
+        limits: of the arm.
+    """
+    found = measures(
+        "gravity torque of the model",
+        np.abs(gravity),
+        joint_units(model.chain.revolute, "N m", "N"),
+        model.chain.names,
+        most=HOLDABLE * limits.torque,
+    )
+    if all(one.within_limits for one in found):
+        return None
+    return failed(
+        "gravity",
+        "holding the arm takes too much of the torque limits: "
+        + "; ".join(str(one) for one in found if not one.within_limits),
+        "Support the arm in a posture that takes less torque, then check again.",
+        found,
+    )
+
+
+def holding_torque(rows: Rows, period: float) -> Vector:
+    """Return the mean torque that held the arm, after it had settled [N m or N], shape (joints,).
+
+    Args:
+        rows: of holding still for `SETTLE + HOLD` seconds.
+        period: [s].
+    """
+    return np.asarray(np.mean([sample.torque for sample, _ in rows[round(SETTLE / period) :]], axis=0))
+
+
+def differences(
+    held: Vector, gravity: Vector, limits: MotionLimits, friction: ExpectedFriction
+) -> tuple[Vector, Vector]:
+    """Return how far two torques are apart, and how far they may be [N m or N], shape (joints,) each."""
+    return np.abs(held - gravity), GRAVITY_ERROR * limits.torque + friction.coulomb
+
+
+def gravity_check(
+    held: Vector, gravity: Vector, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction
+) -> Check:
+    """Compare the torque that held the arm with the model's gravity torque.
+
+    Args:
+        held: `held_torque` [N m or N], shape (joints,).
+        gravity: the model's torque there, likewise.
+        model: of the arm.
+        limits: of the arm.
+        friction: Coulomb friction may hold the arm instead of torque, either way.
+    """
+    names = model.chain.names
+    force = joint_units(model.chain.revolute, "N m", "N")
+    difference, most = differences(held, gravity, limits, friction)
+    found = [
+        *measures("holding torque", held, force, names),
+        *measures("gravity torque of the model", gravity, force, names),
+        *measures("difference", difference, force, names, most=most),
+    ]
+    check = check_from_measures("gravity", found, REMEDY)
+    if check.verdict is Verdict.FAILED and (weight := _weight(held - gravity, gravity, most)):
+        return replace(check, reason=f"{weight}: {check.reason}")
+    return check
+
+
+def holding_fault_check(
+    session: Session, model: ArmModel, limits: MotionLimits, friction: ExpectedFriction, error: ArmFault
+) -> Check:
+    """Find out why a fault ended the holding of an arm.
+
+    Causes: a wrong sign that explains how the arm moved; what the fault itself says; or a load: an arm that sinks,
+    although the torque that holds it is above the model's. Its joints stick on the way, like a frozen encoder.
+
+    Args:
+        session: in which it was held.
+        model: of the arm.
+        limits: of the arm.
+        friction: expected.
+        error: the fault.
+    """
+    remedy, trace = remedy_of(error), session.trace()
+    stands_still = error.code == "frozen_encoder"
+    if remedy is not None and not stands_still:
+        return failed("gravity", str(error), remedy)
+    if not stands_still and (wrong := wrong_signs(trace, session)):
+        return sign_failure(wrong, model, str(error))
+    moved = trace.position[-1] - trace.position[0]
+    sunk = (moved * session.gravity < 0.0) & (np.abs(moved) > _SUNK)
+    extra = np.where(sunk, trace.torque[-1] - session.gravity, 0.0)
+    _, most = differences(trace.torque[-1], session.gravity, limits, friction)
+    if weight := _weight(extra, session.gravity, most):
+        joints = ", ".join(
+            f"{name} sank by {abs(way):.3g} {unit} against {abs(more):.3g} {force} more than the model's"
+            for name, way, more, most_more, unit, force in zip(
+                model.chain.names,
+                moved,
+                extra,
+                most,
+                joint_units(model.chain.revolute, "rad", "m"),
+                joint_units(model.chain.revolute, "N m", "N"),
+                strict=True,
+            )
+            if abs(more) > most_more
+        )
+        return failed("gravity", f"{weight}: {joints}; the safety monitor released it ({error.code})", REMEDY)
+    if remedy is not None:
+        return failed("gravity", str(error), remedy)
+    return failed("gravity", f"the arm could not be held where it stands: {error}", f"{REMEDY} {_SIGNS}")
+
+
+def _weight(extra: Vector, gravity: Vector, most: Vector) -> str:
+    """Describe whether the arm is heavier or lighter than described, where all joints that differ agree; else empty."""
+    sides = np.sign(extra * gravity)[np.abs(extra) > most]
+    if not len(sides) or (sides != sides[0]).any() or sides[0] == 0.0:
+        return ""
+    if sides[0] > 0.0:
+        return "the arm is heavier than described, or its drives give less torque than they are asked for"
+    return "the arm is lighter than described, or its drives give more torque than they are asked for"

@@ -32,7 +32,7 @@ from ident_service.results.run_folder import write_results
     ],
     ids=["filtered_regressor", "decimated", "savitzky_golay", "huber", "wls"],
 )
-def test_every_way_to_smooth_and_fit_has_a_report(tmp_path: Path, options: Identification) -> None:
+def test_every_method_to_smooth_and_fit_has_a_report(tmp_path: Path, options: Identification) -> None:
     one = made(tmp_path / "results", options=options)
     expected = one.estimate.candidates[one.estimate.chosen].identification.joint_rms
     for joint, rms in zip(one.evidence.recordings[0].joints, expected, strict=True):

@@ -53,14 +53,14 @@ def test_blocks_that_carry_the_state_equal_one_pass(rate: np.ndarray, cuts: list
 
 
 @given(rate=RATES, start=st.floats(-1.0, 1.0))
-def test_no_way_at_all_is_the_sign(rate: np.ndarray, start: float) -> None:
+def test_no_presliding_is_the_sign(rate: np.ndarray, start: float) -> None:
     for begin in (None, np.array([start])):
         np.testing.assert_array_equal(
             friction_direction(rate[:, None], PERIOD, np.zeros(1), begin)[:, 0], np.sign(rate)
         )
 
 
-def test_each_drive_has_its_own_way() -> None:
+def test_each_drive_has_its_own_presliding_length() -> None:
     rate = np.random.default_rng(1).normal(size=(300, 3))
     x0 = np.array([0.0, 0.002, 0.02])
     got = friction_direction(rate, PERIOD, x0)
@@ -71,7 +71,7 @@ def test_each_drive_has_its_own_way() -> None:
         )
 
 
-def test_after_a_reversal_the_way_decides_not_the_speed() -> None:
+def test_after_a_reversal_the_travel_decides_not_the_speed() -> None:
     # The same way at half the speed, so twice the time, gives the same direction.
     fast = np.concatenate([np.ones(50), -np.ones(50)])[:, None]
     slow = 0.5 * np.repeat(fast, 2, axis=0)
@@ -95,7 +95,7 @@ def test_standing_still_keeps_the_direction() -> None:
     np.testing.assert_array_equal(friction_direction(np.zeros((4, 1)), PERIOD, np.array([0.01])), 0.0)
 
 
-def test_a_long_way_loses_no_digits() -> None:
+def test_a_long_travel_loses_no_digits() -> None:
     # An hour at one speed, then one turn: the exponent counts from the turn.
     rate = np.concatenate([np.full(200_000, 3.0), np.full(10, -0.5)])
     got = friction_direction(rate[:, None], PERIOD, np.array([1e-2]))[-10:, 0]

@@ -137,7 +137,7 @@ def test_a_session_that_was_closed_leaves_nothing_to_be_missed(cycles: int) -> N
     assert drives_of(seen) == ["switch on disabled, pre-operational"] * 2
 
 
-def test_what_a_drive_has_latched_is_told_with_its_cause() -> None:
+def test_what_a_drive_has_latched_is_reported_with_its_cause() -> None:
     bench = Bench()
     with bench.arm as arm:
         arm.enable()

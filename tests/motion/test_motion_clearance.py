@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.local_commands import LocalCommands
 from motion_bench import bench_excitation, bench_limits, bench_model
 from run_bench import Bench
 
@@ -16,7 +17,6 @@ from ident_service.errors import ArmFault, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.collision import CollisionModel
 from ident_service.motion.clearance import ClearanceChecker, require_clear, stops_touching
-from ident_service.motion.command_channel import LocalCommands
 from ident_service.motion.run import run
 from ident_service.motion.sequencer import Paused, Resumed
 from ident_service.motion.trajectory import PathReference, Reference, Setpoint, plan_trajectory, rest, run_to_end
@@ -58,7 +58,7 @@ def searched(paused: Paused, model: ArmModel) -> Resumed:
 
 
 @pytest.mark.parametrize("left", np.linspace(0.3, 0.9 * MOTION.duration, 6).tolist())
-def test_a_way_back_that_would_touch_is_not_taken(left: float) -> None:
+def test_a_return_that_would_touch_is_not_taken(left: float) -> None:
     paused, free, model = beside_the_way_back(left)
     assert nearest(model, free, free.back) < 0.0
     try:
@@ -82,14 +82,14 @@ def test_some_are_searched_again_and_some_are_none() -> None:
     assert True in found
 
 
-def test_far_from_everything_the_way_back_is_what_it_was() -> None:
+def test_far_from_everything_the_return_is_what_it_was() -> None:
     paused = Paused(MOTION, 1.0, LIMITS)
     model = with_ball(np.array([0.0, 0.0, 5.0]), 0.1)
     assert searched(paused, model).joined == paused.resume().joined
     assert searched(paused, bench_model()).joined == paused.resume().joined
 
 
-def test_an_arm_that_stands_touching_finds_no_way_back() -> None:
+def test_an_arm_that_stands_touching_finds_no_return() -> None:
     paused = Paused(MOTION, 1.0, LIMITS)
     model = with_ball(tip(paused.at(paused.duration).position), 0.05)
     with pytest.raises(MotionRefused, match=r"the path comes within -0\.\d+ m at elbow - obstacle ball, 0\.00 s"):
@@ -127,7 +127,7 @@ class Standing:
         return self._setpoint
 
 
-def test_a_stop_out_of_a_way_that_would_touch_is_told() -> None:
+def test_a_stop_out_of_a_trajectory_that_would_touch_is_reported() -> None:
     """The tip flies at 2 rad/s towards a ball that the way itself does not reach."""
     moving = replace(rest(np.zeros(2)), velocity=np.array([2.0, 0.0]))
     ahead = tip(np.array([0.2, 0.0])) + np.array([0.0, 0.03, 0.0])
@@ -173,7 +173,7 @@ def test_looking_takes_a_bearable_part_of_a_cycle(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_in_a_run_a_way_back_that_is_not_clear_is_none(
+def test_in_a_run_a_return_that_is_not_clear_is_none(
     make: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[float] = []

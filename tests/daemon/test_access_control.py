@@ -348,14 +348,14 @@ def test_a_request_that_comes_twice_moves_the_arm_once(daemon: Asked) -> None:
 def test_a_challenge_does_not_count_for_long(tmp_path: Path) -> None:
     now = [0.0]
     with Database(tmp_path) as db:
-        gate = Authenticator(db, lambda: now[0])
-        word = gate.challenge("a", "me")
+        authenticator = Authenticator(db, lambda: now[0])
+        word = authenticator.challenge("a", "me")
         now[0] = CHALLENGE_SECONDS - 0.1
-        assert gate.confirm(word, "a", "me")
-        assert not gate.confirm(word, "a", "me")
-        word = gate.challenge("a", "me")
+        assert authenticator.confirm(word, "a", "me")
+        assert not authenticator.confirm(word, "a", "me")
+        word = authenticator.challenge("a", "me")
         now[0] += CHALLENGE_SECONDS + 0.1
-        assert not gate.confirm(word, "a", "me")
+        assert not authenticator.confirm(word, "a", "me")
 
 
 def test_a_session_survives_a_restart_and_ends_in_time(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -374,13 +374,13 @@ def test_a_session_survives_a_restart_and_ends_in_time(state: Path, monkeypatch:
         refusal(daemon.get("/api/v1/whoami", headers=header), 401)
     with Database(state) as db:
         other = add_token(db, "late", "viewer", "test")
-        gate = Authenticator(db)
-        session = gate.log_in(other, "here")
+        authenticator = Authenticator(db)
+        session = authenticator.log_in(other, "here")
         assert session is not None
         now = time.time()
         monkeypatch.setattr(time, "time", lambda: now + SESSION_SECONDS + 1.0)
-        assert gate.by_session(session[0]) is None
-        assert gate.known(None, session[0]) is None
+        assert authenticator.by_session(session[0]) is None
+        assert authenticator.known(None, session[0]) is None
 
 
 @pytest.mark.slow

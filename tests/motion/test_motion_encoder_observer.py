@@ -1,4 +1,4 @@
-"""A joint that its push should have moved has a frozen encoder; whole runs are `test_motion_owed_runs.py`."""
+"""A joint that its push should have moved has a frozen encoder; whole runs: `test_motion_encoder_observer_runs.py`."""
 
 from __future__ import annotations
 
@@ -51,7 +51,9 @@ def cycles_until(owed: FrozenEncoderObserver, correction: Array, most: int = 300
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("excess", [0.3, 3.0])
-def test_what_is_owed_is_what_the_push_beyond_friction_would_have_moved(joint: int, side: float, excess: float) -> None:
+def test_missing_motion_is_what_the_push_beyond_friction_would_have_moved(
+    joint: int, side: float, excess: float
+) -> None:
     push = side * unit(joint) * (STANDING * FRICTION + excess)
     expected = np.sqrt(2.0 * HIDDEN[joint] * INERTIA[joint] / excess) / PERIOD
     assert cycles_until(observer(), push) == pytest.approx(expected, abs=2.0)
@@ -99,7 +101,7 @@ def test_only_the_change_since_the_last_step_counts() -> None:
     assert cycles_until(owed, needed - 1.5 * STANDING * FRICTION) is not None
 
 
-def test_a_step_and_less_push_forgive_what_is_owed() -> None:
+def test_a_step_and_less_push_forgive_missing_motion() -> None:
     push = 1.5 * STANDING * FRICTION * unit(1)
     alone = cycles_until(observer(), push)
     assert alone is not None
@@ -110,14 +112,14 @@ def test_a_step_and_less_push_forgive_what_is_owed() -> None:
             shown(owed, forgive, NONE)
 
 
-def test_of_an_arm_that_is_asked_for_no_position_nothing_is_owed() -> None:
+def test_of_an_arm_that_is_asked_for_no_position_no_motion_is_missing() -> None:
     owed = observer()
     shown(owed, np.ones(2), 5.0 * STANDING * FRICTION)
     assert cycles_until(owed, NONE) is None
 
 
 @pytest.mark.slow
-def test_what_only_balances_another_joint_is_not_owed() -> None:
+def test_what_only_balances_another_joint_is_no_missing_motion() -> None:
     push = 3.0 * STANDING * FRICTION * unit(1)
     for own, found in ((0.0, False), (-1.0, False), (0.3, False), (0.5, True)):
         owed = observer()
@@ -131,7 +133,7 @@ def test_losing_an_axis_excuses_nothing() -> None:
     alone = cycles_until(observer(), push)
     assert alone is not None
     assert alone > FROZEN_CYCLES
-    bench = Bench(owed=observer())
+    bench = Bench(encoder_observer=observer())
     bench.see(HOME, answer=NONE)
     for cycle in range(alone - 1):
         fault = bench.see(HOME, correction=push, answer=push / INERTIA, valid=(True, cycle % 6 != 0))[1]
@@ -197,7 +199,7 @@ def test_a_drive_that_is_pushed_hard_and_stands_is_found_although_its_joints_mov
 
 
 @pytest.mark.parametrize("stuck", [0, 1])
-def test_what_a_drive_owes_is_what_the_push_beyond_its_friction_would_have_moved(stuck: int) -> None:
+def test_the_missing_motion_of_a_drive_is_what_the_push_beyond_its_friction_would_have_moved(stuck: int) -> None:
     friction = np.append(FRICTION, (np.abs(TO_DRIVES) * FRICTION).max(axis=1))
     inertia = (TO_DRIVES @ DYNAMICS.mass_matrix(HOME) @ TO_DRIVES.T)[stuck, stuck]
     hidden = (MOVES @ HIDDEN)[stuck]

@@ -38,7 +38,7 @@ def test_the_most_severe_event_counts_and_every_warning_is_counted() -> None:
     assert bench.guard.warnings["drive_warning"] == 3
 
 
-def test_the_event_is_told_before_the_status_word_it_explains_but_not_before_worse() -> None:
+def test_the_event_is_reported_before_the_status_word_it_explains_but_not_before_worse() -> None:
     bench = Bench()
     bench.see(HOME, status=(int(AxisStatus.POWERED),) * 2)
     tripped = (int(AxisStatus.POWERED), int(AxisStatus.FAULT))
@@ -56,7 +56,7 @@ def test_warnings_that_do_not_end_stop_the_arm() -> None:
     assert is_fault(found[-1], "repeated_warnings")
 
 
-def test_what_cannot_be_believed_comes_before_what_is_told() -> None:
+def test_what_cannot_be_believed_comes_before_what_is_reported() -> None:
     _, fault = Bench().see(np.array([np.nan, HOME[1]]), events=(DIED,))
     assert is_fault(fault, "feedback_not_finite", 0)
 

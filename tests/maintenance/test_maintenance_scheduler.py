@@ -12,7 +12,7 @@ from maintenance.conftest import ARM, MONDAY, Clock, description
 
 from ident_service.config.load import load_arm
 from ident_service.daemon.jobs.commands import JOBS
-from ident_service.daemon.jobs.outcome import explain_interrupted, mark_interrupted, outcome, said
+from ident_service.daemon.jobs.outcome import explain_interrupted, mark_interrupted, outcome, process_output
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.jobs.requests import Check, Run
 from ident_service.daemon.maintenance.reidentification import ReidentificationRequest, reidentifications
@@ -38,17 +38,17 @@ pytestmark = pytest.mark.slow  # one commissioning for all of them
 
 
 class Scene:
-    """A registry with an accepted arm, its queue, and a keeper in the test's time."""
+    """A registry with an accepted arm, its queue, and a scheduler in the test's time."""
 
     def __init__(self, db: Database, state: Path, clock: Clock) -> None:
         self.db, self.state, self.clock = db, state, clock
         self.restart()
-        self.keeper.look()
+        self.scheduler.look()
 
     def restart(self) -> None:
         """Another process on the same state folder."""
         self.engine = Engine(self.db, self.state)
-        self.keeper = MaintenanceScheduler(self.engine, None, self.clock)
+        self.scheduler = MaintenanceScheduler(self.engine, None, self.clock)
         mark_interrupted(self.db, self.state)
 
     def allow(self, **changes: object) -> None:
@@ -58,7 +58,7 @@ class Scene:
         """A schedule of six o'clock, and its time has come."""
         add_schedule(self.db, ARM, DueRule(cron="0 6 * * *"), "me", self.clock())
         self.clock.at = MONDAY + 6 * HOUR - 0.5
-        self.keeper.look()
+        self.scheduler.look()
         self.clock.forward(1.0)
 
     def ended(self, state: str = "done", answer: object = None, detail: str = "") -> None:
@@ -68,7 +68,7 @@ class Scene:
             (self.state / JOBS / job / "answer.json").write_text(json.dumps(answer))
         jobs.ended(self.db, job, state, detail)
         self.engine.live._jobs.pop(job)
-        self.keeper.look()
+        self.scheduler.look()
 
     @property
     def only(self) -> Row:
@@ -96,16 +96,16 @@ def test_an_arm_whose_description_says_nothing_never_moves_by_itself(scene: Scen
     assert load_arm("planar2").unattended_motion == "refused"
     scene.at_six()
     for _ in range(3):
-        scene.keeper.look()
+        scene.scheduler.look()
     assert len(pending(scene.db, ARM)) == 1
     assert scene.queued == []
     assert reidentifications(scene.db) == []
     assert scene.why == ["the arm's description does not allow motion without a person"]
     with pytest.raises(MotionRefused, match="does not allow"):
-        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM, unattended=True), "service")
+        scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM, unattended=True), "service")
     # A description that allows it later does not set off what waits already.
     scene.allow()
-    scene.keeper.look()
+    scene.scheduler.look()
     assert scene.queued == []
 
 
@@ -113,7 +113,7 @@ def test_only_an_allowed_arm_begins_and_by_a_preflight_under_our_own_lease(scene
     scene.allow()
     scene.at_six()
     for _ in range(3):
-        scene.keeper.look()
+        scene.scheduler.look()
     assert scene.queued == [("check", True)]
     assert (scene.only["begun_by"], scene.only["unattended"], scene.only["against"]) == ("service", 1, 1)
     scene.ended()
@@ -123,22 +123,22 @@ def test_only_an_allowed_arm_begins_and_by_a_preflight_under_our_own_lease(scene
 def test_a_preflight_that_is_refused_begins_no_run_and_asks_for_a_person(scene: Scene) -> None:
     scene.allow()
     scene.at_six()
-    scene.keeper.look()
+    scene.scheduler.look()
     scene.ended("refused", detail="gravity torque is not the model's")
     for _ in range(3):
-        scene.keeper.look()
+        scene.scheduler.look()
     assert (scene.only["state"], scene.queued) == ("refused", [])
     assert "gravity torque" in scene.only["detail"]
     assert len(pending(scene.db, ARM)) == 1
 
 
 def test_a_run_that_was_refused_is_not_named(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     scene.ended("done")
-    scene.keeper.look()
+    scene.scheduler.look()
     assert (scene.only["step"], scene.only["recorded"] is None) == ("run", False)
     scene.ended("refused", detail="the arm is in use")
-    scene.keeper.look()
+    scene.scheduler.look()
     assert scene.only["state"] == "refused"
     assert (scene.only["recorded"], scene.only["run"]) == (None, None)
 
@@ -177,7 +177,7 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
     if spoil is not _disabled:
         scene.at_six()
     words = spoil(scene)
-    scene.keeper.look()
+    scene.scheduler.look()
     assert scene.why
     assert all(words in why for why in scene.why)
     # Neither an acknowledged fault nor a free arm sets off what was refused before.
@@ -187,51 +187,51 @@ def test_what_stands_against_it_asks_for_a_person_for_good(scene: Scene, spoil: 
     for row in jobs.queue(scene.db):
         jobs.ended(scene.db, row["id"], "cancelled", "")
     scene.clock.forward(1.0)
-    scene.keeper.look()
+    scene.scheduler.look()
     assert reidentifications(scene.db) == []
 
 
 def test_a_stop_between_the_steps_is_a_stop(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     job = scene.only["job"]
     jobs.ended(scene.db, job, "done", "")
     scene.engine.live._jobs.pop(job)
     assert scene.engine.stop(ARM, "bob") == {"arms": [], "jobs": []}  # nothing moves at this moment
-    scene.keeper.look()
+    scene.scheduler.look()
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
     assert "a stop was requested" in scene.only["detail"]
     # The next one is not stopped by it.
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     assert scene.queued == [("check", False)]
 
 
 def test_one_at_a_time(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     with pytest.raises(MotionRefused, match="already"):
-        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "bob")
+        scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "bob")
     assert scene.queued == [("check", False)]  # the second one's was not entered either
 
 
 def test_a_restart_after_the_preflight_does_not_begin_the_run(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     jobs.ended(scene.db, scene.only["job"], "done", "")
     scene.restart()
-    scene.keeper.look()
+    scene.scheduler.look()
     assert (scene.only["state"], scene.queued) == ("interrupted", [])
     assert "nothing has moved since" in scene.only["detail"]
 
 
 @pytest.mark.parametrize("running", [False, True])
-def test_a_restart_during_a_motion_is_told_when_it_is_known(scene: Scene, running: bool) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+def test_a_restart_during_a_motion_is_reported_when_it_is_known(scene: Scene, running: bool) -> None:
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     if running:
         jobs.started(scene.db, scene.only["job"], "")
     scene.restart()
-    scene.keeper.look()
+    scene.scheduler.look()
     if running:  # its process is being looked for
         assert scene.only["state"] == "running"
         explain_interrupted(scene.db, scene.state)
-        scene.keeper.look()
+        scene.scheduler.look()
         assert "the service died while it ran" in scene.only["detail"]
     else:
         assert "nothing has moved" in scene.only["detail"]
@@ -239,7 +239,7 @@ def test_a_restart_during_a_motion_is_told_when_it_is_known(scene: Scene, runnin
 
 
 def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     scene.ended()
     jobs.ended(scene.db, scene.only["job"], "done", "")
     # The run that a process would have left: the accepted one's recording.
@@ -252,7 +252,7 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
     index_run(scene.db, scene.state, accepted)
     scene.db.write("UPDATE reidentifications SET recorded = ?", accepted)
     scene.restart()
-    scene.keeper.look()
+    scene.scheduler.look()
     assert (scene.only["state"], scene.only["step"], scene.queued) == ("running", "identify", [("identify", False)])
     (row,) = jobs.queue(scene.db)
     # By the description that was accepted, and not by today's.
@@ -261,16 +261,16 @@ def test_a_restart_before_what_only_computes_goes_on(scene: Scene, accepted: str
     jobs.started(scene.db, row["id"], "")
     scene.restart()
     explain_interrupted(scene.db, scene.state)
-    scene.keeper.look()
+    scene.scheduler.look()
     assert scene.only["state"] == "interrupted"
     assert accepted in scene.only["detail"]
 
 
 def test_what_was_stopped_is_no_verdict(scene: Scene) -> None:
-    scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+    scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     stopped = {"exit_code": 0, "report": {"state": "stopped"}}
     (scene.state / JOBS / scene.only["job"] / "answer.json").write_text(json.dumps(stopped))
-    assert outcome(said(scene.state / JOBS / scene.only["job"]), 0, "").state == "cancelled"
+    assert outcome(process_output(scene.state / JOBS / scene.only["job"]), 0, "").state == "cancelled"
     scene.ended("cancelled", detail="a stop was requested")
     assert (scene.only["state"], scene.queued) == ("cancelled", [])
 
@@ -278,11 +278,11 @@ def test_what_was_stopped_is_no_verdict(scene: Scene) -> None:
 def test_nothing_accepted_or_another_mechanism_cannot_be_compared(scene: Scene) -> None:
     add_arm(scene.db, scene.state, description(name="new"), {}, "me")
     with pytest.raises(UsageError, match="nothing has been accepted"):
-        scene.keeper.reidentifications.begin(ReidentificationRequest("new"), "ann")
+        scene.scheduler.reidentifications.begin(ReidentificationRequest("new"), "ann")
     longer = description().replace("shoulder: {a: 0.5}", "shoulder: {a: 0.6}")
     add_arm(scene.db, scene.state, longer, {}, "me", replace=True)
     with pytest.raises(UsageError, match="kinematics"):
-        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+        scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
     assert scene.queued == []
 
 
@@ -290,7 +290,7 @@ def test_an_accepted_set_that_was_changed_on_the_disk_is_compared_with_nothing(s
     _, folder = accepted_set(scene.state, ARM)
     (folder / "parameters.json").write_text("{}")
     with pytest.raises(ValueError, match="was changed since"):
-        scene.keeper.reidentifications.begin(ReidentificationRequest(ARM), "ann")
+        scene.scheduler.reidentifications.begin(ReidentificationRequest(ARM), "ann")
 
 
 def test_what_is_rolled_back_to_is_the_same_to_the_last_bit(scene: Scene, accepted: str) -> None:
@@ -325,19 +325,19 @@ def test_a_notice_is_kept_with_what_says_that_it_was_told(scene: Scene) -> None:
                 raise sqlite3.OperationalError("database or disk is full")
 
     broken = Broken()
-    scene.keeper._webhook = broken
+    scene.scheduler._webhook = broken
     scene.at_six()
     with pytest.raises(sqlite3.OperationalError):
-        scene.keeper.look()
+        scene.scheduler.look()
     assert ([row["told"] for row in pending(scene.db)], deliveries(scene.db)) == ([0], [])
     broken.broken = False
     for _ in range(3):
-        scene.keeper.look()
+        scene.scheduler.look()
     assert ([row["told"] for row in pending(scene.db)], len(deliveries(scene.db))) == ([1], 1)
 
 
 def test_a_check_by_hand_is_untouched(scene: Scene) -> None:
     scene.at_six()
-    scene.keeper.look()
+    scene.scheduler.look()
     scene.engine.create(Check(kind="check", arm=ARM), "ann")
     assert scene.queued == [("check", False)]

@@ -18,7 +18,7 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
-from ident_service.motion.realtime import asked
+from ident_service.motion.realtime import temporary_privileges
 from ident_service.motion.run import keep_host_alive
 from ident_service.preflight import static_checks as plan
 
@@ -63,7 +63,7 @@ def test_in_virtual_time_nobody_waits() -> None:
     assert arm.cycles == 0
 
 
-def test_a_cycle_that_fails_is_told_when_the_work_is_done() -> None:
+def test_a_cycle_that_fails_is_reported_when_the_work_is_done() -> None:
     arm, done = Looked(RealClock(), fails_at=1), list[str]()
     with pytest.raises(DriverError, match="the bus is gone"):
         during(arm, lambda: done.append("work"))
@@ -71,7 +71,7 @@ def test_a_cycle_that_fails_is_told_when_the_work_is_done() -> None:
     assert arm.cycles == 1
 
 
-def test_what_a_driver_should_not_raise_is_told_too() -> None:
+def test_what_a_driver_should_not_raise_is_reported_too() -> None:
     with pytest.raises(ZeroDivisionError):
         during(Looked(RealClock(), fails_at=1, error=ZeroDivisionError()), lambda: None)
 
@@ -79,7 +79,7 @@ def test_what_a_driver_should_not_raise_is_told_too() -> None:
 @pytest.mark.slow
 def test_cycles_go_on_beside_work_that_has_real_time() -> None:
     """Work and cycles share a core there; work at a real-time priority would have the kernel stop both."""
-    with asked() as granted:
+    with temporary_privileges() as granted:
         if not granted.scheduling:
             pytest.skip("this machine grants no real time")
         arm, before = Looked(RealClock()), (os.sched_getscheduler(0), os.sched_getparam(0), os.nice(0))
@@ -106,7 +106,7 @@ def test_preflight_computes_without_a_real_time_priority(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(plan, "proof_of", watched)
     model = arm_model(load_arm("planar2"))
-    with asked() as granted:
+    with temporary_privileges() as granted:
         if not granted.scheduling:
             pytest.skip("this machine grants no real time")
         plan.motion_proven_check(model, motion_limits(model.config), excitation(model, "identification"))
@@ -114,7 +114,7 @@ def test_preflight_computes_without_a_real_time_priority(monkeypatch: pytest.Mon
     assert seen == [os.SCHED_OTHER]
 
 
-def test_work_that_fails_ends_the_cycles_and_is_told_first() -> None:
+def test_work_that_fails_ends_the_cycles_and_is_reported_first() -> None:
     arm = Looked(RealClock(), fails_at=1)
     with pytest.raises(KeyboardInterrupt):
         during(arm, interrupted)
