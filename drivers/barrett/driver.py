@@ -54,7 +54,7 @@ class JointEncoders:
             coordinates: of the arm.
             names: of the joints.
         """
-        self._pucks, self._names, self._tolerance = driver.pucks, names, driver.joint_tolerance
+        self._names, self._tolerance = names, driver.joint_tolerance
         self._radians = {k: 2.0 * pi / puck.joint_counts for k, puck in enumerate(driver.pucks) if puck.joint_counts}
         self._motors_of = coordinates.motors_of
         self._counts: dict[int, int] = {}

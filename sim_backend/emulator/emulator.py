@@ -70,11 +70,6 @@ class Emulator:
         body.watch = self._watch
 
     @property
-    def bus_numbers(self) -> tuple[int, ...]:
-        """Return the index of each drive's bus."""
-        return self._buses
-
-    @property
     def gone(self) -> bool:
         """Return whether a fault has taken the bus."""
         return any(fault.kind == "bus_gone" for fault in self._injection.active)

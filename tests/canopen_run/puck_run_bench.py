@@ -10,7 +10,6 @@ from canopen_run_bench import TORQUE_NOISE, described, truth
 GEARS = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}
 PUCK = {"cts": 65536, "ipnm": 2700, "mt": 8100, "poles": 12}
 # Home on whole counts, so that arms that were zeroed there stand where they think.
-_COUNT = 2.0 * 3.141592653589793 / 65536
 
 
 def puck_arm(name: str, rate: float, kp: float, kd: float, bus: dict[str, Any], **driver: Any) -> dict[str, Any]:

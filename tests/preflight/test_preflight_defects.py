@@ -28,7 +28,6 @@ from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray
-TOUCHING = ("gravity", "direction", "watchdog")
 
 
 def untouched(flight: Flight) -> None:

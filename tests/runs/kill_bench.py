@@ -28,7 +28,6 @@ from ident_service.registry.state_folder import fault_file
 from sim_backend.plant_status import PlantStatus, read_status
 
 PATIENCE = 90.0  # s of the machine's time; nothing is judged by it but what never happens
-STARTING = 4.0  # s that a run takes before it moves, about
 TAG = "IDENT_KILL_TAG"
 VICTIMS = {"parent": "ident_service", "recorder": "recordings.recorder_main", "motion": "motion.process"}
 # What the next run is told of a victim that was killed while the arm moved.

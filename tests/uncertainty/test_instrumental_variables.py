@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from doubt.closed_loop import RATE, pendulum_model, recorded_in_closed_loop
 from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
 from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
+from uncertainty.closed_loop import RATE, pendulum_model, recorded_in_closed_loop
 
 from ident_service.errors import ModelError
 from ident_service.estimation.equations import equation_rows, equations
