@@ -48,6 +48,7 @@ _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
 _MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
 _LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows
+_USELESS = 5.0  # times the information per parameter, variance or condition number that a motion may lose to its proof
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
@@ -229,6 +230,7 @@ def design_motion(
     if best.result is None:
         raise MotionRefused(f"not even the posture at rest keeps the limits: {best.refused}")
     coefficients, proof = best.result
+    require_known_inertia(model, task, base, best, limits)
     path = basis.path(coefficients)
     kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))
     excitation = Excitation(
@@ -314,6 +316,35 @@ def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
     gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
     return f"scaled down until all limits could be proven; at full size it would give about {gain}: {attempt.why}"
+
+
+def require_known_inertia(
+    model: ArmModel, task: Task, base: BaseParameters, attempt: Attempt, limits: MotionLimits
+) -> None:
+    """Refuse what is left of a motion that the arm cannot follow because its drives' inertia is not described.
+
+    The law's stiffness is kp times the inertia that it knows, behind a wrist next to none; and the arm itself, which
+    has more, is simulated with as little.
+
+    Raises:
+        MotionRefused: most of the information was lost, and a joint that lags has no drive inertia.
+    """
+    tracking, used = attempt.proof.tracking, control_model(model)
+    if not attempt.why or tracking is None or used.prior is None:
+        return
+    drives = (model.chain.coupling**2).T @ used.layout.term_values("drive_inertia", used.prior)
+    lost = float(np.exp(attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)))
+    late = zip(model.chain.names, tracking.late(limits), drives, strict=True)
+    unknown = [name for name, lags, drive in late if lags and drive <= 0.0]
+    if unknown and lost > _USELESS:
+        keys = ", ".join(f"joints.{name}.drive_inertia" for name in unknown)
+        terms = "" if "drive_inertia" in model.config.terms else ", and add drive_inertia to terms"
+        raise MotionRefused(
+            f"{model.config.name}: the arm can follow so little of the motion found that it would give "
+            f"{gain_words(task.criterion, lost)} at full size. {', '.join(unknown)} lag, and neither prior nor "
+            f"description has their drives' inertia, without which the controller is soft: write {keys} (rotor inertia "
+            f"times the gear ratio squared){terms}"
+        )
 
 
 def require_storable(basis: Basis) -> None:

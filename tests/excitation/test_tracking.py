@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from design_bench import FOURIER, ONE_START, quick, small
 
+from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Criterion, Design
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
@@ -22,9 +23,16 @@ from ident_service.excitation.active_limits import (
     stiffer_gains,
 )
 from ident_service.excitation.described_motion import excitation
-from ident_service.excitation.design import complete_task, criterion_of, design_motion, family, per_period
+from ident_service.excitation.design import (
+    complete_task,
+    criterion_of,
+    design_motion,
+    family,
+    per_period,
+    require_known_inertia,
+)
 from ident_service.excitation.limit_proof import certified_clearance, proof_of, scale_to_verified, violations
-from ident_service.excitation.mending import Prover
+from ident_service.excitation.mending import Attempt, Prover
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.optimal_design import Problem, Task
 from ident_service.excitation.postures import safe_posture
@@ -93,6 +101,36 @@ def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -
     assert any("lags by" in one or "catches up" in one for one in found)
     with pytest.raises(MotionRefused, match="the arm is certain to follow none"):
         design_motion(model, quick(), budget=ONE_START)
+
+
+@pytest.mark.parametrize(("known", "share"), [(False, 0.2), (True, 0.2), (False, 0.7)])
+def test_what_is_left_of_a_motion_of_unknown_drives_is_refused_and_says_what_to_write(
+    known: bool, share: float
+) -> None:
+    table = load_arm("planar2").model_dump(mode="json", by_alias=True)["prior"]
+    values = {name: value for name, value in zip(table["names"], table["values"], strict=True) if name[:2] != "Ia"}
+    joints = {name: {"kp": 20.0, "kd": 9.0, "following_error": 0.05} for name in ("shoulder", "elbow")}
+    if known:
+        joints = {name: gains | {"drive_inertia": 0.01} for name, gains in joints.items()}
+    model = small(joints=joints, prior=values)
+    design = quick()
+    basis, base = family(design, model)
+    task, limits = complete_task(model, design, basis, base), motion_limits(model.config)
+    problem = Problem(task, per_period(basis))
+    safe = basis.standing(safe_posture(model, task.limits))
+    whole = problem.coefficients(random_variables(problem, np.random.default_rng(1), safe))
+    proof = proof_of(basis.path(whole), model, task.limits, CollisionModel(model), design.torque_margin)
+    assert proof.tracking is not None
+    assert proof.tracking.late(limits).all()
+    left = criterion_of(task, basis.path(basis.still(whole) + share * (whole - basis.still(whole))), base)
+    attempt = Attempt(task, Candidate(0, 0.0, whole), proof, "lags", None, left, "")
+    if known or share > 0.5:
+        require_known_inertia(model, task, base, attempt, limits)
+        return
+    with pytest.raises(
+        MotionRefused, match=r"shoulder, elbow lag, .*: write joints.shoulder.drive_inertia, joints.elbow"
+    ):
+        require_known_inertia(model, task, base, attempt, limits)
 
 
 def test_clearance_is_the_arm_s_and_not_the_reference_s() -> None:
