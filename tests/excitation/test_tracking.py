@@ -133,6 +133,17 @@ def test_what_is_left_of_a_motion_of_unknown_drives_is_refused_and_says_what_to_
         require_known_inertia(model, task, base, attempt, limits)
 
 
+def test_limits_of_a_motion_that_teaches_next_to_nothing_can_be_told() -> None:
+    model, design = small(), quick()
+    task = complete_task(model, design, *family(design, model))
+    limits, basis = motion_limits(model.config), task.basis
+    wriggle = np.random.default_rng(0).normal(scale=1e-5, size=(2, basis.size))
+    held = basis.standing(task.limits.upper) + np.where(basis.moving, wriggle, 0.0)  # at a limit all the time
+    found = binding(task, held, per_period(basis))
+    assert max(one.exponent for one in found) == 50.0
+    assert "is limited by its position range" in active_limit_lines(found, task, limits, limits.velocity, ("", ""))[0]
+
+
 def test_clearance_is_the_arm_s_and_not_the_reference_s() -> None:
     model = small()
     path = excitation(model, "identification").path
