@@ -48,7 +48,7 @@ _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
 _MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
 _LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows
-_USELESS = 5.0  # times the information per parameter, variance or condition number that a motion may lose to its proof
+_SOFT = 3.0  # times the stiffness that a joint lacks to follow at its velocity limit
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
@@ -213,6 +213,7 @@ def design_motion(
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
     _require_holdable_home(model, task.limits)
+    require_known_inertia(model, task, safe)
     budget = budget or Budget()
     prover = Prover(
         model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto, budget.clock
@@ -230,7 +231,6 @@ def design_motion(
     if best.result is None:
         raise MotionRefused(f"not even the posture at rest keeps the limits: {best.refused}")
     coefficients, proof = best.result
-    require_known_inertia(model, task, base, best, limits)
     path = basis.path(coefficients)
     kappa = condition_number(information(path, model, base, np.ones(model.chain.joints)))
     excitation = Excitation(
@@ -318,32 +318,35 @@ def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     return f"scaled down until all limits could be proven; at full size it would give about {gain}: {attempt.why}"
 
 
-def require_known_inertia(
-    model: ArmModel, task: Task, base: BaseParameters, attempt: Attempt, limits: MotionLimits
-) -> None:
-    """Refuse what is left of a motion that the arm cannot follow because its drives' inertia is not described.
+def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
+    """Refuse an arm whose controller is far too soft because its drives' inertia is not described.
 
     The law's stiffness is kp times the inertia that it knows, behind a wrist next to none; and the arm itself, which
-    has more, is simulated with as little.
+    has more, is simulated with as little. What such a motion comes to is chance.
+
+    Args:
+        model: of the arm.
+        task: of the search.
+        safe: a posture that keeps all limits, shape (joints,).
 
     Raises:
-        MotionRefused: most of the information was lost, and a joint that lags has no drive inertia.
+        MotionRefused: a joint without drive inertia would lag at its velocity limit by far more than it may.
     """
-    tracking, used = attempt.proof.tracking, control_model(model)
-    if not attempt.why or tracking is None or used.prior is None:
+    used = control_model(model)
+    if used.prior is None:
         return
     drives = (model.chain.coupling**2).T @ used.layout.term_values("drive_inertia", used.prior)
-    lost = float(np.exp(attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)))
-    late = zip(model.chain.names, tracking.late(limits), drives, strict=True)
-    unknown = [name for name, lags, drive in late if lags and drive <= 0.0]
-    if unknown and lost > _USELESS:
-        keys = ", ".join(f"joints.{name}.drive_inertia" for name in unknown)
+    times = needed_stiffness(task, task.basis.standing(safe), per_period(task.basis))
+    soft = [k for k, name in enumerate(model.chain.names) if drives[k] <= 0.0 and times[k] > _SOFT]
+    if soft:
+        names = [model.chain.names[k] for k in soft]
+        keys = ", ".join(f"joints.{name}.drive_inertia" for name in names)
         terms = "" if "drive_inertia" in model.config.terms else ", and add drive_inertia to terms"
         raise MotionRefused(
-            f"{model.config.name}: the arm can follow so little of the motion found that it would give "
-            f"{gain_words(task.criterion, lost)} at full size. {', '.join(unknown)} lag, and neither prior nor "
-            f"description has their drives' inertia, without which the controller is soft: write {keys} (rotor inertia "
-            f"times the gear ratio squared){terms}"
+            f"{model.config.name}: {', '.join(names)} would lag at the velocity limit by "
+            f"{', '.join(f'{times[k]:.2g}' for k in soft)} times what following_error allows: neither prior nor "
+            f"description has the inertia of the drives, without which the controller is soft. Write {keys} (rotor "
+            f"inertia times the gear ratio squared){terms}"
         )
 
 
