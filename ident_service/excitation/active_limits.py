@@ -90,7 +90,7 @@ def binding(task: Task, coefficients: Array, per_period: int) -> tuple[ActiveLim
         cost, stiffer = total.get(owner, (0.0, 0.0))
         total[owner] = cost + force, stiffer + force * part
     return tuple(
-        ActiveLimit(*owner, *costs)
+        ActiveLimit(*owner, *np.minimum(costs, _MOST).tolist())
         for owner, costs in sorted(total.items(), key=lambda item: -item[1][0])
         if costs[0] > 0.0
     )

@@ -295,6 +295,7 @@ _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
 _MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
 _LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows
+_SOFT = 3.0  # times the stiffness that a joint lacks to follow at its velocity limit
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
 
@@ -459,6 +460,7 @@ def design_motion(
     _require_free_home(model, task.limits, collision)
     safe = safe_posture(model, task.limits, seed)
     _require_holdable_home(model, task.limits)
+    require_known_inertia(model, task, safe)
     budget = budget or Budget()
     prover = Prover(
         model, task, safe, design.torque_margin, lambda X: criterion_of(task, basis.path(X), base), veto, budget.clock
@@ -561,6 +563,38 @@ def _scaling_text(task: Task, base: BaseParameters, attempt: Attempt) -> str:
     lost = attempt.value - criterion_of(task, task.basis.path(attempt.candidate.coefficients), base)
     gain = gain_words(task.criterion, float(np.exp(max(lost, 0.0))))
     return f"scaled down until all limits could be proven; at full size it would give about {gain}: {attempt.why}"
+
+
+def require_known_inertia(model: ArmModel, task: Task, safe: Array) -> None:
+    """Refuse an arm whose controller is far too soft because its drives' inertia is not described.
+
+    The law's stiffness is kp times the inertia that it knows, behind a wrist next to none; and the arm itself, which
+    has more, is simulated with as little. What such a motion comes to is chance.
+
+    Args:
+        model: of the arm.
+        task: of the search.
+        safe: a posture that keeps all limits, shape (joints,).
+
+    Raises:
+        MotionRefused: a joint without drive inertia would lag at its velocity limit by far more than it may.
+    """
+    used = control_model(model)
+    if used.prior is None:
+        return
+    drives = (model.chain.coupling**2).T @ used.layout.term_values("drive_inertia", used.prior)
+    times = needed_stiffness(task, task.basis.standing(safe), per_period(task.basis))
+    soft = [k for k, name in enumerate(model.chain.names) if drives[k] <= 0.0 and times[k] > _SOFT]
+    if soft:
+        names = [model.chain.names[k] for k in soft]
+        keys = ", ".join(f"joints.{name}.drive_inertia" for name in names)
+        terms = "" if "drive_inertia" in model.config.terms else ", and add drive_inertia to terms"
+        raise MotionRefused(
+            f"{model.config.name}: {', '.join(names)} would lag at the velocity limit by "
+            f"{', '.join(f'{times[k]:.2g}' for k in soft)} times what following_error allows: neither prior nor "
+            f"description has the inertia of the drives, without which the controller is soft. Write {keys} (rotor "
+            f"inertia times the gear ratio squared){terms}"
+        )
 
 
 def require_storable(basis: Basis) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from design_bench import FOURIER, ONE_START, quick, small
 
+from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Criterion, Design
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import MotionRefused
@@ -29,6 +30,7 @@ from ident_service.excitation.design import (
     design_motion,
     family,
     per_period,
+    require_known_inertia,
     safe_posture,
 )
 from ident_service.excitation.limit_proof import certified_clearance, proof_of, scale_to_verified, violations
@@ -99,6 +101,32 @@ def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -
     assert any("lags by" in one or "catches up" in one for one in found)
     with pytest.raises(MotionRefused, match="the arm is certain to follow none"):
         design_motion(model, quick(), budget=ONE_START)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_soft_joint_of_unknown_drives_is_refused_and_says_what_to_write(known: bool) -> None:
+    document = load_arm("planar2").model_dump(mode="json", by_alias=True)["prior"]
+    prior = {name: value for name, value in zip(document["names"], document["values"], strict=True) if name != "Ia2"}
+    joints = {"elbow": {"kp": 5.0, "kd": 4.0, "following_error": 0.02} | ({"drive_inertia": 0.01} if known else {})}
+    model = small(joints=joints, prior=prior)
+    task = complete_task(model, quick(), *family(quick(), model))
+    safe = safe_posture(model, task.limits)
+    if known:
+        require_known_inertia(model, task, safe)
+        return
+    with pytest.raises(MotionRefused, match=r"elbow would lag at .* Write joints.elbow.drive_inertia \(rotor"):
+        require_known_inertia(model, task, safe)
+
+
+def test_limits_of_a_motion_that_teaches_next_to_nothing_can_be_told() -> None:
+    model, design = small(), quick()
+    task = complete_task(model, design, *family(design, model))
+    limits, basis = motion_limits(model.config), task.basis
+    wriggle = np.random.default_rng(0).normal(scale=1e-5, size=(2, basis.size))
+    held = basis.standing(task.limits.upper) + np.where(basis.moving, wriggle, 0.0)  # at a limit all the time
+    found = binding(task, held, per_period(basis))
+    assert max(one.exponent for one in found) == 50.0
+    assert "is limited by its position range" in active_limit_lines(found, task, limits, limits.velocity, ("", ""))[0]
 
 
 def test_clearance_is_the_arm_s_and_not_the_reference_s() -> None:
