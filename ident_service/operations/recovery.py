@@ -47,7 +47,7 @@ class Recovery:
     Attributes:
         arm: name.
         faults: that nobody has acknowledged, the earliest first.
-        mover: process that moves the arm, or None.
+        controlling_pid: process that moves the arm, or None.
         seen: at the arm, after a reset if there was one; None where it could not be looked at.
         unreachable: why not, or empty.
         zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
@@ -60,7 +60,7 @@ class Recovery:
 
     arm: str
     faults: tuple[StoredFault, ...]
-    mover: int | None
+    controlling_pid: int | None
     seen: Watched | None
     unreachable: str
     zero_lost: str
@@ -251,14 +251,12 @@ class ZeroingResult:
         posture: that the arm stands in, of all joints.
         drives: message of each drive about its zero.
         faults: that nobody has acknowledged; zeroing is possible with them and leaves them as they are.
-        ticket_removed: whether there was a preflight ticket, which was about another zero.
     """
 
     arm: str
     posture: tuple[JointPosture, ...]
     drives: tuple[str, ...]
     faults: tuple[StoredFault, ...]
-    ticket_removed: bool
 
 
 def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
@@ -304,8 +302,7 @@ def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm:
         if typed.strip() != config.name:
             raise MotionRefused(f"{config.name}: home not set: the arm's name was not typed; nothing has changed")
         # Removed before zeroing: a ticket that outlived it would be for another zero.
-        existed = ticket.exists()
         ticket.unlink(missing_ok=True)
-        PositionFile(ticket.parent, config).forget()  # what drives tell is about another zero from now on
+        PositionFile(ticket.parent, config).forget()  # of the zero that is about to be replaced
         drives = (make_arm(config) if arm is None else arm).zero()
-    return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)
+    return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered())

@@ -41,7 +41,7 @@ import gc, os
 from ident_service.motion.realtime import temporary_privileges
 def state(): return os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled(), gc.get_freeze_count()
 before = state()
-with asked(1) as granted:
+with temporary_privileges(1) as granted:
     assert not gc.isenabled()
     assert granted.core is None or os.sched_getaffinity(0) == {granted.core}
 assert state() == before, (before, state())

@@ -117,12 +117,12 @@ def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behin
 
 @pytest.mark.slow
 def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    assert not set_home(config, state, sure).ticket_removed
+    set_home(config, state, sure)
     ticket = checked(config)
     path = ticket_path(state, config.name)
     path.write_text(ticket.to_json())
     lead(behind, HOME + 0.01)
-    assert set_home(config, state, sure).ticket_removed
+    set_home(config, state, sure)
     assert not path.exists()
     with make_arm(config) as arm:  # where the file of another state folder was left
         why = ticket.valid_for(subject_of(arm_model(config), None, arm.describe()), ticket.created)

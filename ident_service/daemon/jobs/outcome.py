@@ -274,13 +274,13 @@ class Orphan:
     Attributes:
         row: of its job.
         process: its name, as `child_process.alive` takes it.
-        mover: id of the process that has the arm; None before one was seen.
+        controlling_pid: id of the process that has the arm; None before one was seen.
         since: when it was seen first [s].
     """
 
     row: Row
     process: str
-    mover: int | None
+    controlling_pid: int | None
     since: float
 
     def standing(self, state: Path) -> str:
@@ -288,9 +288,9 @@ class Orphan:
         row, moves = self.row, bool(self.row["motion"])
         lives = alive(self.process)
         has = controlling_pid(control_path(state, row["arm"])) if moves else None
-        if lives and self.mover is None:
-            self.mover = has
-        if not lives and (has is None or has != self.mover):
+        if lives and self.controlling_pid is None:
+            self.controlling_pid = has
+        if not lives and (has is None or has != self.controlling_pid):
             return ""
         if has is not None and held_arm(state, row["arm"]):
             return f" {has} holds {held_until(row['arm'])}"
