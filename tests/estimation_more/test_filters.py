@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.signal
-from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
+from estimation.synthetic import SampledRecording, recorded, serial_chain, smoothed_samples, stamps, waves, with_options
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.arm import Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import equation_rows, equations, smoothed_samples
+from ident_service.estimation.equations import equation_rows, equations
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
