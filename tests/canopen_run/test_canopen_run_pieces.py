@@ -35,7 +35,7 @@ def behind(folder: Path, *, brakes: bool = True) -> tuple[LockStepArm, CanopenAr
     return drives, CanopenArm(config, lambda _: [drives.link(0)])
 
 
-def test_what_was_asked_of_the_kernel_is_given_back() -> None:
+def test_privileges_of_the_kernel_are_given_back() -> None:
     code = """
 import gc, os
 from ident_service.motion.realtime import temporary_privileges

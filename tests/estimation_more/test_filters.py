@@ -51,7 +51,7 @@ def test_polynomials_are_exact_for_polynomials() -> None:
         np.testing.assert_allclose(values[:, 0], wanted, rtol=0, atol=1e-8 * 100.0**order)
 
 
-def test_polynomials_have_about_the_cut_off_asked_for() -> None:
+def test_polynomials_have_about_the_requested_cut_off() -> None:
     rng = np.random.default_rng(4)
     white = rng.normal(size=(40_000, 1))
     recording = SampledRecording(stamps(len(white), RATE), white, white)

@@ -338,7 +338,7 @@ def explain_interrupted(
     """
     left = list(orphans(db, state) if found is None else found)
     closing = threading.Event() if closing is None else closing
-    told: dict[str, str] = {}
+    recorded: dict[str, str] = {}
     for one in left:
         # A motion has seen the end of its input and stops its arm; a second word would end what holds it.
         if not (one.row["motion"] and held_arm(state, one.row["arm"])):
@@ -350,8 +350,8 @@ def explain_interrupted(
                 left.remove(one)
                 _explain(db, state, one.row)
                 over(job)
-            elif words != told.setdefault(job, " is being looked for"):
-                told[job] = words
+            elif words != recorded.setdefault(job, " is being looked for"):
+                recorded[job] = words
                 rows.explain(db, job, f"{END_UNOBSERVED}{words}")
         if left:
             closing.wait(_LOOK)
