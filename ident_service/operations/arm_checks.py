@@ -195,12 +195,14 @@ class ScaleCheck:
 
     Attributes:
         joint: its name.
-        measured: by how much, as the drives say, likewise.
+        typed: turn that a person typed [rad or m].
+        measured: turn that the drives measured, likewise.
         good: whether they agree.
         words: about it, for people.
     """
 
     joint: str
+    typed: float
     measured: float
     good: bool
     words: str
@@ -264,7 +266,7 @@ def _turned(name: str, answer: str, scale: float, revolute: bool, measured: floa
             if ratio > 1e-3
             else ": its encoder does not count, or is another joint's"
         )
-    return ScaleCheck(name, measured, good, words)
+    return ScaleCheck(name, typed, measured, good, words)
 
 
 def _position(arm: Arm, number: int) -> float:

@@ -251,12 +251,14 @@ class ZeroingResult:
         posture: that the arm stands in, of all joints.
         drives: message of each drive about its zero.
         faults: that nobody has acknowledged; zeroing is possible with them and leaves them as they are.
+        ticket_removed: whether there was a preflight ticket, which was about another zero.
     """
 
     arm: str
     posture: tuple[JointPosture, ...]
     drives: tuple[str, ...]
     faults: tuple[StoredFault, ...]
+    ticket_removed: bool
 
 
 def home_posture(config: ArmConfig) -> tuple[JointPosture, ...]:
@@ -302,7 +304,8 @@ def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm:
         if typed.strip() != config.name:
             raise MotionRefused(f"{config.name}: home not set: the arm's name was not typed; nothing has changed")
         # Removed before zeroing: a ticket that outlived it would be for another zero.
+        existed = ticket.exists()
         ticket.unlink(missing_ok=True)
         PositionFile(ticket.parent, config).forget()  # of the zero that is about to be replaced
         drives = (make_arm(config) if arm is None else arm).zero()
-    return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered())
+    return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

@@ -108,7 +108,7 @@ def test_a_person_who_says_so_makes_the_arm_usable(config: ArmConfig, behind: Lo
 
 @pytest.mark.slow
 def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    set_home(config, state, sure)
+    assert not set_home(config, state, sure).ticket_removed
     ticket = checked(config)
     assert ticket.verdict is Verdict.PASSED, [check.reason for check in ticket.checks]
     with make_arm(config) as arm:
@@ -117,12 +117,12 @@ def test_a_zeroed_arm_passes_its_preflight_and_is_moved(config: ArmConfig, behin
 
 @pytest.mark.slow
 def test_a_ticket_dies_with_the_zero_that_it_was_made_for(config: ArmConfig, behind: LockStepArm, state: Path) -> None:
-    set_home(config, state, sure)
+    assert not set_home(config, state, sure).ticket_removed
     ticket = checked(config)
     path = ticket_path(state, config.name)
     path.write_text(ticket.to_json())
     lead(behind, HOME + 0.01)
-    set_home(config, state, sure)
+    assert set_home(config, state, sure).ticket_removed
     assert not path.exists()
     with make_arm(config) as arm:  # where the file of another state folder was left
         why = ticket.valid_for(subject_of(arm_model(config), None, arm.describe()), ticket.created)
@@ -134,7 +134,7 @@ def test_no_ticket_outlives_a_zeroing_that_is_cut_short(
     config: ArmConfig, behind: LockStepArm, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Switched off and on, drives count from 0 again, so that a ticket cannot tell one zero from the other."""
-    set_home(config, state, sure)
+    assert not set_home(config, state, sure).ticket_removed
     ticket = checked(config)
     path = ticket_path(state, config.name)
     path.write_text(ticket.to_json())
