@@ -327,14 +327,13 @@ def _position(data: bytes) -> int:
     return bits - (1 << POSITION_BITS) if bits >> POSITION_BITS - 1 else bits
 
 
-def torque_frame(group: int, number: int, counts: Sequence[int], *, sender: int = HOST) -> Frame:
+def torque_frame(group: int, number: int, counts: Sequence[int]) -> Frame:
     """Return the frame that carries up to four torques to a group.
 
     Args:
         group: `Group.LOWER` or `Group.UPPER`.
         number: of the property T in the pucks' firmware, the same in all of them.
         counts: torque of the pucks by their slots (PIDX); slots that are left out get zero.
-        sender: its node.
 
     Raises:
         DriverError: too many torques, or one that 14 bits do not hold: nothing is to be sent then.
@@ -346,7 +345,7 @@ def torque_frame(group: int, number: int, counts: Sequence[int], *, sender: int 
         count = counts[slot] if slot < len(counts) else 0
         packed = packed << _TORQUE_BITS | count & (1 << _TORQUE_BITS) - 1
     data = bytes([_SET | number & 0x7F]) + packed.to_bytes(7, "big")
-    return Frame(Address(sender, group, group=True).identifier, data)
+    return Frame(Address(HOST, group, group=True).identifier, data)
 
 
 def torques_of(data: bytes) -> tuple[int, tuple[int, int, int, int]] | None:

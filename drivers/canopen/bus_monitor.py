@@ -341,7 +341,7 @@ class MonitoringArm(Arm):
             self._lost,
             tuple(int(joint_status(status[k] for k in motors)) for motors in joints),
             drives=tuple(
-                f"node {place[1]}: {_says(one)}, {self._heard.nmt_words(place, now_ns, patience_ns)}"
+                f"node {place[1]}: {_status_words(one)}, {self._heard.nmt_words(place, now_ns, patience_ns)}"
                 for place, one in zip(self._places, seen, strict=True)
             ),
         )
@@ -356,6 +356,6 @@ def _take(seen: _LastAnswers, position: int | None, status: int | None) -> None:
     seen.status = status if status is not None else seen.status
 
 
-def _says(seen: _LastAnswers) -> str:
+def _status_words(seen: _LastAnswers) -> str:
     words = "no status word" if seen.status is None else drive_words(seen.status, seen.emergency)
     return words if seen.age == 0 else f"{words} (no answer for {seen.age} cycles)"

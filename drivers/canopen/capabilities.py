@@ -246,9 +246,9 @@ def discovered(objects: Objects, drive: CanopenDrive, own: Sequence[Family] = ()
         DriverError: it does not answer, or the bus is gone.
     """
     objects.read_bytes(od.DEVICE_TYPE.index, 0, od.DEVICE_TYPE.name)  # one that is silent is not asked for all the rest
-    first = _asked(objects, (od.DEVICE_TYPE, od.VENDOR, od.PRODUCT))
+    first = _read_entries(objects, (od.DEVICE_TYPE, od.VENDOR, od.PRODUCT))
     family = family_of(first.identity, own)
-    return family, replace(_asked(objects, _entries(family, drive)), firmware=_firmware(objects))
+    return family, replace(_read_entries(objects, _entries(family, drive)), firmware=_firmware(objects))
 
 
 def _firmware(objects: Objects) -> str:
@@ -286,7 +286,7 @@ def _entries(family: Family, drive: CanopenDrive) -> dict[int, Entry]:
     return {entry.key: entry for entry in reversed(entries)}
 
 
-def _asked(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> DriveEntries:
+def _read_entries(objects: Objects, entries: Mapping[int, Entry] | Sequence[Entry]) -> DriveEntries:
     there, values, unread = set(), {}, {}
     for entry in entries.values() if isinstance(entries, Mapping) else entries:
         try:

@@ -338,7 +338,7 @@ class CanopenArm(Arm):
         if self._buses is not None:
             raise DriverError("the arm is open; close it before it is zeroed")
         with ZeroingArm(self._config, self._open_bus) as arm:
-            return arm.take_home()
+            return arm.set_home()
 
     def log_frames(self, path: Path) -> None:
         """Log every frame of the next session; see `Arm`."""

@@ -26,7 +26,7 @@ _OFF = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
 
 
 class ZeroingArm(MonitoringArm):
-    """Observe drives, whether they have a zero or not, until `take_home`."""
+    """Observe drives, whether they have a zero or not, until `set_home`."""
 
     def _find_zero(self) -> None:
         """Do nothing: whatever zero the drives have is about to be replaced."""
@@ -34,7 +34,7 @@ class ZeroingArm(MonitoringArm):
     def _require_no_restart(self) -> None:
         """Do nothing before the counts are taken."""
 
-    def take_home(self) -> tuple[str, ...]:
+    def set_home(self) -> tuple[str, ...]:
         """Store in every drive its present counts as those at home.
 
         Returns:

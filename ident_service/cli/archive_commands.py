@@ -277,7 +277,7 @@ def _import(arguments: argparse.Namespace) -> Answer:
 
 
 def _prune(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.run_archive import expendable, prune
+    from ident_service.operations.run_archive import prunable_recordings, prune
     from ident_service.registry.database import Database
     from ident_service.registry.runs import rebuild_runs
 
@@ -287,7 +287,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
         gone = (
             prune(db, state, arguments.keep, terminal_user(arguments))
             if arguments.yes
-            else expendable(db, state, arguments.keep)
+            else prunable_recordings(db, state, arguments.keep)
         )
     document = {
         "deleted": arguments.yes,

@@ -189,7 +189,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
         "arm": found.arm,
         "usable": found.usable,
         "faults": [asdict(one) for one in found.faults],
-        "moved_by": found.mover,
+        "moved_by": found.controlling_pid,
         "seen": None if found.seen is None else watch_document(found.seen),
         "unreachable": found.unreachable,
         "zero_lost": found.zero_lost,
@@ -226,8 +226,8 @@ def _text(found: Recovery) -> str:
         lines.append(f"  active since {since} UTC: {one.code}: {one.cause}")
     if not found.faults:
         lines.append("  no active faults")
-    if found.mover is not None:
-        lines.append(f"  process {found.mover} is moving the arm")
+    if found.controlling_pid is not None:
+        lines.append(f"  process {found.controlling_pid} is moving the arm")
     if found.unreachable:
         lines.append(f"  the arm does not answer: {found.unreachable}")
     if found.zero_lost:

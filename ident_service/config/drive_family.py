@@ -154,11 +154,11 @@ class Family(Section):
 
     @model_validator(mode="after")
     def _every_fact_has_a_source(self) -> Family:
-        told = self.model_fields_set - _NEEDS_NO_SOURCE
-        if empty := [key for key in sorted(told) if getattr(self, key) is None]:
+        given = self.model_fields_set - _NEEDS_NO_SOURCE
+        if empty := [key for key in sorted(given) if getattr(self, key) is None]:
             raise ValueError(f"{', '.join(empty)}: leave out what is not known")
-        if told != self.sources.keys():
-            raise ValueError(f"sources are needed for {', '.join(sorted(told))}; there are {', '.join(self.sources)}")
+        if given != self.sources.keys():
+            raise ValueError(f"sources are needed for {', '.join(sorted(given))}; there are {', '.join(self.sources)}")
         return self
 
     def over(self, generic: Family) -> Family:

@@ -112,10 +112,10 @@ def data_sheet(text: str) -> DataSheet:
     entries = _compact_pdos(info) | entries
     usage: Mapping[str, str] = sections.get("dummyusage", {})
     dummies = frozenset(k for k in range(1, 8) if _is_set(usage.get(f"dummy{k:04d}", "0")))
-    told = {1: "vendornumber", 2: "productnumber", 3: "revisionnumber"}
+    wanted = {1: "vendornumber", 2: "productnumber", 3: "revisionnumber"}
     mistake = None if entries or "deviceinfo" in sections else "it lists no object and has no section [DeviceInfo]"
-    identity = {sub: _number(info.get(key, ""), 0) for sub, key in told.items()}
-    identity |= {s: n for s in told if (one := entries.get(0x1018 << 8 | s)) and (n := one.number(0)) is not None}
+    identity = {sub: _number(info.get(key, ""), 0) for sub, key in wanted.items()}
+    identity |= {s: n for s in wanted if (one := entries.get(0x1018 << 8 | s)) and (n := one.number(0)) is not None}
     known = {sub: value for sub, value in identity.items() if value is not None}
     return DataSheet(entries, dummies, known, mistake, _cut_off(sections, {index for index, _ in objects}))
 

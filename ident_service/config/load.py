@@ -448,14 +448,14 @@ def _problems(error: ValidationError, tree: Tree, path: Path, section: str = "")
             continue
         name = ".".join(str(part) for part in (where[:-1] if mistakes[0]["type"] == "missing" else where))
         # Of a value that may be one thing or another, each branch has its own complaint.
-        told = list(dict.fromkeys(_mistake_words(one, where, known, tree) for one in mistakes))
-        wanted = [words for kind, words in told if kind == "wanted"]
-        said = [words for kind, words in told if kind == "said"]
-        if wanted and not said:
-            said = [f"must be {' or '.join(wanted)}, not {_value(mistakes[0]['input'])}"]
+        worded = list(dict.fromkeys(_mistake_words(one, where, known, tree) for one in mistakes))
+        wanted = [words for kind, words in worded if kind == "wanted"]
+        sentences = [words for kind, words in worded if kind == "sentence"]
+        if wanted and not sentences:
+            sentences = [f"must be {' or '.join(wanted)}, not {_value(mistakes[0]['input'])}"]
             if texts := [one for one in mistakes if isinstance(one["input"], str)]:
-                said[0] += _nearest(str(texts[0]["input"]), mistakes)
-        for words in said:
+                sentences[0] += _nearest(str(texts[0]["input"]), mistakes)
+        for words in sentences:
             yield tree.problem(where, f"{name}: {words}" if name else words, path)
 
 
@@ -485,39 +485,39 @@ _BOUNDS = {
 
 
 def _mistake_words(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -> tuple[str, str]:
-    """Return whether a mistake is told by what is `wanted` or in words that are `said`, and those words."""
+    """Return whether a mistake is reported by what is `wanted` or by a whole `sentence`, and those words."""
     kind, context, value = mistake["type"], mistake.get("ctx", {}), mistake["input"]
     if kind in _WANTED:
         unit = known.unit(where, tree.value)
         if kind in ("float_type", "int_type") and isinstance(value, str) and _is_number(value):
-            return "said", f"{str(value)!r} is text, and {_WANTED[kind]} is needed; leave out the quotes"
+            return "sentence", f"{str(value)!r} is text, and {_WANTED[kind]} is needed; leave out the quotes"
         return "wanted", _WANTED[kind] + (f" [{unit}]" if unit and "number" in _WANTED[kind] else "")
     if kind in _BOUNDS:
         words, key = _BOUNDS[kind]
         unit = known.unit(where, tree.value)
-        return "said", f"must be {words} {context[key]:.10g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
+        return "sentence", f"must be {words} {context[key]:.10g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
     if kind in ("literal_error", "enum"):
         return "wanted", str(context["expected"])
     if kind == "union_tag_invalid":
         tag, tags = str(context["tag"]), [one.strip("' ") for one in str(context["expected_tags"]).split(",")]
-        return "said", f"kind must be {' or '.join(tags)}, not {tag!r}{did_you_mean(tag, tags)}"
+        return "sentence", f"kind must be {' or '.join(tags)}, not {tag!r}{did_you_mean(tag, tags)}"
     if kind == "union_tag_not_found":
-        return "said", "'kind' is missing; add it"
+        return "sentence", "'kind' is missing; add it"
     if kind == "extra_forbidden":
-        return "said", f"unknown key {where[-1]!r}{known.remedy(where, tree.value)}"
+        return "sentence", f"unknown key {where[-1]!r}{known.remedy(where, tree.value)}"
     if kind == "missing":
         if isinstance(where[-1], int):
-            return "said", f"must be a list of {known.items(where[:-1], tree.value)}, not {where[-1]}"
+            return "sentence", f"must be a list of {known.items(where[:-1], tree.value)}, not {where[-1]}"
         words = known.description(where, tree.value)
-        return "said", f"{where[-1]!r} is missing; add it" + (f": {words}" if words else "")
+        return "sentence", f"{where[-1]!r} is missing; add it" + (f": {words}" if words else "")
     if kind in ("too_long", "too_short"):
         bound = f"at most {context['max_length']}" if kind == "too_long" else f"at least {context['min_length']}"
-        return "said", f"must be a list of {bound}, not {context['actual_length']}"
+        return "sentence", f"must be a list of {bound}, not {context['actual_length']}"
     if kind == "string_pattern_mismatch":
         words = known.description(where, tree.value)
         said = plain_mistake(mistake)
-        return "said", f"{said}; {words}" if words and " that is needed here" in said else said
-    return "said", plain_mistake(mistake)
+        return "sentence", f"{said}; {words}" if words and " that is needed here" in said else said
+    return "sentence", plain_mistake(mistake)
 
 
 def _nearest(word: str, mistakes: Sequence[ErrorDetails]) -> str:

@@ -158,8 +158,8 @@ def reference() -> str:
         for key, one in _keys(sections[name]):
             words, unit = one.get("description", ""), one.get("x-unit", "")
             example = f"`{examples[name, key]}`" if (name, key) in examples else ""
-            told = words.replace(f" [{unit}]", "", 1)
-            cells = (f"`{key}`", _type(one, schema, titles), unit, _default(one), told, example)
+            description = words.replace(f" [{unit}]", "", 1)
+            cells = (f"`{key}`", _type(one, schema, titles), unit, _default(one), description, example)
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         parts.append("\n".join([*lines, ""]))
     return "\n".join(parts)

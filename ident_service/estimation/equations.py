@@ -14,7 +14,6 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.arm import Identification
 from ident_service.config.payload import Payload
 from ident_service.errors import RecordingError
 from ident_service.estimation.repeats import Label, Stretches, stretches
@@ -460,9 +459,3 @@ def _pairs(labels: Sequence[Label]) -> list[tuple[int, int | None]]:
     if len(partner) > 0.9 * len(labels):
         return [(place, place + 1 if place + 1 < len(labels) else None) for place in range(0, len(labels), 2)]
     return sorted(partner.items())
-
-
-def smoothed_samples(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:
-    """Return all smoothed samples of a recording at once, for scoring and drawing short recordings."""
-    parts = list(smoothed(recording, options, coupling))
-    return Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in Motion.__dataclass_fields__))

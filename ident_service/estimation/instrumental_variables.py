@@ -11,37 +11,33 @@ the rows, and friction would be biased by the choice. The motion is simulated wi
 and again with the better one, until the estimate does not change any more; a round is one pass over the recordings,
 block by block. Z is smoothed as W is.
 
-The simulated arm is rigid with drives and friction (`rigid_body.ForwardDynamics`). What it follows should be the
-reference that the real one followed; its loop then is that of eq. 76, with the prior model and gains of the
-configuration. The protocol of a recording does not show the reference. Unless it is given, the measured position
-takes its place, low-passed so far below the regressor's own cut-off that little of its noise is left: variance of a
-second derivative falls with the fifth power of the cut-off. What the noise of the torque moved below that frequency is
-in the instruments then, and its bias stays. Around a motion that has been followed once already, and for an arm
-without prior or gains, the loop is inverse dynamics with the simulated parameters themselves, stiff and critically
-damped, so that errors of following do not come twice.
+The simulated arm is rigid with drives and friction (`pinocchio_models.ForwardDynamics`). It follows the measured
+position, since a recording does not contain the reference that the real arm followed. That position is low-passed so
+far below the regressor's own cut-off that little of its noise is left: variance of a second derivative falls with the
+fifth power of the cut-off. What the noise of the torque moved below that frequency is in the instruments, and its bias
+stays. The simulated loop is inverse dynamics with the simulated parameters themselves, stiff and critically damped, so
+that the tracking error, which the measured position already contains, is not added twice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.motion_limits import MotionLimits, motion_limits
-from ident_service.errors import ModelError, MotionRefused
+from ident_service.errors import ModelError
 from ident_service.estimation.equations import MAX_BLOCKS, Rows, cut_into_stretches, equation_rows
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.least_squares import LeastSquares
 from ident_service.estimation.repeats import Label, Stretches
 from ident_service.estimation.spectra import with_chosen_cutoff
-from ident_service.model.arm_model import ArmModel, control_model
+from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
-from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.information import sparsity
 from ident_service.model.zero_phase import low_pass
 from ident_service.recordings.recording import BLOCK_SAMPLES, Block, Recording, Stamps, join
@@ -52,7 +48,7 @@ _MOST_ROUNDS = 10
 _RANK_TOLERANCE = 1e-12
 _ORDER = 3  # order of the low-pass on the followed positions
 _SLOWEST = 2.0  # Hz, least cut-off of that low-pass on measured positions; motions of arms are slower
-_STIFFNESS = 60.0  # rad/s, of the loop around an arm whose own is not known
+_STIFFNESS = 60.0  # rad/s, natural frequency of the simulated loop
 _LARGEST_STEP = 0.5  # largest integration step, as a share of the velocity loop's time constant
 _RUNAWAY = 1e4  # rad/s or m/s
 
@@ -95,10 +91,6 @@ def instrumental_variables(
     conditions: FeasibleSet,
     fit: LeastSquares,
     delta: Array,
-    *,
-    references: Sequence[Recording] | None = None,
-    cutoff: float | None = None,
-    progress: Callable[[int, float], None] = lambda _round, _change: None,
 ) -> InstrumentalEstimate:
     """Refine an estimate by instrumental variables from simulated motions.
 
@@ -109,33 +101,27 @@ def instrumental_variables(
         conditions: the feasible set, which every simulated arm is in.
         fit: ordinary or weighted least squares to begin from; its weights per joint stay. Weights per row are not used.
         delta: feasible link parameters near it, to simulate first, shape (parameters,).
-        references: per recording what its arm followed, as positions at the same stamps; the measured ones when None.
-        cutoff: of the low-pass on what is followed [Hz]; the smoothing's own where references are given, else a
-            quarter of it, but at least 2 Hz.
-        progress: called after each round with its number and the change in standard deviations.
 
     Raises:
-        ModelError: no recording or too few references, directions that the data do not see, a simulated loop that
-            runs away, instruments that say nothing about some direction.
+        ModelError: no recording, directions that the data do not excite, a simulated loop that runs away, a simulated
+            motion that does not excite some direction.
         RecordingError: a recording cannot be used.
         SolverError: the solver stopped without an optimum.
     """
     if fit.rank < base.size:
         raise ModelError(f"the data excite {fit.rank} of {base.size} directions; instruments need all of them")
-    follow = recordings if references is None else references
-    if not recordings or len(follow) != len(recordings):
-        raise ModelError(f"{len(recordings)} recordings and {len(follow)} references; each recording needs its own")
+    if not recordings:
+        raise ModelError("the instrumental estimate needs a recording")
     # The arms that are simulated below are smoothed as the recordings are.
     model = with_chosen_cutoff(model, recordings)
-    smoothed = float(model.config.identification.smoothing.cutoff)
-    frequency = cutoff or (smoothed if references is not None else max(0.25 * smoothed, _SLOWEST))
+    cutoff = max(0.25 * float(model.config.identification.smoothing.cutoff), _SLOWEST)
     cut = cut_into_stretches(recordings, model)
     beta = fit.beta
     best: InstrumentalEstimate | None = None
     for number in range(1, _MOST_ROUNDS + 1):
         sums: dict[Label, _Sums] = {}
-        for recording, reference, parts in zip(recordings, follow, cut, strict=True):
-            instruments = simulated(recording, reference, model, delta, frequency, commanded=references is not None)
+        for recording, parts in zip(recordings, cut, strict=True):
+            instruments = simulated(recording, model, delta, cutoff)
             for label, block in _blocks(recording, instruments, model, base, fit.weights, parts):
                 sums = _bounded(sums | {label: sums[label] + block if label in sums else block})
         solved = _solve(list(sums.values()))
@@ -143,7 +129,6 @@ def instrumental_variables(
         beta = solved.beta
         nearest = constrained_least_squares(replace(fit, beta=beta, rho1=fit.R1 @ beta), base, conditions)
         delta = nearest.delta
-        progress(number, change)
         if number > 1 and (best is None or change < best.change):
             deviations = np.sqrt(np.diag(solved.covariance))
             best = InstrumentalEstimate(
@@ -270,31 +255,27 @@ class SimulatedRecording:
             yield replace(block, position=position, velocity=None)
 
 
-def simulated(
-    recording: Recording, reference: Recording, model: ArmModel, delta: Array, cutoff: float, *, commanded: bool
-) -> SimulatedRecording:
+def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float) -> SimulatedRecording:
     """Return the recording as the arm would have made it without noise.
 
     Args:
-        recording: whose stamps and torques to keep.
-        reference: whose positions the arm follows.
-        model: the arm; its configuration says what to trim, and how its loop is closed.
+        recording: whose positions the simulated arm follows, and whose stamps and torques are kept.
+        model: the arm; its configuration says what to trim.
         delta: its parameters, shape (parameters,).
-        cutoff: of the low-pass on what it follows [Hz].
-        commanded: whether the reference is what the loop of the configuration was given.
+        cutoff: of the low-pass on the positions that it follows [Hz].
 
     Raises:
         ModelError: a link has no positive mass, the loop runs away, or a cut-off above half the rate.
         RecordingError: a recording cannot be used.
     """
     fmt = model.config.recording
-    stamps = grid(reference, fmt)
+    stamps = grid(recording, fmt)
     if not 0.0 < cutoff < 0.5 / stamps.period_s:
         raise ModelError(f"a cut-off of {cutoff:g} Hz at {1.0 / stamps.period_s:.4g} Hz is not possible")
-    loop = _Loop(model, delta, stamps.period_s, commanded)
+    loop = _Loop(model, delta, stamps.period_s)
     held: list[Block] = []
     stretches = []
-    for piece in uniform(reference, fmt, stamps):
+    for piece in uniform(recording, fmt, stamps):
         held.append(piece.block)
         if piece.end:
             whole = join(held)
@@ -309,61 +290,33 @@ def simulated(
 class _Loop:
     """Simulated arm under control, without noise and without delay."""
 
-    def __init__(self, model: ArmModel, delta: Array, period: float, commanded: bool) -> None:
+    def __init__(self, model: ArmModel, delta: Array, period: float) -> None:
         # Pinocchio is loaded by those who simulate only.
         from ident_service.model.pinocchio_models import ForwardDynamics
 
-        self._plant = ForwardDynamics(model.chain, model.layout, delta)
+        self._arm = ForwardDynamics(model.chain, model.layout, delta)
         self._period = period
-        joints = [model.config.joints.get(name) for name in model.chain.names]
-        gains = [(joint.kp, joint.kd) for joint in joints if joint and joint.kp and joint.kd]
-        prior = control_model(model).prior
-        self._known = commanded and prior is not None and len(gains) == model.chain.joints
-        if self._known and prior is not None:
-            self._controller = ForwardDynamics(model.chain, model.layout, prior)
-            self._kp, self._kd = np.array(gains, dtype=float).T
-            self._cutoff = np.asarray(model.config.control.velocity_cutoff, dtype=float)
-            # Without the limits of a joint nothing is guessed of its friction, and nothing is added for it.
-            limits = _limits(model)
-            self._friction = np.zeros_like if limits is None else friction_feedforward(model, limits).torque
-        else:
-            self._controller = self._plant
-            self._kp = np.full(model.chain.joints, _STIFFNESS**2)
-            self._kd = np.full(model.chain.joints, 2.0 * _STIFFNESS)
-            self._friction = self._plant.friction
 
     def follow(self, reference: Array) -> Array:
         """Return the positions that the arm takes, shape (samples, joints), following `reference` of the same shape."""
         velocity = np.gradient(reference, self._period, axis=0)
         acceleration = np.gradient(velocity, self._period, axis=0)
-        wanted = np.stack([reference, velocity, acceleration], axis=1)
-        steps = max(1, int(np.ceil(self._period * float(self._kd.max()) / _LARGEST_STEP)))
+        desired = np.stack([reference, velocity, acceleration], axis=1)
+        kp, kd = _STIFFNESS**2, 2.0 * _STIFFNESS
+        steps = max(1, int(np.ceil(self._period * kd / _LARGEST_STEP)))
         h = self._period / steps
-        gain = 1.0 - np.exp(-2.0 * np.pi * self._cutoff * h) if self._known else 1.0
         q, v = reference[0].copy(), velocity[0].copy()
-        rate = v
         result = np.empty_like(reference)
         result[0] = q
         for sample in range(1, len(reference)):
-            before, after = wanted[sample - 1], wanted[sample]
+            before, after = desired[sample - 1], desired[sample]
             for step in range(steps):
                 now = before if step == 0 else before + (step / steps) * (after - before)
-                alpha = now[2] + self._kd * (now[1] - rate) + self._kp * (now[0] - q)
-                torque = self._controller.torque(q, rate, alpha) + self._friction(now[1])
-                next_v = self._plant.next_velocity(q, v, torque, h)
-                change = 0.5 * h * (v + next_v)
-                q, v = q + change, next_v
-                # Eq. 76 sees velocity as encoder differences through a low-pass; the other loop sees it as it is.
-                rate = rate + gain * (change / h - rate) if self._known else v
+                alpha = now[2] + kd * (now[1] - v) + kp * (now[0] - q)
+                torque = self._arm.torque(q, v, alpha) + self._arm.friction(now[1])
+                next_v = self._arm.next_velocity(q, v, torque, h)
+                q, v = q + 0.5 * h * (v + next_v), next_v
             if not bool(np.abs(v).max() < _RUNAWAY):
                 raise ModelError(f"the simulated loop is unstable after {sample * self._period:.3g} s")
             result[sample] = q
         return result
-
-
-def _limits(model: ArmModel) -> MotionLimits | None:
-    """Return the limits and gains of an arm that can be moved, None for one that is only identified."""
-    try:
-        return motion_limits(model.config)
-    except MotionRefused:
-        return None

@@ -331,13 +331,11 @@ class Averaged:
         motion: one period.
         periods: how many were averaged.
         torque_noise: standard deviation of one torque sample between periods [N m or N], shape (joints,).
-        position_noise: likewise of the position [rad or m], shape (joints,).
     """
 
     motion: Motion
     periods: int
     torque_noise: Array
-    position_noise: Array
 
 
 def averaged(
@@ -399,7 +397,7 @@ def averaged(
             "trim approach and return with recording.trim, or correct identification.period",
         )
     motion = _motion(mean_q, mean_tau, recording.torque_held, options, step, coupling)
-    return Averaged(motion, total, spread_tau, spread_q)
+    return Averaged(motion, total, spread_tau)
 
 
 def _motion(

@@ -30,7 +30,7 @@ from ident_service.model.chain import Array
 _REACHED = 0.05  # share of a limit that may be unused where it counts as reached; proofs shrink motions a little
 _NO_FORCE = -1e6  # a multiplier so low that a limit has no effect, however far it is exceeded
 _WORTH_TELLING = 0.03  # least lambda to report; below, twice the limit gains 2 %
-_MOST_TOLD = 6
+_MOST_LISTED = 6
 _MOST = 50.0  # of lambda: slopes of a motion that teaches next to nothing know no bounds
 _MUCH = 1.5  # times: from here on a factor says more than a percentage
 _HALVINGS = 5  # of the way to gains that would do, where those are not stable
@@ -128,7 +128,7 @@ def active_limit_lines(
     """
     names, lines = task.model.chain.names, []
     left = dict(gains or {})
-    for one in found[:_MOST_TOLD]:
+    for one in found[:_MOST_LISTED]:
         if one.exponent < _WORTH_TELLING:
             break
         gain = f"would give about {gain_words(task.criterion, 2.0**one.exponent)}"

@@ -183,9 +183,10 @@ def remarks_on_angles(base: BaseParameters) -> tuple[str, ...]:
         return ()
     named = ", ".join(base.names[base.base[place]] for place in faint[:5])
     return (
-        f"{len(faint)} of {base.size} base parameters ({named}{', ...' if len(faint) > 5 else ''}) can hardly be told"
-        f" from the others (by {base.independence[faint].max():.1g} of their effect): angles of the mechanism are"
-        " probably rounded, as 1.5708 for pi/2; set kinematics.snap: true for a URDF, or write more digits",
+        f"{len(faint)} of {base.size} base parameters ({named}{', ...' if len(faint) > 5 else ''}) can hardly be"
+        f" separated from the others (by {base.independence[faint].max():.1g} of their effect): angles of the"
+        " mechanism are probably rounded, as 1.5708 for pi/2; set kinematics.snap: true for a URDF, or"
+        " write more digits",
     )
 
 

@@ -161,12 +161,12 @@ def require_urdf(file: TextFile) -> None:
     parser.EndElementHandler = reader.end
     parser.Parse(file.text.encode("utf-8", "surrogatepass"), True)
     if mistakes := sorted(reader.finish()):
-        told = "; ".join(f"{file.name}:{line}: {words}" for line, words in mistakes[:_MOST_TOLD])
-        more = len(mistakes) - _MOST_TOLD
-        raise ModelError(told + (f"; and {more} more" if more > 0 else ""))
+        listed = "; ".join(f"{file.name}:{line}: {words}" for line, words in mistakes[:_MOST_LISTED])
+        more = len(mistakes) - _MOST_LISTED
+        raise ModelError(listed + (f"; and {more} more" if more > 0 else ""))
 
 
-_MOST_TOLD: Final = 5
+_MOST_LISTED: Final = 5
 _MOVES: Final = {"revolute": "limit", "prismatic": "limit", "continuous": "", "fixed": "", "floating": "", "planar": ""}
 _NUMBER: Final = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 # What the parser asks of each element of a joint: numbers that must be there, those that may be, and vectors of three.
@@ -184,7 +184,7 @@ _UNITS: Final = {
     "velocity": "rad/s (m/s of a slide)",
     **dict.fromkeys(("lower", "upper"), "rad (m of a slide)"),
 }
-_LONGEST_TOLD: Final = 40  # characters of a name or value
+_LONGEST_SHOWN: Final = 40  # characters of a name or value
 
 
 class _Urdf:
@@ -212,7 +212,7 @@ class _Urdf:
             self._named("joint", attributes, line, self._joints)
             self._joint, self._at, self._type = {"name": attributes.get("name", "")}, line, attributes.get("type", "")
             if self._type not in _MOVES:
-                said = self._type[:_LONGEST_TOLD]
+                said = self._type[:_LONGEST_SHOWN]
                 self._mistakes.append((line, f"{self._where()}: type {said!r} is none of {', '.join(_MOVES)}"))
         elif self._open[:-1] == ["robot", "joint"]:
             self._of_a_joint(tag, attributes, line)
@@ -226,13 +226,13 @@ class _Urdf:
         """Return line and words of each mistake."""
         for line, where, role, link in self._ends:
             if link not in self._links:
-                named = link[:_LONGEST_TOLD]
+                named = link[:_LONGEST_SHOWN]
                 self._mistakes.append(
                     (line, f'{where}: its {role} link {named!r} is declared nowhere; add <link name="{named}"/>')
                 )
         roots = [name for name in self._links if name not in self._children]
         if len(roots) > 1 and not self._mistakes:
-            named = ", ".join(f"{name[:_LONGEST_TOLD]!r} (line {self._links[name]})" for name in roots[:_MOST_TOLD])
+            named = ", ".join(f"{name[:_LONGEST_SHOWN]!r} (line {self._links[name]})" for name in roots[:_MOST_LISTED])
             self._mistakes.append(
                 (
                     self._links[roots[1]],
@@ -248,7 +248,7 @@ class _Urdf:
             self._mistakes.append((line, f"a {kind} without a name; give <{kind} name=...>"))
         elif name in known:
             self._mistakes.append(
-                (line, f"{kind} {name[:_LONGEST_TOLD]!r} is there already, in line {known[name]}; rename one of them")
+                (line, f"{kind} {name[:_LONGEST_SHOWN]!r} is there already, in line {known[name]}; rename one of them")
             )
         else:
             known[name] = line
@@ -278,11 +278,11 @@ class _Urdf:
             numbers = [word for word in words if _NUMBER.fullmatch(word) and math.isfinite(float(word))]
             if len(words) != count or len(numbers) != count:
                 should = "three numbers" if count > 1 else f"a number{f' of {_UNITS[key]}' if key in _UNITS else ''}"
-                said = attributes[key][:_LONGEST_TOLD]
+                said = attributes[key][:_LONGEST_SHOWN]
                 self._mistakes.append((line, f"{where}: {tag} {key} is {said!r}; give {should}"))
 
     def _where(self) -> str:
-        return f"joint {self._joint['name'][:_LONGEST_TOLD]!r}"
+        return f"joint {self._joint['name'][:_LONGEST_SHOWN]!r}"
 
     def _joint_ends(self) -> None:
         where = self._where()

@@ -67,17 +67,12 @@ def ticket_document(ticket: Ticket) -> dict[str, Any]:
     return ticket_values(ticket)
 
 
-def ticket_text(ticket: Ticket, *, every_measure: bool = False) -> str:
-    """Format the ticket as text.
-
-    Args:
-        ticket: to be shown.
-        every_measure: every number of every check, and not only the one nearest to its limit.
-    """
+def ticket_text(ticket: Ticket) -> str:
+    """Format the ticket as text: of each check the measure that is nearest to its limit."""
     motion = ticket.subject.excitation
     lines = [f"preflight of {ticket.subject.arm} for {f'the {motion} motion' if motion else 'the path home'}", ""]
     for check in ticket.checks:
-        lines += _check_lines(check, every_measure)
+        lines += _check_lines(check)
     lines.append("")
     until = ticket.expires.isoformat(sep=" ", timespec="seconds").removesuffix("+00:00")
     if ticket.verdict is Verdict.PASSED:
@@ -89,11 +84,11 @@ def ticket_text(ticket: Ticket, *, every_measure: bool = False) -> str:
     return "\n".join([*lines, ""])
 
 
-def _check_lines(check: Check, every_measure: bool) -> list[str]:
+def _check_lines(check: Check) -> list[str]:
     lines = [f"  {_WORDS[check.verdict]:<10} {TITLES[check.code]}"]
-    shown = list(check.measures) if every_measure else [one for one in [nearest_measure(check)] if one is not None]
-    if check.verdict is Verdict.PASSED or every_measure:
-        lines += [f"{'':13}{one}" for one in shown]
+    nearest = nearest_measure(check)
+    if check.verdict is Verdict.PASSED and nearest is not None:
+        lines.append(f"{'':13}{nearest}")
     if check.reason:
         lines.append(f"{'':13}{check.reason}")
     if check.remedy and check.verdict is not Verdict.PASSED:
@@ -200,8 +195,8 @@ class ScaleCheck:
 
     Attributes:
         joint: its name.
-        typed: by how much, as a person says [rad or m].
-        measured: by how much, as the drives say, likewise.
+        typed: turn that a person typed [rad or m].
+        measured: turn that the drives measured, likewise.
         good: whether they agree.
         words: about it, for people.
     """

@@ -47,7 +47,7 @@ class Recovery:
     Attributes:
         arm: name.
         faults: that nobody has acknowledged, the earliest first.
-        mover: process that moves the arm, or None.
+        controlling_pid: process that moves the arm, or None.
         seen: at the arm, after a reset if there was one; None where it could not be looked at.
         unreachable: why not, or empty.
         zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
@@ -60,7 +60,7 @@ class Recovery:
 
     arm: str
     faults: tuple[StoredFault, ...]
-    mover: int | None
+    controlling_pid: int | None
     seen: Watched | None
     unreachable: str
     zero_lost: str
@@ -306,6 +306,6 @@ def set_home(config: ArmConfig, state: Path, confirm: Callable[[str], str], arm:
         # Removed before zeroing: a ticket that outlived it would be for another zero.
         existed = ticket.exists()
         ticket.unlink(missing_ok=True)
-        PositionFile(ticket.parent, config).forget()  # what drives tell is about another zero from now on
+        PositionFile(ticket.parent, config).forget()  # of the zero that is about to be replaced
         drives = (make_arm(config) if arm is None else arm).zero()
     return ZeroingResult(config.name, posture, drives, fault_file(state, config.name).remembered(), existed)

@@ -94,7 +94,7 @@ class PrunableRecording:
     bytes: int
 
 
-def expendable(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
+def prunable_recordings(db: Database, state: Path, newest: int) -> list[PrunableRecording]:
     """Return the recordings that `prune` would delete.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
@@ -137,8 +137,8 @@ def _busy(db: Database) -> set[str]:
 
 
 def prune(db: Database, state: Path, newest: int, who: str) -> list[PrunableRecording]:
-    """Delete the recordings that `expendable` returns; each row is marked first, so that a kill does no damage."""
-    gone = expendable(db, state, newest)
+    """Delete the recordings that `prunable_recordings` returns; rows are marked first: a kill does no damage."""
+    gone = prunable_recordings(db, state, newest)
     for one in gone:
         with db.transaction():
             db.write("UPDATE recordings SET deleted = ? WHERE run = ? AND name = ?", time.time(), one.run, one.name)

@@ -142,16 +142,13 @@ class Quality:
         return tuple(found)
 
 
-def quality(
-    recording: Recording, fmt: RecordingFormat, torque_limit: Array | None = None, known: Grid | None = None
-) -> Quality:
+def quality(recording: Recording, fmt: RecordingFormat, torque_limit: Array | None = None) -> Quality:
     """Assess a recording, in constant memory.
 
     Args:
         recording: read once more after `grid`.
         fmt: seconds to trim, and length of a gap.
         torque_limit: of each joint [N m or N], shape (joints,), NaN where it is not known.
-        known: `grid(recording, fmt)`, where that has been found already.
 
     Raises:
         UsageError: not one limit a joint.
@@ -159,7 +156,7 @@ def quality(
     """
     if torque_limit is not None and torque_limit.shape != (recording.joints,):
         raise UsageError(f"{torque_limit.shape=} but the recording has {recording.joints} joints")
-    stamps = known or grid(recording, fmt)
+    stamps = grid(recording, fmt)
     limit = np.full(recording.joints, np.nan) if torque_limit is None else torque_limit
     names = recording.joint_names or [str(joint + 1) for joint in range(recording.joints)]
     joints = _Joints(names, limit, stamps)

@@ -168,15 +168,15 @@ class TorqueLoop:
         number = self._objects.number
         values = self._objects.values
         cyclic = number(0x6061) in self._personality.modes
-        asked = self._personality.asked(self._objects) + number(0x60B2) if cyclic else 0
+        target = self._personality.target_torque(self._objects) + number(0x60B2) if cyclic else 0
         if follows := number(0x6061) == _CSP and 0x607A00 in self._objects.entries:
             count = self._personality.torque(1.0, self._objects)
             most, self._motor.holds = self._personality.reach(self._objects) * count, True
-            asked = round(self._position.torque(now_ns, most) / count) if count else 0
+            target = round(self._position.torque(now_ns, most) / count) if count else 0
         reach = int(self._personality.reach(self._objects) * self._motor.defects.torque_share)
-        demand = min(max(asked, -reach), reach)
+        demand = min(max(target, -reach), reach)
         self.follows = cyclic or follows
-        self.limited = demand != asked
+        self.limited = demand != target
         if demand and self._exceeds_max_speed(demand, now_ns):
             demand, self.limited, self.follows = 0, True, False
         values[0x607400] = demand
@@ -522,7 +522,7 @@ class CanopenDrive:
         self._node.now_ns = now_ns
         if frame.remote:
             if frame.identifier == 0x700 + self._node.number and self.nmt.state is not State.INITIALISING:
-                self.nmt.asked()
+                self.nmt.answer_guarding()
             return self._finish()
         identifier, state = frame.identifier, self.nmt.state
         if identifier == 0:

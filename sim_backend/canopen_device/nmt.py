@@ -130,7 +130,7 @@ class Nmt:
         """Apply a change of object 100Ch or 100Dh; guarding begins with the next request (CiA 301, 7.2.8.2.2.1)."""
         self._node.stop(_LIFE)
 
-    def asked(self) -> None:
+    def answer_guarding(self) -> None:
         """Answer a remote frame that asks for the state, and await the next one where life is guarded."""
         objects = self._node.objects
         if objects.number(0x1017):

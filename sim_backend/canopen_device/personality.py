@@ -77,8 +77,8 @@ class DriveProperties:
                 found.append(1000 * value // whole if whole else 0)
         return min(found)
 
-    def asked(self, objects: Objects) -> int:
-        """Return the torque that the target asks for [counts]; none while the drive does not follow it."""
+    def target_torque(self, objects: Objects) -> int:
+        """Return the target torque [counts]; none while the drive does not follow it."""
         follows = objects.number(0x6040) & self.enabling == self.enabling
         if not follows or any(objects.number(key >> 8, key & 0xFF) != value for key, value in self.needs):
             return 0

@@ -176,7 +176,7 @@ def test_waiting_for_a_person_ends_when_nobody_wants_the_arm_any_more() -> None:
             arm.enable()
 
 
-def test_an_arm_that_somebody_activates_unasked_is_lowered(bench: Bench) -> None:
+def test_an_arm_that_somebody_else_activates_is_lowered(bench: Bench) -> None:
     with bench.arm:
         bench.press("activate")
         assert bench.safety.mode is SafetyMode.ACTIVE
@@ -415,7 +415,7 @@ def test_a_puck_that_does_not_answer_or_is_none_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_after_an_emergency_stop_each_thing_to_do_is_said_once(tmp_path: Path) -> None:
+def test_after_an_emergency_stop_each_thing_to_do_is_shown_once(tmp_path: Path) -> None:
     bench = Bench(wam())
     bench.behind.inject(DriveFault("emergency_stop"))
     bench.behind.settle(bench.behind.clock.now_ns() + 100_000_000)

@@ -56,7 +56,7 @@ def test_positions_are_packed_as_the_vectors_say(counts: int, data: str) -> None
     assert decoded(Frame(0x4A3, raised)) == Position(5, counts)
 
 
-def test_positions_are_asked_for_by_one_frame_and_answered_by_every_puck() -> None:
+def test_positions_are_requested_by_one_frame_and_answered_by_every_puck() -> None:
     assert get(Group.ARM, Properties(200, Role.MOTOR).number("P"), group=True) == Frame(0x404, b"\x30")
     answered = [position_frame(node, 0).identifier for node in range(1, 8)]
     assert answered == [0x423, 0x443, 0x463, 0x483, 0x4A3, 0x4C3, 0x4E3]

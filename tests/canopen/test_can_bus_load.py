@@ -78,7 +78,7 @@ def test_over_budget_is_a_verdict_with_remedies(arms: Path, capsys: pytest.Captu
     assert answered(capsys, "bus", "load", path, "--rate", "500")["exit_code"] == DONE
 
 
-def test_another_rate_can_be_asked_for(arms: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_rate_can_be_requested(arms: Path, capsys: pytest.CaptureFixture[str]) -> None:
     document = answered(capsys, "bus", "load", arms / "wam7_canopen_500hz.yaml", "--rate", "1100")
     assert (document["exit_code"], document["rate"], document["highest_rate"]) == (VERDICT_NO, 1100.0, 1010)
 

@@ -254,7 +254,7 @@ def test_a_drive_that_stops_following_its_torque_is_reported() -> None:
     assert codes.count(EventCode.DEAF) == 1  # neither before it followed nor when it was switched off
 
 
-def test_what_a_drive_said_before_it_booted_is_no_longer_true() -> None:
+def test_what_a_drive_reported_before_it_booted_is_no_longer_true() -> None:
     bus = codec()
     bus.receive(Frame(0x281, struct.pack("<Hh", 0x1227, 0)))
     assert bus.drives[0].state is DriveState.OPERATION_ENABLED
@@ -358,7 +358,7 @@ def change_nothing(frames: list[Frame]) -> None:
     assert all(isinstance(event, Event) and event.words for event in bus.take_events())
 
 
-def test_uploads_are_kept_of_what_was_asked_for_alone() -> None:
+def test_only_requested_uploads_are_kept() -> None:
     """Another tool's conversation with a drive is not ours; a flood of it must not be kept."""
     bus = codec()
     drive = bus.drives[0]

@@ -53,7 +53,7 @@ def position(node: int, value: int) -> Frame:
     return Frame(0x580 + node, struct.pack("<BHBi", 0x43, 0x6064, 0, value))
 
 
-def test_many_nodes_are_asked_in_bursts_on_both_buses() -> None:
+def test_many_nodes_are_queried_in_bursts_on_both_buses() -> None:
     clock = VirtualClock()
     links = [Nodes(clock, lambda n: position(n, 10 * n)), Nodes(clock, lambda n: position(n, -n) if n % 5 else None)]
     places = [(bus, node) for bus in (0, 1) for node in range(1, 21)]

@@ -97,7 +97,7 @@ def test_without_measurement_nothing_is_reported() -> None:
         assert {(s.measured_torque, s.torque_difference) for s in samples} == {(None, None)}
 
 
-def test_drives_that_do_not_have_it_are_not_asked_for_it() -> None:
+def test_drives_without_the_entry_are_reported() -> None:
     found = config("cyclic", eds={"name": "bare.eds", "text": EDS.replace("[6077]", "[5F77]")})
     assert isinstance(found.driver, CanopenDriver)
     (((where, what),)) = list(disagreements(found.driver, found.transmission, JOINTS, 500.0))

@@ -96,7 +96,7 @@ def test_positions_are_tracked_until_the_drives_are_enabled_and_held_from_then_o
         np.testing.assert_allclose(sample.position, before, atol=1e-4)
 
 
-def test_the_drive_alone_can_keep_the_joints_torque_limits_so_it_is_told_them() -> None:
+def test_the_drive_alone_can_keep_the_joints_torque_limits_so_they_are_written_to_it() -> None:
     config = positions_config()
     joints = {name: joint.model_copy(update={"torque": 2.0}) for name, joint in config.joints.items()}
     bench = Bench(config.model_copy(update={"joints": joints}), config)

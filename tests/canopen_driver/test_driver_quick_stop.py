@@ -43,7 +43,7 @@ def test_a_quick_stop_is_not_cut_short_by_closing() -> None:
     assert (np.abs(after) < 0.7 * np.abs(moving)).all()
 
 
-def test_a_quick_stop_that_was_lost_is_told_again() -> None:
+def test_a_quick_stop_that_was_lost_is_sent_again() -> None:
     config = weightless_config()
     behind = LockStepArm(config)
     truths: list[Truth] = []

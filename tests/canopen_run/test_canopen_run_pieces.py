@@ -35,13 +35,13 @@ def behind(folder: Path, *, brakes: bool = True) -> tuple[LockStepArm, CanopenAr
     return drives, CanopenArm(config, lambda _: [drives.link(0)])
 
 
-def test_what_was_asked_of_the_kernel_is_given_back() -> None:
+def test_privileges_of_the_kernel_are_given_back() -> None:
     code = """
 import gc, os
 from ident_service.motion.realtime import temporary_privileges
 def state(): return os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled(), gc.get_freeze_count()
 before = state()
-with asked(1) as granted:
+with temporary_privileges(1) as granted:
     assert not gc.isenabled()
     assert granted.core is None or os.sched_getaffinity(0) == {granted.core}
 assert state() == before, (before, state())

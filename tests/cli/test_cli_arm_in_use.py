@@ -75,7 +75,7 @@ def test_that_an_arm_is_supported_takes_its_typed_name(ident: Ident, state: Path
         assert holder.supported
 
 
-def test_drives_that_hold_an_arm_are_not_told_to_let_go_without_its_name(
+def test_drives_that_hold_an_arm_are_not_released_without_its_name(
     ident: Ident, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     let_go: list[str] = []

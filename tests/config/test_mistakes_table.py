@@ -281,7 +281,7 @@ def test_a_mesh_that_no_clearance_can_be_computed_from_is_reported_before_prefli
     assert "give capsules for 'base' under geometry" in told[1]
 
 
-def test_an_arm_without_a_driver_is_told_what_a_motion_would_need(
+def test_an_arm_without_a_driver_is_refused_with_what_a_motion_needs(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = GOOD.replace(ELBOW, "elbow: {position: [-2, 2]}").partition("driver:")[0]

@@ -13,7 +13,7 @@ from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import accepted_description
 from ident_service.errors import ParameterError, UnknownId, UsageError
 from ident_service.operations.acceptance import accept, acceptances, rollback, synchronise
-from ident_service.operations.run_archive import expendable, import_run, prune
+from ident_service.operations.run_archive import import_run, prunable_recordings, prune
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import Database
 from ident_service.registry.runs import (
@@ -187,13 +187,13 @@ def test_only_recordings_that_nobody_accepted_are_let_go(db: Database, state: Pa
     shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("*.mcap"))
     write_manifest(bare)
     import_run(db, state, bare, "me")
-    gone = expendable(db, state, 2)
+    gone = prunable_recordings(db, state, 2)
     assert {one.run[:8] for one in gone} == {"20260102", "20260103"}
     assert {one.name for one in gone} == {"identification.mcap", "validation.mcap"}
     assert all((state / "runs" / one.run / one.name).is_file() for one in gone)  # a dry run
     assert prune(db, state, 2, "me") == gone
     assert not any((state / "runs" / one.run / one.name).exists() for one in gone)
-    assert expendable(db, state, 2) == []
+    assert prunable_recordings(db, state, 2) == []
     # What stays is still what the manifest names, and the row keeps the hash of what went.
     row = index_run(db, state, gone[0].run)
     assert row["ending"] == "done"
@@ -224,7 +224,7 @@ def test_recordings_behind_an_accepted_set_of_another_run_stay(db: Database, sta
         (identified / name).unlink()
     write_manifest(identified)
     import_run(db, state, identified, "me")
-    assert {one.run[:8] for one in expendable(db, state, 0)} == {"20250101", "20250102", "20250103"}
+    assert {one.run[:8] for one in prunable_recordings(db, state, 0)} == {"20250101", "20250102", "20250103"}
     accept(db, state, state / "runs" / identified.name, "kept for ever", "me")
     assert [one.run[:8] for one in prune(db, state, 0, "me")] == ["20250103"]
     # An earlier set stays one that can be rolled back to.
@@ -233,7 +233,7 @@ def test_recordings_behind_an_accepted_set_of_another_run_stay(db: Database, sta
     (identified / "parameters.json").write_text(json.dumps(document))
     write_manifest(identified)
     accept(db, state, identified, "from elsewhere", "me")
-    assert expendable(db, state, 0) == []
+    assert prunable_recordings(db, state, 0) == []
     gone = "20250103T000000Z-quick"
     with pytest.raises(UnknownId, match=r"was deleted on \d{4}-\d\d-\d\d to make room \(`ident prune`\)"):
         run_file(db, state, gone, "other.mcap")
@@ -245,6 +245,6 @@ def test_recordings_that_a_job_reads_stay(db: Database, state: Path, folder: Pat
     import_run(db, state, folder, "me")
     asked = {"kind": "identify", "recordings": [{"run": folder.name}]}
     job = rows.add_job(db, "identify-1", "identify", "quick", asked, [], "me", motion=False, run="another")
-    assert expendable(db, state, 0) == []
+    assert prunable_recordings(db, state, 0) == []
     rows.ended(db, job["id"], "done", "", 0)
-    assert {one.run for one in expendable(db, state, 0)} == {folder.name}
+    assert {one.run for one in prunable_recordings(db, state, 0)} == {folder.name}

@@ -402,7 +402,7 @@ def test_stop_needs_no_token_here_and_any_token_from_elsewhere(daemon: Asked, vi
 
 
 @pytest.mark.slow
-def test_only_whoever_asked_renews_a_lease(daemon: Asked) -> None:
+def test_only_the_holder_renews_a_lease(daemon: Asked) -> None:
     job = daemon.begin(MOTION, confirmed=True)
     daemon.as_token(add_token(daemon.service.db, "other", "operator", "test"))
     refusal(daemon.post(f"/api/v1/jobs/{job['id']}/lease"), 403, "only the requester")

@@ -246,7 +246,7 @@ def test_a_log_that_nobody_reads_keeps_nobody() -> None:
     assert len(numbers) < 5000
 
 
-def test_what_is_said_again_and_again_is_left_out_and_counted() -> None:
+def test_repeated_log_messages_are_left_out_and_counted() -> None:
     now, kept = [0.0], list[logging.LogRecord]()
     log = logging.Logger("test")
     handler = logging.Handler()

@@ -202,7 +202,7 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_daemon_that_is_asked_to_end_stops_its_arm_first(state: Path) -> None:
+def test_a_terminated_daemon_stops_its_arm_first(state: Path) -> None:
     checked_before(state, patient_text(ARM))
     with daemon_process(state) as (process, client):
         client.post("/api/v1/arms", {"description": patient_text(ARM)})

@@ -76,7 +76,7 @@ def test_who_is_far_behind_reads_the_registry(
 
 
 @pytest.mark.slow
-def test_how_arms_and_jobs_stand_is_told_to_whoever_comes(daemon: Asked, watch: EventPoller) -> None:
+def test_a_new_listener_gets_the_state_of_arms_and_jobs(daemon: Asked, watch: EventPoller) -> None:
     state = daemon.service.state
     fault_file(state, "planar2").latch("overspeed", "too fast")
     with ControlFile.take(control_path(state, "wam7_sim"), None):

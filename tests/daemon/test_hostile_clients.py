@@ -279,7 +279,7 @@ def test_every_stream_ends_with_its_token() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_revoked_token_is_told_nothing_more(state: Path) -> None:
+def test_a_revoked_token_gets_nothing_more(state: Path) -> None:
     with daemon_process(state) as (_, client), Database(state) as db:
         told, ended = list[str](), threading.Event()
         secret = add_token(db, "ann", "viewer", "test")

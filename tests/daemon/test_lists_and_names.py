@@ -97,7 +97,7 @@ def test_a_page_after_what_is_not_there_is_refused(daemon: Asked) -> None:
         refusal(daemon.get(f"/api/v1/{path}?before=../x"), 422)
 
 
-def test_a_computation_that_is_asked_for_twice_is_one_job(daemon: Asked, viewer: str) -> None:
+def test_a_computation_that_is_requested_twice_is_one_job(daemon: Asked, viewer: str) -> None:
     base: dict[str, object] = {"job": {"kind": "base", "arm": "planar2"}}
 
     def post(key: str, body: dict[str, object] = base) -> Any:
@@ -124,7 +124,7 @@ def test_a_computation_that_is_asked_for_twice_is_one_job(daemon: Asked, viewer:
 
 
 @pytest.mark.slow
-def test_a_name_that_is_taken_is_replaced_where_that_is_asked_for(daemon: Asked) -> None:
+def test_a_name_that_is_taken_is_replaced_where_that_is_requested(daemon: Asked) -> None:
     def post(text: str, **more: object) -> Any:
         return daemon.post("/api/v1/arms", {"description": text, **more})
 

@@ -78,7 +78,7 @@ def test_every_figure_and_label_is_there(figures: dict[str, set[str]]) -> None:
             assert {label.strip() for label in by.split(",")} <= known | _OF_PROMETHEUS, expression
 
 
-def test_rules_say_who_is_told_and_what_to_do() -> None:
+def test_rules_name_the_recipient_and_the_action() -> None:
     names = [rule["alert"] for rule in rules()]
     assert len(set(names)) == len(names) >= 8
     for rule in rules():

@@ -73,7 +73,7 @@ def manager(tmp_path: Path) -> Iterator[Manager]:
     found.close()
 
 
-def test_who_is_told_that_it_is_ready_has_the_first_page_at_once(state: Path, tmp_path: Path, manager: Manager) -> None:
+def test_the_ready_notice_comes_once_the_first_page_is_served(state: Path, tmp_path: Path, manager: Manager) -> None:
     process = started(state, NOTIFY_SOCKET=str(tmp_path / "notify"))
     try:
         assert manager.hear() == ("READY=1", process.pid)

@@ -177,7 +177,7 @@ def test_strange_text_is_refused_in_words(daemon: Asked, text: str) -> None:
     assert answer.status_code in (400, 422), answer.text
 
 
-def test_an_upload_is_told_every_mistake_with_its_place(daemon: Asked, tmp_path: Path) -> None:
+def test_an_upload_is_answered_with_every_mistake_and_its_place(daemon: Asked, tmp_path: Path) -> None:
     text = quick_text().replace("velocity: 2,", "velocity: -2,").replace("terms:", "termz:")
     answer = daemon.post("/api/v1/arms", {"description": text})
     assert answer.status_code == 422

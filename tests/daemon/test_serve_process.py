@@ -203,7 +203,7 @@ def test_a_token_is_sent_nowhere_in_the_clear(url: str) -> None:
         IdentClient(url, "ident_secret")
 
 
-def door(folder: Path, request: dict[str, Any], more: bytes = b"") -> tuple[int, str]:
+def motion_unit(folder: Path, request: dict[str, Any], more: bytes = b"") -> tuple[int, str]:
     """What a motion's own unit makes of a request: its exit code and what the journal hears."""
     ours, theirs = socket.socketpair()
     with ours, theirs:
@@ -236,11 +236,11 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     forbidden += [["recover", "planar2", option, "--json"] for option in ("--leave-limit", "--leave", "--l", "--out=x")]
     assert not any(map(taken, forbidden))
     for words in forbidden:
-        code, said = door(folder, {"folder": str(folder), "words": words})
+        code, said = motion_unit(folder, {"folder": str(folder), "words": words})
         assert (code, "only motions" in said) == (2, True), words
     assert list(folder.iterdir()) == []
     words = ["home", "planar2", "--lease-from-stdin", "--json", "--state", str(state)]
-    code, _ = door(folder, {"folder": str(folder), "words": words})
+    code, _ = motion_unit(folder, {"folder": str(folder), "words": words})
     assert code == 3  # it was not checked, in the words of the command
     assert json.loads((folder / ANSWER).read_text())["error"]["kind"] == "MotionRefused"
     assert "no preflight ticket" in (folder / LOG).read_text()
@@ -249,10 +249,10 @@ def test_a_unit_of_its_own_does_motions_under_a_lease_and_nothing_else(state: Pa
     looks = folder / "looks"
     looks.mkdir()
     seen = ["watch", "planar2", "--seconds=0.1", "--json", "--state", str(state)]
-    assert door(looks, {"folder": str(looks), "words": seen})[0] == 0
+    assert motion_unit(looks, {"folder": str(looks), "words": seen})[0] == 0
     assert json.loads((looks / ANSWER).read_text())["exit_code"] == 0
     # Files that are there already are nobody's to overwrite.
-    assert door(folder, {"folder": str(folder), "words": words})[0] == 2
+    assert motion_unit(folder, {"folder": str(folder), "words": words})[0] == 2
 
 
 def test_a_child_behind_a_socket_is_commanded_and_read(tmp_path: Path) -> None:

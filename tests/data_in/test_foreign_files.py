@@ -72,7 +72,7 @@ def test_a_bag_with_other_names_and_order(tmp_path: Path, samples: Block, joints
     assert np.array_equal(whole(recording).torque, samples.torque[:, order])
 
 
-def test_a_bag_names_the_arm_s_joints_when_none_are_asked_for(tmp_path: Path, samples: Block) -> None:
+def test_a_bag_names_the_arm_s_joints_when_none_are_requested(tmp_path: Path, samples: Block) -> None:
     path = write_bag(tmp_path / "bag.mcap", "/joint_states", ["two", "axis_1"], samples)
     recording = open_recording(path, fmt=RecordingFormat(joint_names={"one": "axis_1"}))
     assert recording.joint_names == ("two", "one")

@@ -227,7 +227,7 @@ def remote_recording(path: Path) -> dict[str, object]:
     return recording(client, argparse.Namespace(json=True), "planar2", path)
 
 
-def test_a_daemon_is_asked_for_the_same_range() -> None:
+def test_a_daemon_is_sent_the_same_range() -> None:
     assert remote_recording(Path("run-1/other.mcap@2.5:")) == {"run": "run-1", "name": "other.mcap", "start": 2.5}
     asked = RecordingReference.model_validate(remote_recording(Path("run-1@1:40")))
     assert (asked.run, asked.name, asked.start, asked.end) == ("run-1", None, 1.0, 40.0)

@@ -139,7 +139,7 @@ def test_every_fault_has_an_entry_with_three_checks() -> None:
         ("commissioning.md", "## What a person must do at each end of a motion"),
     ],
 )
-def test_what_a_person_must_do_at_each_end_is_said_of_what_the_code_does(page: str, heading: str) -> None:
+def test_what_a_person_must_do_at_each_end_describes_what_the_code_does(page: str, heading: str) -> None:
     told = text(page).partition(heading)[2].partition("\n## ")[0]
     rows = re.findall(r"(?m)^\| (.*) \|$", told)
     named = {code: row for row in rows for code in re.findall(r"`(\w+)`", row.split("|")[0]) if code in FAULTS}

@@ -248,7 +248,7 @@ def test_two_buses_are_looked_at_together() -> None:
 
 
 @pytest.mark.parametrize(("bitrate", "rate"), [(1_000_000, RATE), (125_000, SHARE * 125_000 / (8 * 7 * 135))])
-def test_a_slow_bus_is_asked_more_seldom(bitrate: int, rate: float) -> None:
+def test_a_slow_bus_is_queried_more_seldom(bitrate: int, rate: float) -> None:
     drive = {"rated_torque": 1.0, "max_torque": 1.0, "max_speed": 100.0}
     driver = CanopenDriver.model_validate(
         {

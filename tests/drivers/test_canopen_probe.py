@@ -102,7 +102,7 @@ def test_drives_without_one_are_refused_in_one_sentence(name: str) -> None:
 
 
 @needs_sheets
-def test_a_drive_without_torques_that_takes_positions_is_told_how() -> None:
+def test_a_drive_without_torques_that_takes_positions_is_named_with_the_remedy() -> None:
     text = EDS
     for index in ("6071", "6087"):
         text = text.replace(f"[{index}]", f"[{int(index, 16) - 0x1000:04X}]")
@@ -124,7 +124,7 @@ def test_a_more_trusted_watchdog_and_further_axes_are_reported() -> None:
     assert "6841h" not in plain
 
 
-def test_a_drive_that_is_silent_is_foretold() -> None:
+def test_capabilities_of_a_silent_drive_are_predicted() -> None:
     config = weightless_config()
     bench = Bench(config)
     for face in bench.behind.emulator.faces:

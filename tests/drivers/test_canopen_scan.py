@@ -200,7 +200,7 @@ class Late(Tap):
         return super().receive(deadline_ns)
 
 
-def test_a_slow_node_is_asked_again_and_what_it_refuses_is_stated() -> None:
+def test_a_slow_node_is_queried_again_and_what_it_refuses_is_stated() -> None:
     bench = Bench()
     found = bus_scan(bench.config, lambda _: [Late(bench.behind.link(0), bench.sent)])
     line = found.lines[-1]

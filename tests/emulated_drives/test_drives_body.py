@@ -146,7 +146,7 @@ def test_braking_takes_the_energy_that_motors_turn_into_heat(tmp_path: Path, bra
         assert -needed @ v == pytest.approx(heat, rel=2e-3, abs=2e-3)
 
 
-def test_all_motors_together_brake_no_joint_less_than_asked(tmp_path: Path) -> None:
+def test_all_motors_together_brake_no_joint_less_than_requested(tmp_path: Path) -> None:
     gears = Gears(WAM, 7)
     asked = np.array([15.0, 15.0, 11.0, 7.0, 2.5, 2.5, 0.3])
     felt = gears.joint_damping(gears.motor_damping(asked))

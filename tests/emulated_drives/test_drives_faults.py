@@ -29,7 +29,7 @@ def true_counts(host: Host) -> list[float]:
     return (body.gears.motor_position(body.plant.position) * PER_RADIAN).tolist()
 
 
-def test_every_kind_of_the_simulated_arm_is_there_or_said_to_be_impossible() -> None:
+def test_every_kind_of_the_simulated_arm_is_there_or_reported_as_impossible() -> None:
     simulated = {kind.value for kind in FaultKind}
     assert simulated == (simulated & set(DRIVE_FAULTS)) | set(_NO_COUNTERPART)
     for kind in simulated & set(DRIVE_FAULTS):

@@ -10,11 +10,12 @@ import numpy as np
 from helpers.random_arms import bodies_of, friction_torque, random_chain, reference_model, reference_torque
 
 from ident_service.config.arm import Identification
+from ident_service.estimation.signal_processing import Motion, smoothed
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
-from ident_service.recordings.recording import Block
+from ident_service.recordings.recording import Block, Recording
 
 Array = np.ndarray
 
@@ -119,3 +120,9 @@ def one_joint_information(W: Array, omega: Array) -> Information:
     """Any linear equations `W beta = omega` as the information of a single joint."""
     support = (np.arange(W.shape[1]),)
     return information_of(W.T[None], omega[:, None], np.ones((len(omega), 1), dtype=bool), support)
+
+
+def smoothed_samples(recording: Recording, options: Identification, coupling: Array | None = None) -> Motion:
+    """All smoothed samples of a short recording at once."""
+    parts = list(smoothed(recording, options, coupling))
+    return Motion(*(np.concatenate([getattr(part, name) for part in parts]) for name in Motion.__dataclass_fields__))

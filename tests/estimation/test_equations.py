@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
+from estimation.synthetic import SampledRecording, recorded, serial_chain, smoothed_samples, stamps, waves, with_options
 from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
@@ -12,7 +12,7 @@ from ident_service.config.arm import Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import equations as module
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import Equations, equations, smoothed_samples
+from ident_service.estimation.equations import Equations, equations
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.regressor import joint_regressor

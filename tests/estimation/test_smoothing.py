@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.signal
-from estimation.synthetic import SampledRecording, stamps, waves
+from estimation.synthetic import SampledRecording, smoothed_samples, stamps, waves
 from helpers.plain import plain_options, plain_smoothing
 
 from ident_service.config.arm import FrictionShape, Identification, Reversal
 from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import smoothed_samples
 from ident_service.estimation.signal_processing import Motion, smoothed
 from ident_service.recordings.adapters import RangeRecording
 from ident_service.recordings.cached_recording import CachedRecording

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.signal
-from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
+from estimation.synthetic import SampledRecording, recorded, serial_chain, smoothed_samples, stamps, waves, with_options
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
 
 from ident_service.config.arm import Identification, Reversal
 from ident_service.errors import RecordingError
 from ident_service.estimation import signal_processing as smoothing
-from ident_service.estimation.equations import equation_rows, equations, smoothed_samples
+from ident_service.estimation.equations import equation_rows, equations
 from ident_service.estimation.least_squares import ordinary_least_squares, weighted_least_squares
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
@@ -51,7 +51,7 @@ def test_polynomials_are_exact_for_polynomials() -> None:
         np.testing.assert_allclose(values[:, 0], wanted, rtol=0, atol=1e-8 * 100.0**order)
 
 
-def test_polynomials_have_about_the_cut_off_asked_for() -> None:
+def test_polynomials_have_about_the_requested_cut_off() -> None:
     rng = np.random.default_rng(4)
     white = rng.normal(size=(40_000, 1))
     recording = SampledRecording(stamps(len(white), RATE), white, white)

@@ -83,7 +83,7 @@ def test_velocities_that_lag_are_not_chosen() -> None:
     assert off(chosen, arm()[1]) < 0.5 * off(identified("measured", fine), arm()[1])
 
 
-def test_velocities_of_our_own_loop_are_not_asked() -> None:
+def test_velocities_of_our_own_loop_are_not_required() -> None:
     assert identified("choose", replace(noisy(*arm()), torque_held=True)).choices == ()
 
 
@@ -96,7 +96,7 @@ def test_a_validation_without_velocities_is_judged_all_the_same() -> None:
     assert estimate.candidates[0].validation[0].error.relative_percent < 20.0
 
 
-def test_velocities_that_are_asked_for_and_not_there_are_missed() -> None:
+def test_required_velocities_that_are_missing_are_reported() -> None:
     model, delta = arm()
     bare = replace(noisy(model, delta), velocity=None)
     assert identified("choose", bare).choices == ()

@@ -171,7 +171,7 @@ def polished(model: ArmModel, design: Design) -> tuple[Task, Candidate, Callable
 
 
 @pytest.mark.slow
-def test_the_limit_that_is_widened_by_its_own_word_pays_as_foretold() -> None:
+def test_a_wider_active_limit_gains_as_predicted() -> None:
     """A slower joint is held by its velocity; a design with a little more of it gains what the multiplier says."""
     model = small(joints={"elbow": {"velocity": 0.6}})
     task, best, from_there = polished(model, quick())
@@ -193,7 +193,7 @@ def soft() -> tuple[Task, Candidate, Callable[[Task], Candidate]]:
 
 
 @pytest.mark.slow
-def test_stiffer_gains_pay_as_foretold(soft: tuple[Task, Candidate, Callable[[Task], Candidate]]) -> None:
+def test_stiffer_gains_help_as_predicted(soft: tuple[Task, Candidate, Callable[[Task], Candidate]]) -> None:
     task, best, from_there = soft
     found = binding(task, best.coefficients, per_period(task.basis))
     expected = sum(one.by_gain for one in found if one.joint == 1)

@@ -291,7 +291,7 @@ def test_random_files_take_other_bodies(seed: int, joints: int, square: bool) ->
 
 
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
-def test_elements_stand_where_they_are_said_to_stand(mark: str) -> None:
+def test_elements_are_found_at_their_places_in_the_text(mark: str) -> None:
     """Cut out of the text by their places, against Python's own tree."""
     data = (mark + FOREIGN).encode()
     pairs = [(xml_places(mark + FOREIGN, "arm.urdf"), ET.fromstring(FOREIGN.encode()))]  # noqa: S314  # ours

@@ -108,7 +108,7 @@ def _full_disk(*_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_storage_that_is_gone_for_a_moment_is_asked_again(unsteady: type[UnsteadyFileSystem]) -> None:
+def test_storage_that_is_gone_for_a_moment_is_queried_again(unsteady: type[UnsteadyFileSystem]) -> None:
     store = Store("unsteady://store")
     unsteady.failures = 3
     store.write("rows/one.json", b"first")

@@ -315,7 +315,7 @@ def test_what_is_rolled_back_to_is_the_same_to_the_last_bit(scene: Scene, accept
     assert kept == ["0001", "0002", "0003"]
 
 
-def test_a_notice_is_kept_with_what_says_that_it_was_told(scene: Scene) -> None:
+def test_a_notice_is_kept_with_the_record_of_its_delivery(scene: Scene) -> None:
     class Broken:
         broken = True
 

@@ -94,7 +94,7 @@ def test_a_program_without_outputs_has_no_slope_either() -> None:
     np.testing.assert_array_equal(program.pull(np.ones((0, 3))), np.zeros((1, 3)))
 
 
-def test_only_the_inputs_asked_for_are_differentiated() -> None:
+def test_only_the_requested_inputs_are_differentiated() -> None:
     tape = ExpressionGraph()
     x, y = tape.input(), tape.input()
     program = Differentiable(tape, [y], [x * y])

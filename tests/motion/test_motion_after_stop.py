@@ -114,7 +114,7 @@ def test_an_arm_that_would_fall_must_say_what_holds_it() -> None:
     assert resolved(loose("lower")) is StopSecuring.LOWER
 
 
-def test_a_simulated_drive_has_a_brake_where_nothing_is_said_and_a_real_one_has_none() -> None:
+def test_a_simulated_drive_has_a_brake_by_default_and_a_real_one_has_none() -> None:
     silent = {name: {key: value for key, value in joint.items() if key != "brake"} for name, joint in JOINTS.items()}
     config = bench_config(joints=silent)
     assert resolved(config) is StopSecuring.BRAKE

@@ -112,7 +112,7 @@ def test_a_step_and_less_push_forgive_missing_motion() -> None:
             shown(owed, forgive, NONE)
 
 
-def test_of_an_arm_that_is_asked_for_no_position_no_motion_is_missing() -> None:
+def test_without_a_commanded_motion_none_is_missing() -> None:
     owed = observer()
     shown(owed, np.ones(2), 5.0 * STANDING * FRICTION)
     assert cycles_until(owed, NONE) is None

@@ -109,7 +109,7 @@ def test_nothing_is_joined_before_its_beginning_or_after_its_end() -> None:
         assert paused.resume().joined == pytest.approx(joined)
 
 
-def test_when_nothing_leads_back_it_is_said_and_the_arm_stands_on() -> None:
+def test_when_nothing_leads_back_that_is_reported_and_the_arm_stands_on() -> None:
     motion = Awkward(())
     paused = Paused(motion, 5.0, LIMITS)
     motion.barred = ((0.0, 10.0),)

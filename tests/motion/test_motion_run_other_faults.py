@@ -93,7 +93,7 @@ def test_every_notice_of_a_drive_is_reported_and_recorded_and_stops_nothing(make
 
 
 @pytest.mark.parametrize("cycle", [250, MIDWAY, 1500])
-def test_a_stop_that_is_asked_for_is_controlled(make: Callable[..., Bench], cycle: int) -> None:
+def test_a_stop_that_is_requested_is_controlled(make: Callable[..., Bench], cycle: int) -> None:
     bench = make()
     report = bench.run(lambda: len(bench.story.samples) >= cycle - LOOKED)
     assert report.state is State.STOPPED
@@ -116,7 +116,7 @@ def test_a_stop_in_the_first_cycle_holds_the_arm_where_it_stands(make: Callable[
     assert (np.abs(bench.truth[-1].position - HOME) < 0.02).all()  # held without asking for a position
 
 
-def test_a_fault_during_a_stop_that_was_asked_for_is_not_swallowed(make: Callable[..., Bench]) -> None:
+def test_a_fault_during_a_stop_that_was_requested_is_not_swallowed(make: Callable[..., Bench]) -> None:
     bench = make(Fault(MIDWAY + 20, FaultKind.ENCODER_JUMP, 0, 2, 1.0))
     error = bench.fault(stop_requested=lambda: len(bench.story.samples) >= MIDWAY - LOOKED)
     assert error.code == "encoder_jumps"

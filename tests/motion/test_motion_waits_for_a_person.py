@@ -68,7 +68,7 @@ def test_an_arm_that_was_moved_meanwhile_is_planned_again_from_where_it_is() -> 
 
 
 @pytest.mark.slow
-def test_an_arm_that_stands_is_asked_for_once() -> None:
+def test_an_arm_at_rest_is_waited_for_once() -> None:
     report, story, _ = moved(1, 0.002)
     assert report.state is State.DONE
     assert waited(story) == 1

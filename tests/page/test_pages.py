@@ -257,7 +257,7 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     daemon.post("/stop", content="", headers=FORM)
 
 
-def test_a_run_is_asked_for_with_a_target(daemon: Asked) -> None:
+def test_a_run_is_requested_with_a_target(daemon: Asked) -> None:
     enter(daemon, "operator")
     fault_file(daemon.service.state, ARM).acknowledge("FOLLOWING_ERROR")
     fields = [attrs for _, attrs in Reader(daemon.get(f"/arms/{ARM}").text).tags if attrs.get("name") == "until"]

@@ -158,7 +158,7 @@ def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], p
     assert path.count("L") == len(view["clearance"]["samples"]) - 1
 
 
-def test_distances_are_reported_while_the_arm_is_on_its_way(shown: tuple[Browser, Reached, str], page: Page) -> None:
+def test_distances_are_reported_while_the_arm_moves(shown: tuple[Browser, Reached, str], page: Page) -> None:
     _, reached, _ = shown
     page.add_init_script(COUNTED)
     confirm_page(page, reached, "rehearse")

@@ -134,7 +134,7 @@ def test_refitted_offsets_keep_a_new_zero_out_of_the_body() -> None:
     assert identify_payload(arm, blocks_of(bare, rng), refit_offsets=True).verdict == "none"
 
 
-def test_no_payload_is_not_said_where_much_is_left_unexplained() -> None:
+def test_no_payload_is_not_reported_where_much_is_left_unexplained() -> None:
     rng = np.random.default_rng(21)
     arm = replace(known(rng), residual=NOISE)
     quiet = identify_payload(arm, blocks_of(DELTA, rng))
@@ -211,7 +211,7 @@ def test_what_the_arm_did_not_know_the_payload_does_not_know() -> None:
 
 
 @pytest.mark.parametrize("size", [0.0, 0.03], ids=["a point", "a ball"])
-def test_what_no_motion_shows_of_a_load_is_small_and_said_to_be_chosen(size: float) -> None:
+def test_what_no_motion_shows_of_a_load_is_small_and_reported_as_chosen(size: float) -> None:
     # A planar arm shows four of the ten; nearly a point has no room inside the usual inset.
     arm, truth = planar_arm(), body(0.3, (0.0, 0.0, 0.0), size)
     payload = identify_payload(arm, planar_blocks(arm, truth))

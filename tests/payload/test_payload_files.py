@@ -140,7 +140,7 @@ def with_event(recording: Path, copy: Path, seconds: float, level: int, message:
         writer.event(int(block.stamp_ns[0]) + int(seconds * 1e9), level, message)
 
 
-def test_nothing_on_the_arm_is_said_to_be_nothing(arms: Path, ident: Ident, tmp_path: Path) -> None:
+def test_nothing_on_the_arm_is_reported_as_nothing(arms: Path, ident: Ident, tmp_path: Path) -> None:
     code, text, _ = ident("payload", arms / "bare", arms / "bare.mcap", "--out", tmp_path / "none")
     assert code == 3
     assert text.startswith("NO PAYLOAD: the arm moves as it was identified\n")

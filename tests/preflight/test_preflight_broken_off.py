@@ -75,7 +75,7 @@ def test_when_every_check_has_been_made(unnamed: Flown) -> None:
     assert ticket.verdict is Verdict.FAILED
 
 
-def test_a_stop_that_is_asked_for_while_a_person_thinks_keeps_the_drives_off() -> None:
+def test_a_stop_that_is_requested_while_a_person_thinks_keeps_the_drives_off() -> None:
     flight = Flight()
 
     def confirm(question: str) -> str:

@@ -68,7 +68,7 @@ def test_link_values_are_those_of_an_arm(shared: Path) -> None:
     assert all(np.linalg.norm(body[6:9]) / body[-1] < 0.4 for body in bodies)
 
 
-def test_a_wrist_of_fifty_grams_beside_the_arm_is_said_to_be_implausible(identified: Identified) -> None:
+def test_a_wrist_of_fifty_grams_beside_the_arm_is_reported_as_implausible(identified: Identified) -> None:
     lines = {line.split(":")[0]: line for line in implausible_links(identified("kuka_lwr4"))}
     assert "kg, where 0.16 to 16 kg are likely" in lines["lwr_5_joint"]
     assert "m from a likely place, where 0.36 m would be much" in lines["lwr_5_joint"]

@@ -182,7 +182,7 @@ def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_header_of_another_program_is_told_what_to_do(tmp_path: Path, header: str, words: str) -> None:
+def test_a_header_of_another_program_is_refused_with_a_remedy(tmp_path: Path, header: str, words: str) -> None:
     with pytest.raises(RecordingError) as caught:
         CsvRecording(write(tmp_path / "run.csv", header + "\n0,1,2\n"))
     assert words in str(caught.value)

@@ -64,7 +64,7 @@ def test_blocks_are_read_only_and_can_be_read_again(tmp_path: Path) -> None:
         next(recording.blocks(0))
 
 
-def test_columns_follow_the_asked_joints(tmp_path: Path) -> None:
+def test_columns_follow_the_requested_joints(tmp_path: Path) -> None:
     path = write_recording(tmp_path / "run.mcap", 20)
     block = read_all(open_recording(path, ["wrist_roll", "shoulder"]))
     assert np.array_equal(block.position, read_all(open_recording(path)).position[:, [2, 0]])
@@ -257,7 +257,7 @@ def test_the_high_level_ros2_reader_takes_our_files(tmp_path: Path) -> None:
     assert topics == {"/joint_states", "/joint_commands", "/cycle", "/robot_description"}
 
 
-def test_joints_that_change_are_refused_unless_asked_for(tmp_path: Path) -> None:
+def test_joints_that_change_are_refused_unless_requested(tmp_path: Path) -> None:
     path = tmp_path / "bag.mcap"
     with path.open("wb") as stream:
         writer = BagWriter(stream)
@@ -293,7 +293,7 @@ def test_messages_outside_of_chunks(tmp_path: Path) -> None:
     assert 0 < len(read_all(torn).stamp_ns) < 49
 
 
-def test_what_drives_measured_stands_beside_what_they_were_told(tmp_path: Path) -> None:
+def test_what_drives_measured_stands_beside_what_they_were_sent(tmp_path: Path) -> None:
     path, q = tmp_path / "run.mcap", np.array([0.1, 0.2, 0.3])
     with RecordingWriter(path, JOINTS, URDF, OFFSET_NS) as writer:
         for k in range(5):

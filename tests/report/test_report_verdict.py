@@ -64,7 +64,7 @@ def judged(made: Made, **changes: Any) -> Assessment:
     return assess(content_of(made, **(sound(made) | changes)))
 
 
-def test_use_is_said_only_where_nothing_stands_against_it(good: Made) -> None:
+def test_use_is_reported_only_where_nothing_stands_against_it(good: Made) -> None:
     found = judged(good)
     assert found.word == "use"
     assert found.line == (

@@ -106,7 +106,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("asked", "stops"), [(-1, True), (0, True), (1, False), (None, False)])
-def test_a_stop_reaches_a_motion_that_was_asked_for_before_it(tmp_path: Path, asked: int | None, stops: bool) -> None:
+def test_a_stop_reaches_a_motion_that_was_requested_before_it(tmp_path: Path, asked: int | None, stops: bool) -> None:
     time = Time()
     assert ControlFile.stop_all(loop_path(tmp_path), time) is None
     requested_ns = None if asked is None else time.now + asked

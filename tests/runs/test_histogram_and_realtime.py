@@ -37,7 +37,7 @@ def test_nothing_was_counted_yet() -> None:
     assert Histogram().below_us(0.999) == 0.0
 
 
-def test_what_is_asked_of_the_kernel_is_answered_in_words_and_nothing_fails() -> None:
+def test_requests_to_the_kernel_are_answered_in_words_and_nothing_fails() -> None:
     code = (
         "from ident_service.motion.realtime import request_privileges; granted = request_privileges(); "
         "print(granted.sentence()); "
@@ -123,7 +123,7 @@ def test_heap_and_stack_have_their_pages_before_the_loop_begins() -> None:
 
 
 @pytest.mark.slow
-def test_what_was_asked_for_a_while_is_given_back() -> None:
+def test_temporary_privileges_are_given_back() -> None:
     before = os.sched_getscheduler(0), os.sched_getaffinity(0)
     for _ in range(2):  # its core is free again
         with temporary_privileges(settings=Realtime(cores=tuple(CORES))) as granted:

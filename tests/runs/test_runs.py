@@ -96,7 +96,7 @@ def checked(arm: Path, state: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_run_in_virtual_time_is_the_run_that_was_asked_for(virtual_arm: Path, tmp_path: Path) -> None:
+def test_a_run_in_virtual_time_is_the_run_that_was_requested(virtual_arm: Path, tmp_path: Path) -> None:
     words = checked(virtual_arm, tmp_path / "state")
     assert main(["run", str(virtual_arm), "--out", str(tmp_path / "run"), *words]) == 0
     names = sorted(path.name for path in (tmp_path / "run").iterdir())

@@ -142,7 +142,7 @@ def test_a_load_is_a_point_mass_in_the_frame_of_the_last_link(tmp_path):
         )
 
 
-def test_a_list_of_faults_is_asked_for(tmp_path):
+def test_faults_must_be_a_list(tmp_path):
     path = tmp_path / "two.yaml"
     path.write_text(TEXT.replace("  faults:\n", "  faults: {kind: nan_position, at: 1}\n"))
     with pytest.raises(ConfigError) as caught:

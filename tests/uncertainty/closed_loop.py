@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from estimation.synthetic import SampledRecording, stamps, waves, with_options
 from helpers.plain import plain_options
@@ -25,8 +23,8 @@ def pendulum_model() -> tuple[ArmModel, Array]:
 
 def recorded_in_closed_loop(
     model: ArmModel, truth: Array, *, seed: int, position_noise: float = 0.0, seconds: float = 24.0
-) -> tuple[SampledRecording, SampledRecording]:
-    """What the joint did, as its encoder and its controller saw it, and what it was told to do.
+) -> SampledRecording:
+    """The joint's motion as its encoder and its controller measured it.
 
     The loop multiplies the encoder's noise [rad] by its gains and moves the joint with it.
     """
@@ -44,5 +42,4 @@ def recorded_in_closed_loop(
         alpha = acceleration[k] + 20.0 * (rate[k] - velocity) + 100.0 * (wanted[k] - seen[k])
         torque[k] = plant.inverse_dynamics(seen[k], velocity, alpha)
         plant.step(torque[k])
-    recording = SampledRecording(stamps(len(time), RATE), seen, torque, torque_held=True)
-    return recording, replace(recording, position=wanted)
+    return SampledRecording(stamps(len(time), RATE), seen, torque, torque_held=True)

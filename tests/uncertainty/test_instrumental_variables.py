@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimation.synthetic import SampledRecording, recorded, serial_chain, stamps, waves, with_options
+from estimation.synthetic import SampledRecording, recorded, serial_chain, waves, with_options
 from helpers.plain import plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta
-from uncertainty.closed_loop import RATE, pendulum_model, recorded_in_closed_loop
+from uncertainty.closed_loop import pendulum_model, recorded_in_closed_loop
 
 from ident_service.errors import ModelError
 from ident_service.estimation.equations import equation_rows, equations
@@ -23,33 +23,28 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters
 
 Array = np.ndarray
-GAINS = {"kp": 400.0, "kd": 40.0}
 
 
-def refined(
-    model: ArmModel, recording: SampledRecording, reference: SampledRecording | None = None
-) -> tuple[LeastSquares, Array, InstrumentalEstimate]:
+def refined(model: ArmModel, recording: SampledRecording) -> tuple[LeastSquares, Array, InstrumentalEstimate]:
     """Least squares, its deviations, and what instruments make of it."""
     base = base_parameters(model.chain, model.layout)
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
     gathered = equations(recording, model, base)
     fit = ordinary_least_squares(gathered.total)
     delta = constrained_least_squares(fit, base, conditions).delta
-    references = None if reference is None else [reference]
-    result = instrumental_variables([recording], model, base, conditions, fit, delta, references=references)
+    result = instrumental_variables([recording], model, base, conditions, fit, delta)
     return fit, np.sqrt(np.diag(block_covariance(gathered, fit))), result
 
 
 @pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [False, True])
-def test_least_squares_is_biased_in_a_noisy_loop_and_instruments_are_not(given: bool) -> None:
+def test_least_squares_is_biased_in_a_noisy_loop_and_instruments_are_not() -> None:
     model, truth = pendulum_model()
     beta = base_parameters(model.chain, model.layout).K @ truth
     plain, better, claimed = [], [], []
     for seed in range(6):
-        recording, reference = recorded_in_closed_loop(model, truth, seed=seed, position_noise=3e-3)
-        fit, _, result = refined(model, recording, reference if given else None)
+        recording = recorded_in_closed_loop(model, truth, seed=seed, position_noise=3e-3)
+        fit, _, result = refined(model, recording)
         plain.append(fit.beta - beta)
         better.append(result.beta - beta)
         claimed.append(result.standard_deviations)
@@ -74,7 +69,7 @@ def test_of_noise_that_biases_least_squares_is_warned_and_instruments_hold_their
     beta = base_parameters(model.chain, model.layout).K @ truth
     off: dict[str, list[Array]] = {"ols": [], "iv": []}
     for seed in range(6):
-        recording, _ = recorded_in_closed_loop(model, truth, seed=seed, position_noise=3e-4)
+        recording = recorded_in_closed_loop(model, truth, seed=seed, position_noise=3e-4)
         for method, errors in off.items():
             estimate = identify(model, [recording], method=method)  # type: ignore[arg-type]
             errors.append((estimate.fit.beta - beta) / estimate.standard_deviations)
@@ -86,14 +81,13 @@ def test_of_noise_that_biases_least_squares_is_warned_and_instruments_hold_their
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [False, True])
-def test_without_noise_nothing_changes(given: bool) -> None:
+def test_without_noise_nothing_changes() -> None:
     model, truth = pendulum_model()
-    recording, reference = recorded_in_closed_loop(model, truth, seed=0)
+    recording = recorded_in_closed_loop(model, truth, seed=0)
     # Noise of the torque's measurement alone, which never enters the loop.
     noise = 0.1 * np.random.default_rng(1).normal(size=recording.torque.shape)
     measured = replace(recording, torque=recording.torque + noise)
-    fit, deviations, result = refined(model, measured, reference if given else None)
+    fit, deviations, result = refined(model, measured)
     assert np.all(np.abs(result.beta - fit.beta) < 0.5 * deviations)
     np.testing.assert_allclose(result.standard_deviations, deviations, rtol=0.2)
     assert result.strength.min() > 0.999
@@ -118,10 +112,10 @@ def test_two_joints_with_everything_between_them() -> None:
 def test_the_covariance_is_the_jackknife_over_blocks() -> None:
     # One round by hand, on explicit rows.
     model, truth = pendulum_model()
-    recording, _ = recorded_in_closed_loop(model, truth, seed=1, position_noise=5e-4)
+    recording = recorded_in_closed_loop(model, truth, seed=1, position_noise=5e-4)
     _, _, result = refined(model, recording)
     base = base_parameters(model.chain, model.layout)
-    made = simulated(recording, recording, model, result.delta, 2.0, commanded=False)
+    made = simulated(recording, model, result.delta, 2.0)
     (rows,), (other,) = (list(equation_rows(source, model, base)) for source in (recording, made))
     keep = other.keep[:, 0]
     W, Z, omega = rows.H_b[0].T[keep], other.H_b[0].T[keep], rows.torque[keep, 0]
@@ -138,75 +132,46 @@ def test_the_covariance_is_the_jackknife_over_blocks() -> None:
 
 def test_the_simulated_arm_follows_and_keeps_everything_else() -> None:
     model, truth = pendulum_model()
-    recording, reference = recorded_in_closed_loop(model, truth, seed=2, position_noise=5e-3)
-    made = simulated(recording, reference, model, truth, 8.0, commanded=False)
+    recording = recorded_in_closed_loop(model, truth, seed=2, position_noise=5e-3)
+    made = simulated(recording, model, truth, 2.0)
     blocks = list(made.blocks(1000))
     position = np.concatenate([block.position for block in blocks])
     np.testing.assert_array_equal(np.concatenate([block.torque for block in blocks]), recording.torque)
     np.testing.assert_array_equal(np.concatenate([block.stamp_ns for block in blocks]), recording.stamp_ns)
     assert made.sha256 == recording.sha256
     assert made.torque_held
-    assert np.abs(position - reference.position).max() < 2e-3
-    # What is followed here is the command, and the encoder's noise is nowhere in it.
+    # The encoder's noise is nowhere in it.
     assert np.sqrt(np.mean((position - recording.position) ** 2)) > 4e-3
     assert np.abs(np.diff(position, 3, axis=0)).max() < 2e-3
 
 
 def test_a_gap_is_not_simulated_across() -> None:
     model, truth = pendulum_model()
-    recording, reference = recorded_in_closed_loop(model, truth, seed=2)
+    recording = recorded_in_closed_loop(model, truth, seed=2)
     half = len(recording.stamp_ns) // 2
     late = recording.stamp_ns.copy()
     late[half:] += 3_000_000_000
-    moved = replace(reference, stamp_ns=late)
-    made = simulated(replace(recording, stamp_ns=late), moved, model, truth, 8.0, commanded=False)
+    moved = replace(recording, stamp_ns=late)
+    made = simulated(moved, model, truth, 8.0)
     (block,) = made.blocks(len(late))
-    first = simulated(
-        *(
-            replace(r, stamp_ns=r.stamp_ns[:half], position=r.position[:half], torque=r.torque[:half])
-            for r in (recording, reference)
-        ),
-        model,
-        truth,
-        8.0,
-        commanded=False,
-    )
+    before = (values[:half] for values in (recording.stamp_ns, recording.position, recording.torque))
+    first = simulated(SampledRecording(*before, torque_held=True), model, truth, 8.0)
     np.testing.assert_allclose(block.position[:half], next(iter(first.blocks(half))).position, rtol=0, atol=1e-12)
     assert np.abs(block.position - moved.position).max() < 2e-3
 
 
-def test_the_loop_of_the_configuration_makes_its_own_error() -> None:
-    """With a prior that is too light by half the arm sags under the gains of eq. 76, by what they say."""
-    model, truth = pendulum_model()
-    known = model_around(model.chain, model.layout, j1=GAINS)
-    prior = 0.5 * truth
-    prior[model.layout.term_columns("coulomb")] = truth[model.layout.term_columns("coulomb")] = 0.0
-    prior[model.layout.term_columns("offset")] = truth[model.layout.term_columns("offset")] = 0.0
-    known = replace(known, prior=prior)
-    still = np.full((500, 1), 0.3)
-    recording = SampledRecording(stamps(500, RATE), still, np.zeros((500, 1)))
-    end = [
-        next(iter(simulated(recording, recording, known, truth, 8.0, commanded=commanded).blocks(500))).position[-1, 0]
-        for commanded in (True, False)
-    ]
-    assert end[1] == pytest.approx(0.3, abs=1e-6)
-    inertia, moment = truth[5] + truth[model.layout.term_columns("drive_inertia")][0], truth[6] * 9.81
-    # tau = M_p kp e + g_p(q) = g(q), at rest.
-    assert 0.5 * inertia * GAINS["kp"] * (0.3 - end[0]) == pytest.approx(0.5 * moment * np.cos(end[0]), rel=1e-4)
-
-
 def test_what_cannot_be_refined_says_why() -> None:
     model, truth = pendulum_model()
-    recording, _ = recorded_in_closed_loop(model, truth, seed=0)
+    recording = recorded_in_closed_loop(model, truth, seed=0)
     base = base_parameters(model.chain, model.layout)
     conditions = feasible_set("pseudo_inertia", base.names, model.config)
     fit = ordinary_least_squares(equations(recording, model, base).total)
     with pytest.raises(ModelError, match="5 of 6 directions"):
         instrumental_variables([recording], model, base, conditions, replace(fit, rank=5), truth)
-    with pytest.raises(ModelError, match="1 recordings and 0 references"):
-        instrumental_variables([recording], model, base, conditions, fit, truth, references=[])
+    with pytest.raises(ModelError, match="needs a recording"):
+        instrumental_variables([], model, base, conditions, fit, truth)
     with pytest.raises(ModelError, match="cut-off of 70 Hz"):
-        instrumental_variables([recording], model, base, conditions, fit, truth, cutoff=70.0)
+        simulated(recording, model, truth, 70.0)
     weightless = truth.copy()
     weightless[model.layout.inertial(0)] = 0.0
     with pytest.raises(ModelError, match="no centre of mass"):
@@ -215,7 +180,6 @@ def test_what_cannot_be_refined_says_why() -> None:
 
 def test_a_loop_that_runs_away_is_named() -> None:
     model, truth = pendulum_model()
-    wild = replace(model_around(model.chain, model.layout, j1={"kp": 1e4, "kd": 1.0}), prior=100.0 * truth)
-    recording, reference = recorded_in_closed_loop(model, truth, seed=0)
+    recording = recorded_in_closed_loop(model, truth, seed=0)
     with pytest.raises(ModelError, match="is unstable after"):
-        simulated(recording, reference, wild, truth, 8.0, commanded=True)
+        simulated(replace(recording, position=1e6 * recording.position), model, truth, 8.0)

@@ -274,13 +274,13 @@ class Orphan:
     Attributes:
         row: of its job.
         process: its name, as `child_process.alive` takes it.
-        mover: id of the process that has the arm; None before one was seen.
+        controlling_pid: id of the process that has the arm; None before one was seen.
         since: when it was seen first [s].
     """
 
     row: Row
     process: str
-    mover: int | None
+    controlling_pid: int | None
     since: float
 
     def standing(self, state: Path) -> str:
@@ -288,9 +288,9 @@ class Orphan:
         row, moves = self.row, bool(self.row["motion"])
         lives = alive(self.process)
         has = controlling_pid(control_path(state, row["arm"])) if moves else None
-        if lives and self.mover is None:
-            self.mover = has
-        if not lives and (has is None or has != self.mover):
+        if lives and self.controlling_pid is None:
+            self.controlling_pid = has
+        if not lives and (has is None or has != self.controlling_pid):
             return ""
         if has is not None and held_arm(state, row["arm"]):
             return f" {has} holds {held_until(row['arm'])}"
@@ -338,7 +338,7 @@ def explain_interrupted(
     """
     left = list(orphans(db, state) if found is None else found)
     closing = threading.Event() if closing is None else closing
-    told: dict[str, str] = {}
+    recorded: dict[str, str] = {}
     for one in left:
         # A motion has seen the end of its input and stops its arm; a second word would end what holds it.
         if not (one.row["motion"] and held_arm(state, one.row["arm"])):
@@ -350,8 +350,8 @@ def explain_interrupted(
                 left.remove(one)
                 _explain(db, state, one.row)
                 over(job)
-            elif words != told.setdefault(job, " is being looked for"):
-                told[job] = words
+            elif words != recorded.setdefault(job, " is being looked for"):
+                recorded[job] = words
                 rows.explain(db, job, f"{END_UNOBSERVED}{words}")
         if left:
             closing.wait(_LOOK)

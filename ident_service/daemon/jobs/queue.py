@@ -114,7 +114,7 @@ class LiveJob:
         child: its process, once it runs.
         end_reason: why it is to end; empty while it is not.
         since: when that was asked [s].
-        told: whether a computation was sent SIGTERM.
+        terminated: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
         concluding: whether its end is being entered.
     """
@@ -129,7 +129,7 @@ class LiveJob:
     child: JobProcess | None = None
     end_reason: str = ""
     since: float = 0.0
-    told: bool = False
+    terminated: bool = False
     killed: bool = False
     concluding: bool = False
 
@@ -563,12 +563,12 @@ class Engine:
             try:
                 explain_interrupted(self.db, self.state, self._orphans, self.live.orphan_ended, self._closing)
             except (sqlite3.Error, OSError) as error:
-                LOG.error("what was interrupted cannot be told yet: %s", error)
+                LOG.error("the outcome of interrupted jobs cannot be recorded yet: %s", error)
                 if self._closing.wait(_LAST):
                     return
                 self._orphans = orphans(self.db, self.state)
             except Exception:
-                LOG.exception("what was interrupted could not be told")
+                LOG.exception("the outcome of interrupted jobs could not be recorded")
                 return
             else:
                 return
@@ -654,8 +654,8 @@ class Engine:
     def _watch(self, live: LiveJob, child: JobProcess) -> None:
         """Check a running job; end a computation by SIGTERM, then by SIGKILL, and conclude a job that has ended."""
         if live.end_reason and not live.order.moves:
-            if not live.told:
-                live.told = True
+            if not live.terminated:
+                live.terminated = True
                 child.signal(signal.SIGTERM)
             elif not live.killed and self._now() - live.since > _POLITE:
                 live.killed = True

@@ -40,14 +40,14 @@ LOG = logging.getLogger("ident.maintenance")
 _SAME = ("kinematics", "gravity", "terms", "transmission")  # sections whose change gives the parameters another meaning
 
 
-def require_comparable(state: Path, config: ArmConfig, number: int | None = None) -> int:
-    """Check that an arm can be compared with an acceptance, the current one if `number` is None; return its number.
+def require_comparable(state: Path, config: ArmConfig) -> int:
+    """Check that an arm can be compared with its current acceptance; return that one's number.
 
     Raises:
         UsageError: nothing was accepted; or the mechanism in the description is another one since.
         ParameterError: the accepted set was changed on the disk.
     """
-    act, folder = accepted_set(state, config.name, number)
+    act, folder = accepted_set(state, config.name)
     before = arm_from_json(folder / ARM)
     other = [key for key in _SAME if getattr(before, key) != getattr(config, key)]
     if other:

@@ -167,7 +167,7 @@ def prune(service: Serving, who: Operator, body: Pruning) -> PruningAnswer:
     gone = (
         run_archive.prune(service.db, service.state, body.keep, who.name)
         if body.yes
-        else run_archive.expendable(service.db, service.state, body.keep)
+        else run_archive.prunable_recordings(service.db, service.state, body.keep)
     )
     return PruningAnswer(
         deleted=body.yes,

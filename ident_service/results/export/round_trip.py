@@ -28,10 +28,10 @@ Carried = Mapping[JointTerm, NDArray[np.bool_]]
 States = tuple[Array, Array, Array]
 
 
-def random_states(joints: int, samples: int = _STATES) -> States:
-    """Return position, velocity and acceleration, always the same ones, each of shape (samples, joints)."""
+def random_states(joints: int) -> States:
+    """Return position, velocity and acceleration, always the same ones, each of shape (states, joints)."""
     rng = np.random.default_rng(_SEED)
-    position, velocity, acceleration = rng.uniform(-3.0, 3.0, size=(3, samples, joints))
+    position, velocity, acceleration = rng.uniform(-3.0, 3.0, size=(3, _STATES, joints))
     velocity[::4] *= 0.02  # where the friction of slow motion differs from that of fast
     return position, velocity, acceleration
 
