@@ -20,7 +20,7 @@ demo: $(READY)
 test: $(READY)
 	$(MAKE) --jobs 4 --output-sync lint types docs coverage collected
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
-	$(BIN)/pytest -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
+	$(BIN)/pytest -n 2 --dist loadfile -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
 # Three workers for two cores: tests that talk to processes of their own also wait.
 TESTS := $(BIN)/pytest -n 3 --dist worksteal

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from helpers import tickets
 from helpers.forks import fork_processes
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
@@ -35,13 +36,15 @@ _ALLOWED = (
     "`make test-foreign` runs it",
 )
 
-# Folders, and files of others, about what a command, a daemon or a page does and not about how its processes begin, talk
-# and end; and files in these folders that are about that.
-_FORKED = {"cli", "daemon", "maintenance", "page", "test_can_log", "test_zero"}
+# Folders, and files of others, about what a command, a daemon or a page does and not about how its processes begin,
+# talk and end; and files in these folders that are about that.
+_FORKED = {"cli", "daemon", "maintenance", "page", "payload"}
+_FORKED |= {"test_can_log", "test_finish", "test_recover", "test_zero"}
+_FORKED |= {"test_canopen_matrix", "test_canopen_positions", "test_pucks_run_virtual"}
 _STARTED = {"test_answer", "test_cli_itself", "test_daemon_killed", "test_image", "test_serve_process"}
 
 # A part of hypothesis' usual hundred examples; `make campaign` has a thousand, wherever a test says no number.
-settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=40)
+settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=25)
 settings.register_profile("campaign", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("default")
 
@@ -69,6 +72,12 @@ def interrupts_are_heard() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def tickets_are_shared(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Have each arm checked once for all workers."""
+    tickets.factory = tmp_path_factory
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ import multiprocessing.resource_tracker
 import multiprocessing.util
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -23,6 +24,7 @@ import types
 import warnings
 import weakref
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Final, NoReturn
 
 import pytest
@@ -77,7 +79,7 @@ class ForkedProcess(subprocess.Popen[Any]):
         pass_fds, cwd, env, ends, own_session = rest[3], rest[4], rest[5], rest[9:15], rest[20]
         environment = None if env is None else {os.fsdecode(name): os.fsdecode(value) for name, value in env.items()}
         if cwd is not None:
-            os.stat(cwd)  # a folder that is not there is the caller's error
+            Path(cwd).stat()  # a folder that is not there is the caller's error
         self.pid = fork()
         if self.pid == 0:
             try:
@@ -130,19 +132,25 @@ def _forget_the_parent(environment: dict[str, str] | None) -> None:
         (1, "stdout", "w", "strict"),
         (2, "stderr", "w", "backslashreplace"),
     ):
-        stream = open(number, mode, encoding="utf-8", errors=errors, closefd=False)  # noqa: PTH123, SIM115
+        stream = open(number, mode, encoding="utf-8", errors=errors, closefd=False)  # noqa: SIM115
         stream.reconfigure(line_buffering=number == 2 or stream.isatty())
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
     warnings.resetwarnings()
     for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
         warnings.simplefilter("ignore", kind)
+    # SQLite knows in each process which files that has locked, and a fork would believe to have the parent's locks.
+    sqlite3.connect = _no_registry
     sys.excepthook, sys.unraisablehook = sys.__excepthook__, sys.__unraisablehook__
     threading.excepthook = threading.__excepthook__
     for handler in list(logging.root.handlers):
         logging.root.removeHandler(handler)
     logging.root.setLevel(logging.WARNING)
     gc.enable()
+
+
+def _no_registry(*_: object, **__: object) -> NoReturn:
+    raise AssertionError("a program that opens the registry is to be started, not forked: tests/conftest.py")
 
 
 def _be(program: str, *words: str) -> NoReturn:
