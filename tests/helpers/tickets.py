@@ -17,7 +17,7 @@ from ident_service.operations.arm_checks import write_ticket
 from ident_service.preflight.preflight import preflight
 from ident_service.registry.state_folder import ticket_path
 
-factory: pytest.TempPathFactory
+factory: pytest.TempPathFactory | None = None
 """Of the tests' temporary folders, one of which the workers share (`tests/conftest.py`)."""
 
 
@@ -37,6 +37,7 @@ def write_checked_ticket(config: ArmConfig, state: Path) -> None:
         config: of an arm without a plant that outlives it, so that one preflight speaks for all tests.
         state: folder of the state, made where it is missing.
     """
+    assert factory is not None
     folder = made_once(factory, f"ticket-{config.sha256}", lambda place: write_ticket(place / "ticket", _made(config)))
     ticket = ticket_from_json((folder / "ticket").read_text(encoding="utf-8"))
     if ticket.expires - datetime.now(UTC) < VALID / 2:
