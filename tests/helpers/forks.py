@@ -80,6 +80,7 @@ class ForkedProcess(subprocess.Popen[Any]):
         environment = None if env is None else {os.fsdecode(name): os.fsdecode(value) for name, value in env.items()}
         if cwd is not None:
             Path(cwd).stat()  # a folder that is not there is the caller's error
+        ready, prepared = os.pipe()
         self.pid = fork()
         if self.pid == 0:
             try:
@@ -87,11 +88,15 @@ class ForkedProcess(subprocess.Popen[Any]):
                     os.setsid()
                 if cwd is not None:
                     os.chdir(cwd)
-                _keep_only(ends[0], ends[3], ends[5], pass_fds)
+                _keep_only(ends[0], ends[3], ends[5], (*pass_fds, prepared))
                 _forget_the_parent(environment)
+                os.close(prepared)
                 contextvars.Context().run(_be, *words)
             finally:
                 os._exit(255)
+        os.close(prepared)
+        with os.fdopen(ready, "rb") as told:
+            told.read()  # its end: now it has its own session, descriptors and signals, as after `exec`
         self._child_created = True
         self._close_pipe_fds(*ends)  # type: ignore[attr-defined]
 
