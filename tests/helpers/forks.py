@@ -40,6 +40,7 @@ PROGRAMS: Final = frozenset(
         "sim_backend.plant_process",
     }
 )
+_parents: list[object] = []  # in a fork
 _PYTHON: Final = sys.executable  # where a test names another one, that one is started
 
 
@@ -119,11 +120,18 @@ def _forget_the_parent(environment: dict[str, str] | None) -> None:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
     signal.set_wakeup_fd(-1)
     faulthandler.disable()
-    # What the parent's objects do at their end or at the interpreter's is the parent's to do.
+    # What the parent's objects do at their end or at the interpreter's is the parent's to do; they stay, as the numbers
+    # of the files that they would close are other files' now.
     atexit._clear()
-    weakref.finalize._registry.clear()  # type: ignore[attr-defined]
+    registries: tuple[Any, ...] = (
+        weakref.finalize._registry,  # type: ignore[attr-defined]
+        concurrent.futures.thread._threads_queues,  # type: ignore[attr-defined]
+    )
+    _parents.extend([*map(dict, registries), sys.stdin, sys.stdout, sys.stderr, sys.__stdin__, sys.__stdout__])
+    _parents.extend([sys.__stderr__, sys.modules["__main__"], *logging.root.handlers])
+    for registry in registries:
+        registry.clear()
     weakref.finalize._registered_with_atexit = False  # type: ignore[attr-defined]
-    concurrent.futures.thread._threads_queues.clear()  # type: ignore[attr-defined]
     multiprocessing.process._children.clear()  # type: ignore[attr-defined]
     multiprocessing.util._finalizer_registry.clear()  # type: ignore[attr-defined]
     atexit.register(multiprocessing.util._exit_function)
