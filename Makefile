@@ -16,7 +16,8 @@ demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
 	$(BIN)/ident simulate
 
-# What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
+# What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails. Tests by the machine's
+# clock use a quarter of a core, so that two files of them run at a time.
 test: $(READY)
 	$(MAKE) --jobs 4 --output-sync lint types docs coverage collected
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
