@@ -16,11 +16,12 @@ demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
 	$(BIN)/ident simulate
 
-# What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails.
+# What a machine lacks (README: system packages) is skipped with its reason; with CI=true it fails. Tests by the machine's
+# clock use a quarter of a core, so that two files of them run at a time.
 test: $(READY)
 	$(MAKE) --jobs 4 --output-sync lint types docs coverage collected
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
-	$(BIN)/pytest -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
+	$(BIN)/pytest -n 2 --dist loadfile -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
 # Three workers for two cores: tests that talk to processes of their own also wait.
 TESTS := $(BIN)/pytest -n 3 --dist worksteal

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
+from helpers import tickets
+from helpers.forks import fork_processes
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
@@ -34,14 +36,28 @@ _ALLOWED = (
     "`make test-foreign` runs it",
 )
 
+# Folders, and files of others, about what a command does and not about how its processes begin, talk and end; and files
+# in these folders that are about that. Not those of the daemon: its threads would be forked with it.
+_FORKED = {"cli", "payload"}
+_FORKED |= {"test_can_log", "test_finish", "test_recover", "test_zero"}
+_FORKED |= {"test_canopen_matrix", "test_canopen_positions", "test_pucks_run_virtual"}
+_STARTED = {"test_answer", "test_cli_itself"}
+
 # A part of hypothesis' usual hundred examples; `make campaign` has a thousand, wherever a test says no number.
-settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=40)
+settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=25)
 settings.register_profile("campaign", deadline=None, print_blob=True, max_examples=1000)
 settings.load_profile("default")
 
 
 def pytest_collection() -> None:
     gc.disable()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pycollect_makeitem(collector: pytest.Collector, obj: object) -> list[pytest.Item] | None:
+    """Make no items of a function whose thousands of cases are for another time; every worker would, and drop them."""
+    marks = getattr(obj, "pytestmark", ()) if "not campaign" in collector.config.getoption("-m") else ()
+    return [] if any(mark.name == "campaign" for mark in marks) else None
 
 
 def pytest_collection_finish() -> None:
@@ -58,12 +74,30 @@ def interrupts_are_heard() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def tickets_are_shared(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Have each arm checked once for all workers."""
+    tickets.factory = tmp_path_factory
+
+
 @pytest.fixture
 def hangups_are_heard() -> Iterator[None]:
     """Hear hangups although the tests were started with `nohup`, which ignores them."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGHUP, before)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def processes(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fork our own programs from this process where `_FORKED` says so; at night each is started anew."""
+    night = "campaign" in (request.config.getoption("--hypothesis-profile", ""), request.config.getoption("-m"))
+    if night or request.path.stem in _STARTED or not _FORKED & {request.path.parent.name, request.path.stem}:
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        fork_processes(patch)
+        yield
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

@@ -12,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 from ident_service import __version__
@@ -217,8 +218,9 @@ def _refused(arguments: argparse.Namespace, error: OSError) -> IdentError | None
     return None
 
 
+@cache  # parsing leaves it as it was
 def parser() -> Parser:
-    """Build the argument parser with all verbs and their arguments."""
+    """Return the argument parser with all verbs and their arguments."""
     top = TopParser(
         prog="ident",
         description="Commission a robot arm: describe it, move it, identify its dynamic parameters.",

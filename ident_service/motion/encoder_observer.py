@@ -178,7 +178,7 @@ class FrozenEncoderObserver:
         """
         self._cycle += 1
         encoders, given = self._encoders, correction
-        fed = encoders.forces(np.broadcast_to(feedforward, correction.shape))
+        fed = encoders.forces(np.full(correction.shape, feedforward))
         correction, answer = encoders.forces(correction), encoders.velocities(answer)
         pushed = correction + fed
         changed = direction != 0.0

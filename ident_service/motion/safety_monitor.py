@@ -366,7 +366,7 @@ class SafetyMonitor:
         answered = bool(sample.valid.all())
         encoders = self._encoders
         steps, valid = encoders.steps(sample.position, self._shown), encoders.valid(sample.valid)
-        own = np.abs(encoders.forces(np.broadcast_to(unexplained, correction.shape)))
+        own = np.abs(encoders.forces(np.full(correction.shape, unexplained)))
         pushed = np.maximum(np.abs(encoders.forces(correction + feedforward)), own)
         self._count_stationary_cycles((steps != 0.0) & valid, pushed)
         self._count_unchanged((steps == 0.0) & valid, velocity)

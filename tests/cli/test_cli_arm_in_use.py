@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.conftest import Ident
+from cli.conftest import COARSE, Ident, quick_arm
 from helpers.tickets import write_checked_ticket
 
 from drivers.arm import Arm
@@ -29,11 +29,12 @@ def test_an_arm_that_moves_is_neither_checked_nor_watched(ident: Ident, state: P
 
 
 @pytest.mark.slow
-def test_a_run_of_an_arm_that_another_process_has_leaves_no_folder(ident: Ident, state: Path) -> None:
+def test_a_run_of_an_arm_that_another_process_has_leaves_no_folder(ident: Ident, state: Path, tmp_path: Path) -> None:
+    arm = quick_arm(tmp_path, *COARSE)
     state.mkdir(mode=0o700)
-    write_checked_ticket(load_arm("planar2"), state)
+    write_checked_ticket(load_arm(arm), state)
     with ControlFile.take(control_path(state, "planar2"), None) as mover:
-        pid, ended = mover.pid, ident("run", "planar2")
+        pid, ended = mover.pid, ident("run", arm)
     assert ended.code == 1
     assert f"in use by process {pid}" in ended.err
     assert "recording" not in ended.err

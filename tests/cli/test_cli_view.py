@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from cli.conftest import Commissioned, Ident
-from rerun.chunk import McapReader, RrdReader
 from scipy.spatial.transform import Rotation
 
 from ident_service.config.kinematics import Kinematics
@@ -47,6 +46,8 @@ URDF = """<robot name="two">
 
 def columns(path: Path) -> dict[str, dict[str, Any]]:
     """Per entity what was sent over time, by the last part of a component's name, and `time` [s]."""
+    from rerun.chunk import RrdReader  # loads for most of a second
+
     found: dict[str, dict[str, Any]] = {}
     for chunk in RrdReader(path).stream():
         batch, entity = chunk.to_record_batch(), found.setdefault(str(chunk.entity_path), {})
@@ -183,6 +184,8 @@ def test_another_arms_urdf_is_refused(tmp_path: Path) -> None:
 
 
 def test_rerun_reads_the_recording_itself(quick: Commissioned) -> None:
+    from rerun.chunk import McapReader
+
     rows: dict[str, int] = {}
     for chunk in McapReader(quick.folder / "validation.mcap").stream():
         rows[str(chunk.entity_path)] = rows.get(str(chunk.entity_path), 0) + chunk.num_rows

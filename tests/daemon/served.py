@@ -80,6 +80,13 @@ class Reached:
 
 
 @contextmanager
+def daemon_thread(state: Path) -> Iterator[IdentClient]:
+    """Yield a client of the owner of a daemon in this process, where the daemon's own is not what is tested."""
+    with listening(state) as reached, IdentClient(reached.url, reached.token) as client:
+        yield client
+
+
+@contextmanager
 def listening(state: Path) -> Iterator[Reached]:
     """A service on a state folder and a free port of this machine."""
     link = socket.socket()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from daemon.conftest import checked_before, patient_text, quick_text
-from daemon.served import daemon_process
+from daemon.served import daemon_process, daemon_thread
 from daemon.verbs_bench import unstable_text
 
 from ident_service import errors
@@ -56,7 +56,7 @@ def client(state: Path) -> Iterator[IdentClient]:
     """A daemon with two arms that were checked: `quick`, and `patient`, whose motion outlasts a test."""
     for text in (quick_text(), patient_text("patient")):
         checked_before(state, text)
-    with daemon_process(state) as (_, client):
+    with daemon_thread(state) as client:
         client.add_arm(quick_text())
         client.add_arm(patient_text("patient"))
         yield client
@@ -204,7 +204,8 @@ def test_a_motion_that_is_refused_raises_at_the_end_of_its_block(client: IdentCl
 
 @pytest.mark.timeout(300)
 def test_a_motion_that_ends_in_a_fault_raises_it(client: IdentClient, state: Path) -> None:
-    text = patient_text("faulty").replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 100}]\n", 1)
+    # Later than its preflight ends, and in the midst of its motion.
+    text = quick_text("faulty", 8).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)
     assert "faults" in text
     checked_before(state, text)
     client.add_arm(text)

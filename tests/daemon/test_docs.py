@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from daemon.conftest import Asked, quick_text
-from daemon.served import daemon_process
+from daemon.served import daemon_thread
 from daemon.test_uploads import COLUMNS
 from daemon.test_uploads import table as table
 from standardwebhooks.webhooks import Webhook
@@ -99,7 +99,7 @@ def test_the_programs_run(
     headers["webhook-signature"] = Webhook(secret).sign("msg_1", now, body)
     programs = blocks("programming.md", "python")
     assert len(programs) == 6
-    with daemon_process(state) as (_, client):
+    with daemon_thread(state) as client:
         client.add_arm(quick_text())
         token = (state / "token").read_text().strip()
         names: dict[str, Any] = {"url": client.url, "token": token}

@@ -186,7 +186,7 @@ def test_crumbs_and_bodies_of_strangers_delay_no_stop(state: Path) -> None:
 
         def crumble() -> None:
             with ExitStack() as lines:
-                opened = [lines.enter_context(socket.create_connection(place, 60)) for _ in range(60)]
+                opened = [lines.enter_context(socket.create_connection(place, 60)) for _ in range(12)]
                 for line in opened:
                     line.setblocking(False)
                 sent = dict.fromkeys(opened, 0)
@@ -203,9 +203,9 @@ def test_crumbs_and_bodies_of_strangers_delay_no_stop(state: Path) -> None:
         attack = [threading.Thread(target=one, daemon=True) for one in (crumble, flood)]
         for one in attack:
             one.start()
-        time.sleep(2.0)
+        time.sleep(0.5)
         took = []
-        for _ in range(5):
+        for _ in range(3):
             began = time.monotonic()
             assert httpx.post(f"{client.url}/api/v1/stop", timeout=60).status_code == 200
             took.append(time.monotonic() - began)

@@ -141,7 +141,7 @@ def _statuses(daemon: Asked, operation: Any, examples: int) -> set[int]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("examples", [4, pytest.param(40, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("examples", [2, pytest.param(40, marks=pytest.mark.campaign)])
 def test_no_request_makes_the_service_fail(daemon: Asked, monkeypatch: pytest.MonkeyPatch, examples: int) -> None:
     # What is asked for is taken and queued; that the queue runs it is another test's.
     monkeypatch.setattr(daemon.service.engine, "_look", lambda: None)

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 from cli.hands import Hands
 from daemon.conftest import checked_before, patient_text, quick_text
-from daemon.served import daemon_process, listening
+from daemon.served import daemon_thread
 from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
@@ -183,7 +183,7 @@ def served(state: Path, commissioned: Path) -> Iterator[tuple[IdentClient, list[
     for run in (RUN, RUN.replace("0101", "0102")):
         shutil.copytree(commissioned, state / "runs" / run)
     singular_copy(commissioned, state / "runs" / SINGULAR)
-    with daemon_process(state) as (_, client):
+    with daemon_thread(state) as client:
         for body in ({"description": quick_text()}, on_a_bus()):
             client.post("/api/v1/arms", body)
         until = time.monotonic() + 30.0
@@ -297,7 +297,7 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
     for text in texts.values():
         checked_before(state, text)
     # The lease of a rehearsal is a quarter of a second, and on a busy machine the next renewal comes later.
-    with listening(state) as reached, IdentClient(reached.url, reached.token) as client:
+    with daemon_thread(state) as client:
         server = ["--server", client.url, "--state", str(state)]
         for text in texts.values():
             client.post("/api/v1/arms", {"description": text})
@@ -331,7 +331,7 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
 def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
     state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with daemon_process(state) as (_, client):
+    with daemon_thread(state) as client:
         server = ["--server", client.url, "--state", str(state)]
         client.add_arm(quick_text())
         client.add_arm(unstable_text().replace("name: quick", "name: unstable"))
@@ -363,7 +363,7 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
 def test_what_is_no_file_here_is_reported_and_files_of_a_description_are_sent(
     state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with daemon_process(state) as (_, client):
+    with daemon_thread(state) as client:
         server = ["--server", client.url, "--state", str(state)]
         for words in (
             ["identify", "monday.csv", "--arm", "planar2"],

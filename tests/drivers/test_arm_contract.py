@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from contract_bench import BACKENDS, PERIOD_NS, canopen, pucks, relative_config
-from helpers.forks import fork_plants
+from helpers.forks import fork_processes
 
 from drivers.arm import StopKind
 from drivers.axis_status import TRIPPED, AxisStatus
@@ -19,7 +19,7 @@ STATUS_CYCLES = 60  # more than a drive may wait with its status report
 @pytest.fixture(autouse=True)
 def plants_are_forked(monkeypatch):
     """How a plant is started is tests/sim's; a process of its own it is here, too."""
-    fork_plants(monkeypatch)
+    fork_processes(monkeypatch)
 
 
 @pytest.fixture(params=sorted(BACKENDS))

@@ -94,7 +94,7 @@ def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
 def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -> None:
     """Soft gains: friction moves the arm farther off than it may be, wherever it moves at all."""
     soft = {name: {"kp": 2.0, "kd": 1.0, "following_error": 0.02} for name in ("shoulder", "elbow")}
-    model = small(joints=soft)
+    model = small(joints=soft, control={"rate": 100.0})
     path = excitation(model, "identification").path
     limits = motion_limits(model.config)
     found = violations(proof_of(path, model, limits, CollisionModel(model)), model, limits)
@@ -236,7 +236,8 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
 def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     """An elbow too soft to move: with the gains, which are stable at this rate, it moves freely."""
     weak = {"elbow": {"kp": 40.0, "kd": 12.0, "following_error": 0.15}}
-    soft = small(joints=weak)
+    slower = {"control": {"rate": 125.0}}
+    soft = small(joints=weak, **slower)
     limits = motion_limits(soft.config)
 
     def stable(kp: np.ndarray, kd: np.ndarray) -> bool:
@@ -246,7 +247,7 @@ def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     told = [line for line in before.binding if line.startswith("elbow")]
     (proposed,) = re.findall(r"with kp ([0-9.]+) and kd ([0-9.]+) it would follow at its velocity", "; ".join(told))
     weak["elbow"] |= {"kp": float(proposed[0]), "kd": float(proposed[1])}
-    after = design_motion(small(joints=weak), quick(), budget=ONE_START)
+    after = design_motion(small(joints=weak, **slower), quick(), budget=ONE_START)
     slow, fast = (one.proof.demands.velocity[1] for one in (before, after))
     assert fast > max(2.0 * slow, 0.3 * limits.velocity[1])
 

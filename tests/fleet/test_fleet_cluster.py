@@ -13,22 +13,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import fsspec
 import numpy as np
-import pandas as pd
-import polars as pl
 import pytest
-from distributed import Client, LocalCluster
 from helpers.fleets import BEGIN, WEEK, Kind, kind, write_recording
-from moto.server import ThreadedMotoServer
 
 from ident_service.certificate_verifier import verify_path
 from ident_service.cli import main
 from ident_service.errors import Unavailable
 from ident_service.fleet.identify import identify_fleet
 from ident_service.fleet.reduction import FleetRequest, in_order, result_of
+
+# These load for two seconds where they are used, and not where tests are only collected.
+if TYPE_CHECKING:
+    from distributed import LocalCluster
 
 pytestmark = [
     pytest.mark.slow,
@@ -64,6 +63,8 @@ def folder(usual: Kind, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def endpoint() -> Iterator[str]:
     """Address of an S3 server of this process."""
+    from moto.server import ThreadedMotoServer
+
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     _, port = server.get_host_and_port()
@@ -76,6 +77,8 @@ KEYS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAU
 
 @pytest.fixture(scope="module")
 def cluster(endpoint: str) -> Iterator[LocalCluster]:
+    from distributed import LocalCluster
+
     with LocalCluster(
         n_workers=2,
         threads_per_worker=1,
@@ -150,6 +153,9 @@ def test_a_fleet_is_identified_and_the_changed_arm_found(fleet: Run, folder: Pat
     assert main(["compare", str(out / "arms" / "arm0"), str(out / "arms" / "arm1")]) in (0, 3)
 
     rows = ARMS * (RECORDINGS + 1) * usual.base.size
+    import pandas as pd
+    import polars as pl
+
     table, other = pd.read_parquet(out / "parameters.parquet"), pl.read_parquet(out / "parameters.parquet")
     assert len(table) == len(other) == rows
     assert list(table.columns) == other.columns
@@ -239,6 +245,8 @@ def undisturbed(cluster: LocalCluster, folder: Path, tmp_path_factory: pytest.Te
 def test_killed_workers_change_nothing(
     fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
+    from distributed import Client
+
     pattern = str(folder / "arm[01]" / "*.mcap")
     stop, killed = threading.Event(), []
 
@@ -277,6 +285,8 @@ def _allow(failures: int, dask_scheduler: Any = None) -> None:
 
 def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
     """After one try here, after four as a rule."""
+    from distributed import Client
+
     with Client(cluster, set_as_default=False) as client:
         client.wait_for_workers(2)
         client.run_on_scheduler(_allow, 0)
@@ -314,6 +324,8 @@ def test_after_a_killed_client_the_next_call_goes_on(
 def test_recordings_and_store_on_s3(
     fleet: Run, endpoint: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import fsspec
+
     for name, value in KEYS.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setitem(fsspec.config.conf, "s3", {"endpoint_url": endpoint})

@@ -299,7 +299,7 @@ _QUIET = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 def test_a_spoiled_file_is_read_or_refused(readers: dict[str, Reader], kind: str) -> None:
     # A process reads each MJCF.
     @given(seed=st.integers(0, 2**32 - 1))
-    @settings(max_examples=3 if kind == "mjcf" else 15, deadline=None, suppress_health_check=_QUIET)
+    @settings(max_examples=3 if kind == "mjcf" else 8, deadline=None, suppress_health_check=_QUIET)
     def each(seed: int) -> None:
         spoil, read = readers[kind]
         read_apart(spoil(random.Random(seed), False), read)  # noqa: S311

@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
+import atexit
+import concurrent.futures.thread
+import contextvars
+import faulthandler
+import fcntl
 import gc
+import importlib.util
+import logging
+import multiprocessing.process
+import multiprocessing.resource_tracker
+import multiprocessing.util
 import os
 import signal
+import sqlite3
 import subprocess
-import time
+import sys
+import threading
+import traceback
+import types
 import warnings
+import weakref
 from collections.abc import Sequence
-from types import SimpleNamespace
-from typing import Any
+from pathlib import Path
+from typing import Any, Final, NoReturn
 
 import pytest
+
+# What our own code starts by `-m`. Not there: processes that limit their memory, which this one may have taken already.
+PROGRAMS: Final = frozenset(
+    {
+        "ident_service",
+        "ident_service.motion.process",
+        "ident_service.operations.target_process",
+        "ident_service.recordings.recorder_main",
+        "drivers.can.frame_log_process",
+        "sim_backend.plant_process",
+    }
+)
+_parents: list[object] = []  # in a fork
+_PYTHON: Final = sys.executable  # where a test names another one, that one is started
 
 
 def fork() -> int:
@@ -26,46 +55,149 @@ def fork() -> int:
     return child
 
 
-class ForkedPlant:
-    """Stand in for `subprocess.Popen` of a plant process: the same program with its modules already imported."""
+class ForkedProcess(subprocess.Popen[Any]):
+    """`subprocess.Popen`, whose children that run one of `PROGRAMS` by `-m` have all modules imported already.
 
-    def __init__(self, command: Sequence[str], *, pass_fds: Sequence[int], **options: Any) -> None:
-        from sim_backend import plant_process
+    Such a child is a process like any other, with the descriptors, folder, environment, session and signals that it
+    would have, and so are its own children; it has not spent half a second on an interpreter and its imports. It has
+    this process' command line in `/proc`, and what a test has put in the place of functions is there as well.
+    """
 
-        assert command[-1] == plant_process.__name__
-        assert options["start_new_session"]
-        hears, tells = os.pipe(), os.pipe()
+    def _execute_child(self, args: Any, *rest: Any) -> None:
+        # Since Python 3.11: executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags, shell,
+        # six ends of pipes, restore_signals, gid, gids, uid, umask, start_new_session, process_group.
+        words = [] if isinstance(args, str | bytes | os.PathLike) else [os.fsdecode(word) for word in args]
+        if words[:1] == [_PYTHON]:
+            begin = 2 if words[1:2] == ["-P"] else 1
+            usual = rest[:2] == (None, None) and rest[2] and not rest[8] and rest[16:20] == (None, None, None, -1)
+            module = words[begin + 1 : begin + 3] if words[begin : begin + 1] == ["-m"] else []
+            if usual and rest[21] == -1 and module[:1] and module[0] in PROGRAMS and module[1:] != ["serve"]:
+                self._fork(words[begin + 1 :], *rest)
+                return
+        super()._execute_child(args, *rest)  # type: ignore[misc]
+
+    def _fork(self, words: list[str], *rest: Any) -> None:
+        pass_fds, cwd, env, ends, own_session = rest[3], rest[4], rest[5], rest[9:15], rest[20]
+        environment = None if env is None else {os.fsdecode(name): os.fsdecode(value) for name, value in env.items()}
+        if cwd is not None:
+            Path(cwd).stat()  # a folder that is not there is the caller's error
+        ready, prepared = os.pipe()
         self.pid = fork()
         if self.pid == 0:
-            code = 1
             try:
-                os.setsid()
-                os.dup2(hears[0], 0)
-                os.dup2(tells[1], 1)
-                kept = sorted(pass_fds)
-                for first, last in zip([3, *(fd + 1 for fd in kept)], [*kept, os.sysconf("SC_OPEN_MAX")], strict=True):
-                    os.closerange(first, last)  # a connection of the parent's must not outlive it
-                code = plant_process.main()
+                if own_session:
+                    os.setsid()
+                if cwd is not None:
+                    os.chdir(cwd)
+                _keep_only(ends[0], ends[3], ends[5], (*pass_fds, prepared))
+                _forget_the_parent(environment)
+                os.close(prepared)
+                contextvars.Context().run(_be, *words)
             finally:
-                os._exit(code)
-        os.close(hears[0])
-        os.close(tells[1])
-        self.stdin, self.stdout = os.fdopen(hears[1], "wb"), os.fdopen(tells[0], "rb")
-
-    def wait(self, timeout: float) -> None:
-        """Wait for its end; TimeoutExpired where it does not come."""
-        end = time.monotonic() + timeout
-        while os.waitpid(self.pid, os.WNOHANG) == (0, 0):
-            if time.monotonic() > end:
-                raise subprocess.TimeoutExpired("plant", timeout)
-            time.sleep(0.001)
-
-    def kill(self) -> None:
-        """Kill it."""
-        os.kill(self.pid, signal.SIGKILL)
+                os._exit(255)
+        os.close(prepared)
+        with os.fdopen(ready, "rb") as told:
+            told.read()  # its end: now it has its own session, descriptors and signals, as after `exec`
+        self._child_created = True
+        self._close_pipe_fds(*ends)  # type: ignore[attr-defined]
 
 
-def fork_plants(patch: pytest.MonkeyPatch) -> None:
-    """Have plants of their own process forked from this one."""
-    processes = SimpleNamespace(Popen=ForkedPlant, PIPE=subprocess.PIPE, TimeoutExpired=subprocess.TimeoutExpired)
-    patch.setattr("sim_backend.remote_arm.subprocess", processes)
+def _keep_only(stdin: int, stdout: int, stderr: int, others: Sequence[int]) -> None:
+    """Have these three descriptors as 0, 1, 2 (-1: as they are) and of all others only those that are passed on."""
+    copies = [-1 if fd == -1 else fcntl.fcntl(fd, fcntl.F_DUPFD, 3) for fd in (stdin, stdout, stderr)]
+    for number, fd in enumerate(copies):
+        if fd != -1:
+            os.dup2(fd, number)
+    kept = sorted(others)
+    for first, last in zip([3, *(fd + 1 for fd in kept)], [*kept, os.sysconf("SC_OPEN_MAX")], strict=True):
+        os.closerange(first, last)
+
+
+def _forget_the_parent(environment: dict[str, str] | None) -> None:
+    """Put back what a new interpreter begins with: signals, streams, warnings, hooks, what is done at the end."""
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    signal.set_wakeup_fd(-1)
+    faulthandler.disable()
+    # What the parent's objects do at their end or at the interpreter's is the parent's to do; they stay, as the numbers
+    # of the files that they would close are other files' now.
+    atexit._clear()
+    registries: tuple[Any, ...] = (
+        weakref.finalize._registry,  # type: ignore[attr-defined]
+        concurrent.futures.thread._threads_queues,  # type: ignore[attr-defined]
+    )
+    _parents.extend([*map(dict, registries), sys.stdin, sys.stdout, sys.stderr, sys.__stdin__, sys.__stdout__])
+    _parents.extend([sys.__stderr__, sys.modules["__main__"], *logging.root.handlers])
+    for registry in registries:
+        registry.clear()
+    weakref.finalize._registered_with_atexit = False  # type: ignore[attr-defined]
+    multiprocessing.process._children.clear()  # type: ignore[attr-defined]
+    multiprocessing.util._finalizer_registry.clear()  # type: ignore[attr-defined]
+    atexit.register(multiprocessing.util._exit_function)
+    tracker = multiprocessing.resource_tracker._resource_tracker
+    tracker._fd = tracker._pid = None  # type: ignore[attr-defined]
+    if environment is not None:
+        os.environ.clear()
+        os.environ.update(environment)
+    for number, name, mode, errors in (
+        (0, "stdin", "r", "strict"),
+        (1, "stdout", "w", "strict"),
+        (2, "stderr", "w", "backslashreplace"),
+    ):
+        stream = open(number, mode, encoding="utf-8", errors=errors, closefd=False)  # noqa: SIM115
+        stream.reconfigure(line_buffering=number == 2 or stream.isatty())
+        setattr(sys, name, stream)
+        setattr(sys, f"__{name}__", stream)
+    warnings.resetwarnings()
+    for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+        warnings.simplefilter("ignore", kind)
+    # SQLite knows in each process which files that has locked, and a fork would believe to have the parent's locks.
+    sqlite3.connect = _no_registry
+    sys.excepthook, sys.unraisablehook = sys.__excepthook__, sys.__unraisablehook__
+    threading.excepthook = threading.__excepthook__
+    for handler in list(logging.root.handlers):
+        logging.root.removeHandler(handler)
+    logging.root.setLevel(logging.WARNING)
+    gc.enable()
+
+
+def _no_registry(*_: object, **__: object) -> NoReturn:
+    raise AssertionError("a program that opens the registry is to be started, not forked: tests/conftest.py")
+
+
+def _be(program: str, *words: str) -> NoReturn:
+    """Run a module as `python -m` does, and end."""
+    spec = importlib.util.find_spec(program)
+    if spec is not None and spec.submodule_search_locations is not None:
+        spec = importlib.util.find_spec(f"{program}.__main__")
+    assert spec is not None
+    assert spec.origin is not None
+    main = types.ModuleType("__main__")
+    main.__file__, main.__spec__ = spec.origin, spec
+    sys.modules["__main__"] = main
+    sys.argv = [spec.origin, *words]
+    code = 0
+    try:
+        exec(spec.loader.get_code(spec.name), main.__dict__)  # type: ignore[union-attr]  # noqa: S102
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        os.kill(os.getpid(), signal.SIGINT)
+    except BaseException:  # noqa: BLE001 - whatever it is, an interpreter ends with its traceback
+        traceback.print_exc()
+        code = 1
+    threading._shutdown()  # type: ignore[attr-defined]
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            code = 120
+    os._exit(code)
+
+
+def fork_processes(patch: pytest.MonkeyPatch) -> None:
+    """Have our own programs that are started from here forked from this process."""
+    patch.setattr(subprocess, "Popen", ForkedProcess)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from flight_bench import LIMIT, Flight, Flown, check_of, verdicts
-from helpers.forks import fork_plants
+from helpers.forks import fork_processes
 from motion.motion_bench import PRIOR, TRUTH
 
 from drivers.arm import Sample
@@ -120,7 +120,7 @@ def test_the_ticket_is_stamped_by_the_clock_it_is_given(good: Flown) -> None:
 
 @pytest.mark.slow
 def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act(monkeypatch: pytest.MonkeyPatch) -> None:
-    fork_plants(monkeypatch)
+    fork_processes(monkeypatch)
     driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5, "process": "separate"}
     flight = Flight(changes={"driver": driver})
     ticket = preflight(

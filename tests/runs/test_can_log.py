@@ -58,11 +58,13 @@ def test_every_frame_of_a_run_is_in_its_folder(
 
 
 @pytest.mark.slow
-def test_it_is_refused_where_nothing_moves_or_no_frames_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_refused_where_nothing_moves_or_no_frames_are(
+    virtual_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     state = ["--state", str(tmp_path / "state")]
     assert main(["recover", "planar2", "--can-log", *state]) == USAGE
     assert "--can-log is for --leave-limit" in capsys.readouterr().err
     # The simulated arm has no fieldbus: said by the motion process, before it is opened.
-    write_checked_ticket(load_arm("planar2"), tmp_path / "state")
-    assert main(["run", "planar2", "--can-log", "--out", str(tmp_path / "run"), *state]) == FAILED
+    write_checked_ticket(load_arm(virtual_arm), tmp_path / "state")
+    assert main(["run", str(virtual_arm), "--can-log", "--out", str(tmp_path / "run"), *state]) == FAILED
     assert "no fieldbus whose frames could be logged" in capsys.readouterr().err

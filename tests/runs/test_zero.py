@@ -46,7 +46,7 @@ def written(folder: Path, homes: tuple[float | None, ...] = (0.3, -0.2), **drive
     tree = {
         "extends": str(planar),
         "name": "drives2",
-        "control": {"rate": 500, "velocity_cutoff": 30},
+        "control": {"rate": 250, "velocity_cutoff": 30},
         "joints": {joint: GAINS | {"home": home} for joint, home in zip(("shoulder", "elbow"), homes, strict=True)},
         "transmission": GEARS,
         "driver": section | driver,

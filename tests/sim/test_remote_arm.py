@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from helpers.forks import fork_plants
+from helpers.forks import fork_processes
 from remote_bench import listening, remote_config, wait_for
 
 from drivers.arm import StopKind
@@ -37,7 +37,7 @@ def local(config: ArmConfig) -> ArmConfig:
 
 @pytest.fixture(autouse=True)
 def plants_are_forked(monkeypatch):
-    fork_plants(monkeypatch)
+    fork_processes(monkeypatch)
 
 
 def forgotten(arm):
