@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -275,7 +276,7 @@ class Ticket:
             if getattr(mine, key) != getattr(theirs, key) and not (no_motion and key == "excitation_sha256"):
                 found.append(f"{what} has changed since")
         if mine.identities != theirs.identities:
-            found.append("the drives are not those that were checked")
+            found.append(f"the drives are not those that were checked{_difference(mine.identities, theirs.identities)}")
         for was, now_is in ((mine.driver, theirs.driver), (mine.software, theirs.software)):
             found += [f"it was made with {was or 'no driver'}, not with {now_is or 'none'}"] if was != now_is else []
         return found
@@ -295,6 +296,17 @@ class Ticket:
     def to_json(self) -> str:
         """Return the ticket as one JSON object, the inverse of `ticket_from_json`."""
         return json.dumps(ticket_values(self), indent=1, allow_nan=False)
+
+
+def _difference(checked: Sequence[str], found: Sequence[str]) -> str:
+    """Describe the first axis whose drive reports something else than it did when it was checked; or nothing."""
+    for axis, (was, now) in enumerate(zip(checked, found, strict=False), 1):
+        if was != now:
+            before, after = re.split("[,;] ", was), re.split("[,;] ", now)
+            gone = ", ".join(part for part in before if part not in after) or "less"
+            new = ", ".join(part for part in after if part not in before) or "less"
+            return f" (axis {axis}: {gone} then, {new} now)"
+    return ""
 
 
 def subject_of(model: ArmModel, excitation: Excitation | None, described: ArmDescription | None) -> Subject:

@@ -118,8 +118,9 @@ def test_a_path_home_asks_for_nothing_that_is_about_the_motion(code: str) -> Non
 def test_a_path_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
     home = subject_of(MODEL, None, ARM)
     assert f"failed: {check.code}" in ticket(check).valid_for(home, later())[0]
-    assert "the drives are not those that were checked" in ticket().valid_for(
-        subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3"))), later()
+    others = subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3")))
+    assert "the drives are not those that were checked (axis 2: b 2 then, b 3 now)" in ticket().valid_for(
+        others, later()
     )
     assert "expired" in ticket().valid_for(home, later(minutes=15))[0]
 
