@@ -37,7 +37,7 @@ from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Histogram
-from ident_service.motion.realtime import asked
+from ident_service.motion.realtime import temporary_privileges
 from ident_service.motion.trajectory import rest
 from sim_backend.emulator.build import build_emulator
 
@@ -128,7 +128,7 @@ def across_processes(rate: int, interface: str, seconds: float) -> tuple[list[Ro
     with tempfile.TemporaryDirectory() as folder:
         path = described(Path(folder), rate, bus)
         config = load_arm(path)
-        with _drives(path), asked():
+        with _drives(path), temporary_privileges():
             try:
                 stamps, last, valid, lost = _held(config, round(seconds * rate))
             except DriverError as error:

@@ -41,7 +41,7 @@ def measure(model: ArmModel) -> list[Row]:
     home = reference.at(0.0).position
     dynamics = InverseDynamics(model.chain, model.layout, prior)
     owed = frozen_encoder_observer(dynamics, model, limits, period, steps)
-    guard = SafetyMonitor(model.chain.names, limits, period, home, contact=Contact(model), owed=owed)
+    guard = SafetyMonitor(model.chain.names, limits, period, home, contact=Contact(model), encoder_observer=owed)
     control = ComputedTorque(dynamics, limits, period, 30.0, home)
     deadlines = Deadlines(guard.findings, period)
     valid, age = np.ones(7, dtype=bool), np.zeros(7, dtype=np.int64)

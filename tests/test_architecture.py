@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import importlib
 import json
+import pkgutil
 import re
 import subprocess
 import sys
@@ -243,6 +245,21 @@ def test_scripts_of_others_stand_in_one_place_with_version_licence_and_checksum(
         if (package or place) not in {"vendored", package_of(file), *MAY_IMPORT[package_of(file)]}
     ]
     assert foreign == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["benchmarks", "tools"])
+def test_what_benchmarks_and_tools_import_of_ours_is_there(folder: str) -> None:
+    """No other test runs them."""
+    ours, missing = {"benchmarks", "drivers", "ident_service", "sim_backend"}, []
+    for path in sorted((ROOT / folder).glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ours:
+                module = importlib.import_module(str(node.module))
+                inside = {one.name for one in pkgutil.iter_modules(getattr(module, "__path__", ()))}
+                names = {one.name for one in node.names if not hasattr(module, one.name)} - inside
+                missing += [f"{path.name}: {node.module}.{name}" for name in sorted(names)]
+    assert missing == []
 
 
 def test_every_file_is_short_enough_to_read() -> None:
