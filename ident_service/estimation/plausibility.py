@@ -39,7 +39,8 @@ _JUMP = 20.0  # times the usual step between samples
 _LEAST_JUMP = 0.02  # rad or m
 _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
-_JOINTS_WITH_SIGN = 4  # moving joints of which gravity and friction turn the torque of at least one round
+# Gravity alone may hold a torque on one side of zero, but seldom of so many joints at almost nothing.
+_JOINTS_WITH_SIGN, _NEARLY_NOTHING = 4, 0.01  # and share of a joint's largest torque
 _AT_REST = 0.9  # share of the time at standstill from which a joint need not feel a changing torque
 
 
@@ -311,9 +312,10 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
 
 
 def _without_sign(joints: Sequence[JointQuality]) -> Iterator[str]:
-    """Yield a reason where no torque of many joints that move changes its sign, as of a current's magnitude."""
+    """Yield a reason where torques of many joints come down to zero and turn round there, as magnitudes do."""
     moving = [seen for seen in joints if seen.standstill < _AT_REST and not torque_missing(seen)]
-    if len(moving) >= _JOINTS_WITH_SIGN and all(seen.torque[0] >= 0.0 for seen in moving):
+    turning = [seen for seen in moving if seen.torque[0] <= _NEARLY_NOTHING * seen.torque[1]]
+    if len(turning) >= _JOINTS_WITH_SIGN and all(seen.torque[0] >= 0.0 for seen in moving):
         yield "no joint's torque is ever negative: were magnitudes recorded? The model needs their signs"
 
 

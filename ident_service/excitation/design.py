@@ -151,7 +151,7 @@ class Attempt:
 
 
 class Prover:
-    """Proofs for one task."""
+    """Prove motions that a search has found, and search on, or shrink them, where not everything can be proven."""
 
     def __init__(
         self,
@@ -163,7 +163,7 @@ class Prover:
         veto: Callable[[FourierPath | PosturePath], str | None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take an arm.
+        """Hold the arm and the search whose motions are to be proven.
 
         Args:
             model: of the arm.

@@ -303,9 +303,9 @@ def _difference(checked: Sequence[str], found: Sequence[str]) -> str:
     for axis, (was, now) in enumerate(zip(checked, found, strict=False), 1):
         if was != now:
             before, after = re.split("[,;] ", was), re.split("[,;] ", now)
-            gone = ", ".join(part for part in before if part not in after) or "less"
-            new = ", ".join(part for part in after if part not in before) or "less"
-            return f" (axis {axis}: {gone} then, {new} now)"
+            parts = [f"no longer {part}" for part in before if part not in after]
+            parts += [f"now {part}" for part in after if part not in before]
+            return f" (axis {axis}: {', '.join(parts)})"
     return ""
 
 

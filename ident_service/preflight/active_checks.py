@@ -470,7 +470,7 @@ def gravity_check(
     """Compare the torque that held the arm with the model's gravity torque.
 
     Args:
-        held: `held_torque` [N m or N], shape (joints,).
+        held: `holding_torque` [N m or N], shape (joints,).
         gravity: the model's torque there, likewise.
         model: of the arm.
         limits: of the arm.

@@ -17,8 +17,8 @@ from ident_service.operations.arm_checks import write_ticket
 from ident_service.preflight.preflight import preflight
 from ident_service.registry.state_folder import ticket_path
 
+# It makes the folder that the workers share; `tests/conftest.py` sets it.
 factory: pytest.TempPathFactory | None = None
-"""Of the tests' temporary folders, one of which the workers share (`tests/conftest.py`)."""
 
 
 def _on_its_support(config: ArmConfig) -> ArmConfig:

@@ -119,7 +119,7 @@ def test_a_path_home_asks_for_all_that_is_about_the_arm(check: Check) -> None:
     home = subject_of(MODEL, None, ARM)
     assert f"failed: {check.code}" in ticket(check).valid_for(home, later())[0]
     others = subject_of(MODEL, None, replace(ARM, identities=("a 1", "b 3")))
-    assert "the drives are not those that were checked (axis 2: b 2 then, b 3 now)" in ticket().valid_for(
+    assert "the drives are not those that were checked (axis 2: no longer b 2, now b 3)" in ticket().valid_for(
         others, later()
     )
     assert "expired" in ticket().valid_for(home, later(minutes=15))[0]

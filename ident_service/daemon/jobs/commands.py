@@ -276,31 +276,31 @@ def _judgement(db: Database, state: Path, request: Judge) -> Command:
     return Command((*words, *_common_options(state)), request.arm, False, request.run, (), LEASE_SECONDS)
 
 
-def _recordings(db: Database, state: Path, request: Sequence[RecordingReference]) -> list[str]:
-    return [f"{_recording(db, state, one)}{range_words(one)}" for one in request]
+def _recordings(db: Database, state: Path, references: Sequence[RecordingReference]) -> list[str]:
+    return [f"{_recording(db, state, one)}{range_words(one)}" for one in references]
 
 
 def _recording(db: Database, state: Path, one: RecordingReference) -> Path:
     return run_file(db, state, one.run, one.name or recording_name(db, one.run))
 
 
-def _as_described(db: Database, state: Path, request: Sequence[RecordingReference]) -> list[str]:
+def _as_described(db: Database, state: Path, references: Sequence[RecordingReference]) -> list[str]:
     """Return paths as `_recordings` does, for commands that take no columns file.
 
     Raises:
         UsageError: a recording came with one.
     """
-    if _columns(db, state, request):
+    if _columns(db, state, references):
         raise UsageError(
             "a recording that came with a columns file can be identified from only; for this, say how its "
             "columns are laid out in the arm's description, and upload it without"
         )
-    return _recordings(db, state, request)
+    return _recordings(db, state, references)
 
 
-def _columns(db: Database, state: Path, request: Sequence[RecordingReference]) -> list[str]:
+def _columns(db: Database, state: Path, references: Sequence[RecordingReference]) -> list[str]:
     """Return `--columns` options for the uploaded recordings that came with a columns file."""
-    files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in request}
+    files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in references}
     return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 
