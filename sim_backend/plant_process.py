@@ -330,11 +330,12 @@ class PlantProcess:
         )
 
     def _silent_period(self) -> None:
-        self._machine.hold()
-        self._advance(silent=True)
         machine = self._machine
+        stopped = machine.watchdog_expired  # the period in which it expires is not yet one of rest
+        machine.hold()
+        self._advance(silent=True)
         slow = bool((np.abs(machine.plant.velocity) <= REST_SPEED).all())
-        self._quiet = self._quiet + 1 if slow and machine.watchdog_expired else 0
+        self._quiet = self._quiet + 1 if slow and stopped else 0
         if self._story.state is not PlantState.SETTLING:
             return
         self._abandoned += 1

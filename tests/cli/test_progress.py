@@ -26,17 +26,39 @@ from ident_service.config.load import load_arm
 PROGRAM = (
     "import sys; from ident_service.cli import main, progress as p; p.AFTER, p._EVERY = 0.05, {every}; sys.exit(main())"
 )
+# The same, waiting after each step until the bar has shown it: steps may be shorter than the time between two pictures.
+SHOWS_EACH_STEP = """
+import sys, threading
+from rich.progress import Progress
+from ident_service.cli import main, progress as p
+p.AFTER, p._EVERY = 0.0, {every}
+step, update, drawn = p.ProgressBar.step, Progress.update, threading.Condition()
+shown = set()
+def drawing(bar, task, **fields):
+    update(bar, task, **fields)
+    with drawn:
+        shown.add(fields["description"])
+        drawn.notify_all()
+def stepping(bar, words, *args, **kwargs):
+    step(bar, words, *args, **kwargs)
+    with drawn:
+        assert drawn.wait_for(lambda: words in shown, 60.0), words
+Progress.update, p.ProgressBar.step = drawing, stepping
+sys.exit(main())
+"""
 STYLE = re.compile(rb"\x1b\[[0-9;]*m")
 
 
 class Terminal:
     """A command in a terminal of 80 columns; its stderr may be a pipe instead."""
 
-    def __init__(self, *words: object, every: float = 0.05, piped: bool = False, **environment: str) -> None:
+    def __init__(
+        self, *words: object, every: float = 0.05, piped: bool = False, program: str = PROGRAM, **environment: str
+    ) -> None:
         self.master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM.format(every=every), *map(str, words)],
+            [sys.executable, "-c", program.format(every=every), *map(str, words)],
             stdin=slave,
             stdout=slave,
             stderr=subprocess.PIPE if piped else slave,
@@ -96,9 +118,9 @@ def test_a_time_is_reported_in_the_unit_that_fits() -> None:
 @pytest.mark.slow
 def test_a_terminal_shows_what_is_being_done_and_then_the_answer_alone(quick: Commissioned, tmp_path: Path) -> None:
     words = ("identify", quick.folder / "identification.mcap", "--arm", quick.arm, "--state", tmp_path)
-    terminal = Terminal(*words)
+    terminal = Terminal(*words, program=SHOWS_EACH_STEP)
     shown = terminal.read()
-    assert terminal.process.returncode == 0
+    assert terminal.process.returncode == 0, lines_of(shown)
     text = lines_of(shown)
     assert "choosing filter, delay and friction" in text
     assert re.search(r"about \d+ s left", text)

@@ -11,6 +11,7 @@ import pytest
 from remote_bench import Client, alive, ended, limits, listening, remote_config, wait_for
 
 from drivers.arm import StopKind
+from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from sim_backend.arm import from_config
 from sim_backend.plant_process import PATIENCE, REST_SPEED
@@ -112,6 +113,21 @@ def test_a_plant_nobody_moved_ends_at_once(tmp_path):
     assert status.state is PlantState.ENDED_AT_REST
     assert status.silent_time == 0.0
     assert not status.peak_velocity.any()
+
+
+def test_silence_lasts_as_long_as_the_watchdog_where_the_arm_stands(tmp_path):
+    path = tmp_path / "status"
+    config = remote_config(status=str(path), watchdog=WATCHDOG)
+    # Gravity along the axes, so that nothing moves a joint.
+    arm = from_config(ArmConfig.model_validate(config.model_dump() | {"gravity": (0.0, 0.0, -9.81)}))
+    arm.open()
+    arm.enable()
+    arm.exchange(np.zeros(2))
+    arm.end_plant()
+    status = read_status(path)
+    assert status.state is PlantState.ENDED_AT_REST
+    assert (status.silent_peak_velocity <= REST_SPEED).all()
+    assert WATCHDOG <= status.silent_time <= WATCHDOG + 2 * status.period
 
 
 def test_an_arm_that_is_forgotten_takes_its_plant_along():
