@@ -80,7 +80,7 @@ def together(cases: Sequence[Case]) -> list[Any]:
     return [pytest.param(group, id=name) for name, group in _groups(cases).items()]
 
 
-def in_runs(cases: Sequence[Case], most: int = 24) -> list[Any]:
+def in_runs(cases: Sequence[Case], most: int = 12) -> list[Any]:
     """All cases of a campaign, so many at most in branches of one run: most of the time goes to what leads to a fault.
 
     What fails is told by its case, which `keeps_its_promise` plays by itself.
