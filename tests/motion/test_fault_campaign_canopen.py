@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from campaign_bench import Case, Outcome, Strike, play, script_of, subject, windows
 from campaign_canopen import CANOPEN_PROMISES, FOREIGN, WIRE, EmulatedArm, of_joint
-from campaign_checks import in_runs, keep_their_promises, keeps_its_promise, together
+from campaign_checks import in_runs, keep_their_promises, together
 from test_fault_campaign import STATES
 
 from ident_service.motion.faults import FAULTS
@@ -26,9 +26,6 @@ from sim_backend.emulator.motor import Power
 
 SEED = 11
 DRIVES = {"bench canopen": 2, "bench positions": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
-# At the end of this stop j7 stands still against more than the friction guess, which is taken for a frozen encoder
-# (decision 0008). A stop that a person asks for in the same cycle ends so too.
-REMAINING = {"wam canopen-lost_status-exciting-0.64-None"}
 # Codes of faults that a drive, not the bus or the loop, tells.
 TOLD = {"drive_fault", "drive_emergency", "drive_silent", "drive_restarted", "drive_left", "feedback_gone"}
 
@@ -148,16 +145,9 @@ def campaign() -> list[Case]:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("some", in_runs([case for case in campaign() if str(case) not in REMAINING]))
+@pytest.mark.parametrize("some", in_runs(campaign()))
 def test_the_campaign(some: list[Case], tmp_path: Path) -> None:
     keep_their_promises(some, tmp_path, let_go)
-
-
-@pytest.mark.campaign
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
-@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in campaign() if str(case) in REMAINING])
-def test_what_is_known_to_fail_goes_on_failing_or_is_taken_off_the_list(case: Case, tmp_path: Path) -> None:
-    let_go(case, keeps_its_promise(case, tmp_path))
 
 
 def let_go(case: Case, outcome: Outcome) -> None:
