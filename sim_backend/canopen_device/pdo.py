@@ -260,7 +260,7 @@ class Pdos:
                 self._act(rpdo, data[:size])
 
     def sync(self) -> None:
-        """Process a SYNC: send synchronous TPDOs with present values, then let received torques act."""
+        """Process a SYNC: send synchronous TPDOs with present values; `act` follows."""
         self._synced_ns = self._node.now_ns
         if not self._active:
             return
@@ -274,6 +274,9 @@ class Pdos:
             if tpdo.syncs >= tpdo.kind:
                 tpdo.syncs, tpdo.last = 0, data
                 self._node.send(tpdo.identifier, data)
+
+    def act(self) -> None:
+        """Let what synchronous RPDOs have brought since the last SYNC act."""
         for group in self.rpdos.values():
             for rpdo in group:
                 if rpdo.waiting is not None:
