@@ -538,7 +538,8 @@ class CanopenDrive:
             if state is not State.STOPPED and (answer := self._sdo.answer(frame.data)) is not None:
                 self._node.send(0x580 + self._node.number, answer)
         elif identifier in self._pdos.rpdos:
-            self._pdos.receive(identifier, frame.data)
+            if not self._pdos.receive(identifier, frame.data):
+                return []
         elif 0x700 < identifier < 0x780:
             self.nmt.heard(frame)
         return self._finish()
