@@ -249,6 +249,7 @@ class Session:
         self._since = Elapsed(period)
         self._target = home.copy() if self.gives_positions else self.gravity.copy()
         self._explained: Vector | None = None  # the model's torque, where drives are given positions
+        self._correction = np.zeros_like(home)  # in the target that was sent last
         self._rows: list[tuple[Sample, Setpoint]] = []
         self._words: tuple[int, ...] = ()
         self._friction = still
@@ -344,7 +345,8 @@ class Session:
         What drives report of themselves is what is being tried, and is not judged here; neither are joints whose drives
         have given up torque, but for their position limits. Every other joint is held and guarded as before. A drive
         that misses its host may leave `operational` and tell no position any more: its joints stand where they were
-        seen last, and the caller says how long that may go on.
+        seen last, and the caller says how long that may go on. Where no targets are sent, joints are pushed by the last
+        one, and drives that are given positions are to hold theirs.
 
         Args:
             sample: of this cycle.
@@ -366,10 +368,12 @@ class Session:
             valid=sample.valid | given_up,
             age=np.where(given_up, 0, sample.age),
         )
+        if self.gives_positions and not sends:
+            setpoint = Setpoint(self._target, np.zeros_like(self.home), np.zeros_like(self.home))
         there = np.where(given_up, sample.position, setpoint.position)
         going = np.where(given_up, 0.0, setpoint.velocity)
         asked = Setpoint(there, going, np.where(given_up, 0.0, setpoint.acceleration))
-        wanted = self._safe_torque(undisturbed, asked, given_up) + self._learned_friction(asked, 0.0)
+        wanted = self._safe_torque(undisturbed, asked, given_up, sends=sends) + self._learned_friction(asked, 0.0)
         if sends:
             self._target = self._passed(asked.position) if self.gives_positions else self._limited(wanted)
 
@@ -396,10 +400,10 @@ class Session:
             self._target = self._limited(held * (left / cycles), band=False)
         self._arm.stop(StopKind.TORQUE_OFF)
 
-    def _safe_torque(self, sample: Sample, setpoint: Setpoint, given_up: Flags) -> Vector:
+    def _safe_torque(self, sample: Sample, setpoint: Setpoint, given_up: Flags, *, sends: bool = True) -> Vector:
         """Check a sample by the guard and return the control law's torque for it [N m or N], shape (joints,)."""
         since, control = self._since(sample.stamp_ns, sample.stamp_doubt_ns), self._control
-        velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, control.correction))
+        velocity, correction = (np.where(given_up, 0.0, of) for of in (control.velocity, self._correction))
         known = self._since.known
         pushes = sample.torque - self._explained if self._explained is not None else np.zeros_like(velocity)
         usable, fault = self._guard.feedback(
@@ -414,6 +418,8 @@ class Session:
         if fault is not None and fault.reaction is not Reaction.WARN:
             raise ArmFault(fault.code, fault.message, [row[0] for row in self._rows[-100:]])
         law = control.torque(sample.position, usable, setpoint, since if known else 0.0)
+        if sends:
+            self._correction = control.correction
         if self.gives_positions:
             self._explained = law - control.correction
         return law

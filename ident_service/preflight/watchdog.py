@@ -18,7 +18,7 @@ from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure
 from ident_service.motion.trajectory import Setpoint
-from ident_service.preflight.session import Session
+from ident_service.preflight.session import REMEDIES, Session
 from ident_service.preflight.static_checks import LONGEST_SILENCE
 
 CODE = "watchdog"
@@ -174,7 +174,11 @@ def watchdog_check(
             strange.append(f"{dog.drive} stopped for another reason ({word!r})")
     if moving is not None and travel is not None:
         unit = "rad" if model.chain.revolute[moving] else "m"
-        found.append(measure("in motion, distance until at rest", travel, unit, joint=model.chain.names[moving]))
+        name = model.chain.names[moving]
+        found.append(measure("in motion, distance until at rest", travel, unit, joint=name))
+        if travel == 0.0 and not strange:
+            why = f"{name}: position unchanged to the last bit from the middle of a motion until at rest"
+            return failed(CODE, why, REMEDIES["frozen_encoder"], found)
     return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
 
 
@@ -196,13 +200,16 @@ def _reaction(word: AxisStatus) -> str:
     return "quick stop" if word & AxisStatus.IDLE else "torque off"
 
 
-def _travel(arm: Arm, begin: Vector, joint: int) -> float:
-    """Measure how far a joint moves from where its host fell silent until it rests, or for `_STOPS` [rad or m]."""
-    now = begin
+def _travel(arm: Arm, begin: Vector, joint: int) -> float | None:
+    """Measure how far a joint moves from where its host fell silent until it rests, or for `_STOPS` [rad or m].
+
+    None where its drive tells no position any more, as one that misses its host's heartbeat may.
+    """
+    now, told = begin, False
     last_ns: int | None = None
     while True:
         sample = arm.exchange(None)
         last_ns = sample.stamp_ns if last_ns is None else last_ns
-        now = np.where(sample.valid, sample.position, now)
+        now, told = np.where(sample.valid, sample.position, now), told or bool(sample.valid[joint])
         if (sample.stamp_ns - last_ns) * 1e-9 > _STOPS:
-            return float(abs(now[joint] - begin[joint]))
+            return float(abs(now[joint] - begin[joint])) if told else None

@@ -13,10 +13,18 @@ from canopen_run_bench import Moved, canopen, checked, described, moved_arm, tru
 from drivers.canopen.driver import CanopenArm
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError, DriverError
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
+from ident_service.model.expected_friction import expected_friction
+from ident_service.motion.ticket import Check, Verdict
+from ident_service.motion.trajectory import hold
+from ident_service.preflight.active_checks import DWELL, strokes
+from ident_service.preflight.session import Session
+from ident_service.preflight.watchdog import watchdog_check
 from ident_service.recordings.open import open_recording
+from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
 
 pytestmark = pytest.mark.slow  # whole runs
@@ -82,6 +90,49 @@ def test_an_arm_is_checked_moved_and_identified_from_the_torque_that_its_drives_
     # 13 figures: none beyond what one in ten thousand is, nor all of them together.
     assert np.abs(z).max() < 4.0, dict(zip(base.expressions, z, strict=True))
     assert z @ z < 35.0, dict(zip(base.expressions, z, strict=True))
+
+
+def silent_in_motion(folder: Path, share: float, counts: int = 65536, fault: str = "") -> tuple[Check, float]:
+    """The watchdog's check of the arm behind two plain gears, at a share of the way that its shoulder goes.
+
+    Returns:
+        The check, and the shoulder's largest true speed [rad/s].
+    """
+    tree = positions("silent", torque_deadline=0.05) | {"transmission": {"ratios": [20.0, 20.0]}}
+    for drive in tree["driver"]["drives"]:
+        drive["counts"] = counts
+    config = load_arm(write(folder, tree))
+    behind, model, speeds = LockStepArm(config), arm_model(config), list[float]()
+    behind.emulator.observer = lambda seen: speeds.append(abs(seen.velocity[0]))
+    with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
+        limits, home = motion_limits(config), arm.exchange(None).position
+        friction = expected_friction(model, limits, config.design.friction_guess)
+        session = Session(arm, model, limits, arm.describe(), home, friction)
+        stroke = strokes(session, model, limits, only=0)[0]
+        begin = DWELL + share * stroke.there.duration
+        session.energise()
+        session.follow(hold(home), 0.2)
+        session.follow(stroke, begin)
+        if fault:
+            behind.inject(parse_fault(fault, tuple(config.joints)))
+        return watchdog_check(arm, model, session, lambda time: stroke.at(begin + time), 0), max(speeds)
+
+
+# Their reports come 0.09 s after the silence began, so that the arm sinks unseen; and the joint stands between counts.
+@pytest.mark.parametrize(("share", "counts"), [(0.5, 65536), (0.61, 1000)])
+def test_drives_that_are_given_no_more_positions_may_stand(share: float, counts: int, tmp_path: Path) -> None:
+    check, _ = silent_in_motion(tmp_path, share, counts)
+    assert check.verdict is Verdict.PASSED, check.reason
+
+
+@pytest.mark.parametrize("share", [0.2, 0.55])
+def test_an_encoder_that_freezes_when_no_more_positions_are_given_is_found(share: float, tmp_path: Path) -> None:
+    """By the drive's push, or by what it says when the drive has stopped; the arm goes no faster than it sinks."""
+    check, speed = silent_in_motion(tmp_path, share, fault="frozen_encoder joint=shoulder duration=5")
+    assert check.verdict is Verdict.FAILED
+    assert check.reason is not None
+    assert "shoulder: position unchanged to the last bit" in check.reason
+    assert speed < 0.9
 
 
 def moved(folder: Path, fault: str = "", stop_at: int | None = None, **driver: Any) -> Moved:

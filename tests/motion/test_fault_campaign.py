@@ -10,12 +10,11 @@ import random
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pytest
 from branches import outcomes
 from campaign_bench import PROMISES, STALLS, STOPPED, Case, Outcome, subject
-from campaign_checks import keep_their_promises, keeps_its_promise, together
+from campaign_checks import in_runs, keep_their_promises, keeps_its_promise, together
 
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.motion.faults import FAULTS, Reaction
@@ -29,6 +28,8 @@ STATES = (
 FINISHED = (State.PAUSING, State.PAUSED, State.RETURNING)  # that finishing a run early leads through
 SEED = 5
 REHEARSAL = 0.1
+# Not found in time (decision 0008): j5 reaches 2.17 times its limit in a rehearsal, 2.02 are allowed.
+REMAINING = {"wam-frozen_encoder-approaching-0.72-4-at 0.1"}
 
 
 def cases(arm: str, times: int, joints: int) -> Iterator[Case]:
@@ -110,14 +111,24 @@ def test_a_sample_of_the_campaign(some: list[Case], tmp_path: Path) -> None:
     keep_their_promises(some, tmp_path)
 
 
-def campaign() -> list[Any]:
+def campaign() -> list[Case]:
     """All cases."""
     every = [*cases("bench", 3, 2), *cases("wam", 2, 2), *slow_freezes("bench", 5), *slow_freezes("wam", 2)]
-    every += [*stalls("bench", 2), *stalls("wam", 1), *finished("bench", 2, 1), *finished("wam", 1, 1)]
-    return [pytest.param(case, id=str(case)) for case in every]
+    return [*every, *stalls("bench", 2), *stalls("wam", 1), *finished("bench", 2, 1), *finished("wam", 1, 1)]
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("case", campaign())
-def test_the_campaign(case: Case, tmp_path: Path) -> None:
+@pytest.mark.parametrize("some", in_runs([case for case in campaign() if str(case) not in REMAINING]))
+def test_the_campaign(some: list[Case], tmp_path: Path) -> None:
+    keep_their_promises(some, tmp_path)
+
+
+@pytest.mark.campaign
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
+@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in campaign() if str(case) in REMAINING])
+def test_what_is_known_to_fail_goes_on_failing_or_is_taken_off_the_list(case: Case, tmp_path: Path) -> None:
     keeps_its_promise(case, tmp_path)
+
+
+def test_what_is_known_to_fail_is_a_case() -> None:
+    assert {str(case) for case in campaign()} >= REMAINING

@@ -11,13 +11,12 @@ import random
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from campaign_bench import Case, Outcome, Strike, play, script_of, subject, windows
 from campaign_canopen import CANOPEN_PROMISES, FOREIGN, WIRE, EmulatedArm, of_joint
-from campaign_checks import keep_their_promises, keeps_its_promise, together
+from campaign_checks import in_runs, keep_their_promises, together
 from test_fault_campaign import STATES
 
 from ident_service.motion.faults import FAULTS
@@ -27,9 +26,6 @@ from sim_backend.emulator.motor import Power
 
 SEED = 11
 DRIVES = {"bench canopen": 2, "bench positions": 2, "loose canopen": 2, "wam canopen": 7, "wam two buses": 7}
-# At the end of this stop j7 stands still against more than the friction guess, which is taken for a frozen encoder
-# (decision 0008). A stop that a person asks for in the same cycle ends so too.
-REMAINING = {"wam canopen-lost_status-exciting-0.64-None"}
 # Codes of faults that a drive, not the bus or the loop, tells.
 TOLD = {"drive_fault", "drive_emergency", "drive_silent", "drive_restarted", "drive_left", "feedback_gone"}
 
@@ -138,22 +134,20 @@ def test_ends_of_an_arm_without_brakes(some: list[Case], tmp_path: Path) -> None
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in loose()])
-def test_all_ends_of_an_arm_without_brakes(case: Case, tmp_path: Path) -> None:
-    ends_as_it_can(case, keeps_its_promise(case, tmp_path))
+@pytest.mark.parametrize("some", in_runs([*loose()]))
+def test_all_ends_of_an_arm_without_brakes(some: list[Case], tmp_path: Path) -> None:
+    keep_their_promises(some, tmp_path, ends_as_it_can)
 
 
-def campaign() -> list[Any]:
-    """All cases; one that is known to fail must go on failing, or be taken off the list."""
-    every = [*cases("bench canopen", 2, 2), *cases("bench positions", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
-    fails = pytest.mark.xfail(strict=True, raises=AssertionError, reason="decision 0008")
-    return [pytest.param(case, id=str(case), marks=fails if str(case) in REMAINING else ()) for case in every]
+def campaign() -> list[Case]:
+    """All cases."""
+    return [*cases("bench canopen", 2, 2), *cases("bench positions", 2, 2), *cases("wam canopen", 1, 2), *two_buses()]
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("case", campaign())
-def test_the_campaign(case: Case, tmp_path: Path) -> None:
-    let_go(case, keeps_its_promise(case, tmp_path))
+@pytest.mark.parametrize("some", in_runs(campaign()))
+def test_the_campaign(some: list[Case], tmp_path: Path) -> None:
+    keep_their_promises(some, tmp_path, let_go)
 
 
 def let_go(case: Case, outcome: Outcome) -> None:

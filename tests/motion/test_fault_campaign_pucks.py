@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from campaign_bench import PAUSED, Case, Outcome
-from campaign_checks import keep_their_promises, keeps_its_promise, together
+from campaign_checks import in_runs, keep_their_promises, together
 from campaign_pucks import PUCK_PROMISES, WIRE, PuckArm, of_joint
 from test_fault_campaign import STATES
 
@@ -57,11 +57,9 @@ def test_a_sample_of_the_campaign(some: list[Case], tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(
-    "case", [pytest.param(one, id=str(one)) for one in (*cases("bench pucks", 2, 2), *cases("wam pucks", 1, 2))]
-)
-def test_the_campaign(case: Case, tmp_path: Path) -> None:
-    let_go(case, keeps_its_promise(case, tmp_path))
+@pytest.mark.parametrize("some", in_runs([*cases("bench pucks", 2, 2), *cases("wam pucks", 1, 2)]))
+def test_the_campaign(some: list[Case], tmp_path: Path) -> None:
+    keep_their_promises(some, tmp_path, let_go)
 
 
 def let_go(case: Case, outcome: Outcome) -> None:

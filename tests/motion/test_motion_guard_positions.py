@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from guard_bench import HOME, LIMITS, NAMES, PERIOD, QUICK, STILL, WARN, Bench, is_fault, unit
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ident_service.motion.faults import FAULTS, Reaction
+from ident_service.motion.faults import FAULTS, Fault, Reaction
 from ident_service.motion.safety_monitor import NOT_APPLIED, VELOCITY_STOP, SafetyMonitor
 
 Array = np.ndarray
@@ -132,3 +133,14 @@ def test_a_joint_that_stands_still_although_it_shall_move_is_a_frozen_encoder() 
         if fault is not None:
             break
     assert is_fault(fault, "frozen_encoder", joint=0)
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_a_joint_that_stands_at_once_is_frozen_only_where_other_positions_are_given(goes_on: bool) -> None:
+    seen, step, faults = bench(), 0.5 * LIMITS.velocity * PERIOD * unit(0), list[Fault | None]()
+    for number in range(20):
+        if goes_on or number < 4:
+            assert seen.guard.position(HOME + (number + 1) * step)[1] is None
+        faults.append(seen.see(HOME + min(number, 3) * step, velocity=step / PERIOD)[1])
+    codes = {fault.code for fault in faults if fault is not None}
+    assert codes == ({"frozen_encoder"} if goes_on else set())
