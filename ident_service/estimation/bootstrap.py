@@ -21,7 +21,7 @@ from ident_service.errors import ModelError, SolverError
 from ident_service.estimation.equations import Equations
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
 from ident_service.estimation.feasible.priors import Prior
-from ident_service.estimation.feasible.problems import constrained_least_squares
+from ident_service.estimation.feasible.problems import ENOUGH, constrained_least_squares
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
@@ -178,7 +178,7 @@ def constrained_intervals(
     for number in range(count):
         other = beta + root @ rng.normal(size=base.size)
         found[number] = constrained_least_squares(
-            replace(fit, beta=other, rho1=fit.R1 @ other), base, conditions, prior
+            replace(fit, beta=other, rho1=fit.R1 @ other), base, conditions, prior, enough=ENOUGH
         ).beta
     apart = found - beta
     sides = [np.sqrt(2.0 * np.mean(part**2, axis=0)) for part in (np.minimum(apart, 0.0), np.maximum(apart, 0.0))]

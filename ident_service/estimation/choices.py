@@ -16,7 +16,7 @@ import numpy as np
 
 from ident_service.errors import SolverError
 from ident_service.estimation.feasible.feasible_set import FeasibleSet
-from ident_service.estimation.feasible.problems import constrained_least_squares
+from ident_service.estimation.feasible.problems import ENOUGH, constrained_least_squares
 from ident_service.estimation.least_squares import ordinary_least_squares
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
@@ -106,7 +106,7 @@ def held_out_thirds(
         rest = Information.sum([part for other, part in enumerate(parts) if other != number])
         try:
             fit = ordinary_least_squares(rest, weights)
-            beta = constrained_least_squares(fit, base, conditions).beta
+            beta = constrained_least_squares(fit, base, conditions, enough=ENOUGH).beta
         except SolverError:
             return np.full(len(parts), np.inf)
         left, torque = (

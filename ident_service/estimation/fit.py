@@ -30,7 +30,7 @@ from ident_service.estimation.friction_fit import (
 )
 from ident_service.estimation.instrumental_variables import instrumental_variables
 from ident_service.estimation.least_squares import LeastSquares, ordinary_least_squares, weighted_least_squares
-from ident_service.estimation.robust_regression import held_out_errors, huber, standstill_weights
+from ident_service.estimation.robust_regression import held_out_errors, huber, spread_rows, standstill_weights
 from ident_service.estimation.shape_uncertainty import ShapeUncertainty, shape_uncertainty
 from ident_service.estimation.spectra import with_chosen_cutoff
 from ident_service.estimation.torque_constants import TorqueConstants, identify_torque_constants
@@ -264,14 +264,14 @@ def _with_known_shape(
     if method == "wls":
         return _fit_with_uncertainty("wls", fit, gathered, shares)
     choices: tuple[Choice, ...] = ()
+    spread = None
     if method == "choose":
-        choices = (
-            best_choice("method", held_out_errors(recordings, model, base, fit, prepared.torque_scales, shares)),
-        )
+        spread = spread_rows(recordings, model, base, prepared.torque_scales, shares)
+        choices = (best_choice("method", held_out_errors(spread, fit)),)
         if choices[0].value == "wls":
             return replace(_fit_with_uncertainty("wls", fit, gathered, shares), choices=choices)
     if method != "iv":
-        fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares)
+        fit, reweighted, change = huber(recordings, model, base, fit, prepared.torque_scales, shares, spread)
         found = replace(_fit_with_uncertainty("huber", fit, reweighted, shares), weighed=gathered)
         return replace(
             found, choices=choices, remarks=_convergence_warnings("Huber's weights", change, robust_regression.SETTLED)

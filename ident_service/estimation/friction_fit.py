@@ -604,23 +604,23 @@ class _Search:
         values, choices = fitted, []
         gathered = self._equations(fitted)
         shares = standstill_weights(gathered)
-        weights = weighted_least_squares(gathered.with_near(shares).total).weights
+        gathered = gathered.with_near(shares)
+        weights = weighted_least_squares(gathered.total).weights
+        errors = held_out_thirds(gathered.blocks, weights, self.base, conditions)
         for key in wanted:
             if np.all(values[key] <= _NONE[key]):
                 continue
             without = start | {key: np.full_like(values[key], _NONE[key])}
             others = [other for other in wanted if other != key and not np.all(values[other] <= _NONE[other])]
             without = self.finer(self.coordinate_search(without, others), others)
-            errors = {
-                name: held_out_thirds(self._equations(way).with_near(shares).blocks, weights, self.base, conditions)
-                for name, way in (("fit", values), ("none", without))
-            }
+            blocks = self._equations(without).with_near(shares).blocks
+            both = {"fit": errors, "none": held_out_thirds(blocks, weights, self.base, conditions)}
             option = f"friction.{key}"
             simpler = key == "stribeck_velocity"
             choices.append(
-                best_choice(option, of_thirds_together(errors)) if simpler else significant_choice(option, errors)
+                best_choice(option, of_thirds_together(both)) if simpler else significant_choice(option, both)
             )
-            values = values if choices[-1].value == "fit" else without
+            values, errors = (values if choices[-1].value == "fit" else without), both[choices[-1].value]
         return values, choices
 
     def _equations(self, values: _Numbers) -> Equations:

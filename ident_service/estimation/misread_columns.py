@@ -14,10 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ident_service.config.arm import ArmConfig
 from ident_service.errors import SolverError
 from ident_service.estimation.equations import motions_of, rows_of_motion
-from ident_service.estimation.feasible.problems import constrained_least_squares
+from ident_service.estimation.feasible.problems import ENOUGH, constrained_least_squares
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import (
     RANK_TOLERANCE,
@@ -31,9 +30,7 @@ from ident_service.model.arm_model import ArmModel
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, sparsity, triangle
-from ident_service.recordings.adapters import RangeRecording
 from ident_service.recordings.recording import Recording
-from ident_service.recordings.resampling import grid
 
 SUSPECTED_FROM, CONCERNED_FROM = 10.0, 2.5  # percent of a joint's torque: to search at all, and to try a joint
 NO_ERROR = 1.0  # percent of a joint's torque; smaller errors count as this one
@@ -41,7 +38,7 @@ BETTER = 3.0  # by which the product of the joints' errors must shrink; real arm
 NONE_WORSE = 2.0  # by which the error of no joint may grow; that of one whose torque is noise may
 LIKELIER = 2.0  # by which an exchange must explain more than a sign: poor joints gain a little by many exchanges
 EXPLAINED = 10.0  # percent of all torques in motion that the right reading leaves at most; wrong geometry leaves more
-_LONGEST = 60.0  # s of recordings that are fitted, and of one of them at most
+_LONGEST = 60.0  # s of recordings that are fitted
 _ROWS = 1000  # that are fitted, about
 _TRIED = 6  # readings besides signs of torques that are fitted under the conditions, while none explains: the best
 
@@ -201,7 +198,8 @@ def _readings(estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]
 
 def _constrained_error(estimate: Estimate, information: Information, weights: Array) -> TorqueError:
     fit = ordinary_least_squares(information, weights)
-    return torque_error(information, constrained_least_squares(fit, estimate.base, estimate.conditions).beta)
+    found = constrained_least_squares(fit, estimate.base, estimate.conditions, enough=ENOUGH)
+    return torque_error(information, found.beta)
 
 
 def _gains(before: Array, after: Array) -> Array:
@@ -315,25 +313,20 @@ def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[tuple[Rec
         smoothing = smoothing.model_copy(update={"filter_torque": True})
     config = model.config.model_copy(update={"identification": options.model_copy(update={"smoothing": smoothing})})
     model = replace(model, config=config)
-    parts = [(one, list(motions_of(one, model))) for one in _parts(recordings, config)]
-    step = max(sum(len(motion.time) for _, motions in parts for motion in motions) // _ROWS, 1)
-    return [(one, motion[slice(None, None, step)]) for one, motions in parts for motion in motions]
+    parts = list(_first_minute(recordings, model))
+    step = max(sum(len(motion.time) for _, motion in parts) // _ROWS, 1)
+    return [(one, motion[slice(None, None, step)]) for one, motion in parts]
 
 
-def _parts(recordings: Sequence[Recording], config: ArmConfig) -> list[Recording]:
-    """Return recordings until a minute is full, and of a longer one its first minute: shares could be too short.
-
-    Those that are trimmed, or averaged over periods, are whole: of a minute too little could be left.
-    """
-    found: list[Recording] = []
-    seconds = 0.0
-    uncut = config.identification.period is not None or any(config.recording.trim)
-    for one in recordings:
-        stamps = grid(one, config.recording)
-        start = one.start if isinstance(one, RangeRecording) else 0.0
-        whole = (stamps.last_ns - stamps.first_ns) * 1e-9 <= _LONGEST
-        found.append(one if whole or uncut else RangeRecording(one, start, start + _LONGEST))
-        seconds += min((stamps.last_ns - stamps.first_ns) * 1e-9, _LONGEST)
-        if seconds >= _LONGEST:
-            break
-    return found
+def _first_minute(recordings: Sequence[Recording], model: ArmModel) -> Iterator[tuple[Recording, Motion]]:
+    """Yield smoothed samples until a minute is full: they are in memory as a rule, and no more of them is smoothed."""
+    left = _LONGEST
+    for recording in recordings:
+        for motion in motions_of(recording, model):
+            if not len(motion.time):
+                continue
+            inside = motion.time - motion.time[0] <= left
+            yield recording, motion[np.flatnonzero(inside)]
+            if not inside.all():
+                return
+            left -= float(motion.time[-1] - motion.time[0])

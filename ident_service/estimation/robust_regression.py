@@ -50,6 +50,7 @@ def huber(
     start: LeastSquares,
     torque_scales: Array | None = None,
     shares: Array | None = None,
+    spread: SpreadRows | None = None,
 ) -> tuple[LeastSquares, Equations, float]:
     """Return Huber's estimate, the reweighted equations that it solves, and the last round's change of it.
 
@@ -63,13 +64,14 @@ def huber(
         start: an estimate to begin from.
         torque_scales: what each joint's measured torque is multiplied by, shape (joints,); ones when None.
         shares: what rows near standstill are multiplied by, shape (joints,); ones when None.
+        spread: `spread_rows` of these, where they have been read already.
 
     Raises:
         RecordingError: a recording cannot be used.
     """
     shares = np.ones(model.chain.joints) if shares is None else shares
     times = np.ones(model.chain.joints) if torque_scales is None else torque_scales
-    spread = _spread(recordings, model, base, times, shares)
+    spread = spread_rows(recordings, model, base, times, shares) if spread is None else spread
     beta, change = spread.huber(start.beta, _MOST_ROUNDS)
     scales = spread.scales(beta)
 
@@ -82,38 +84,23 @@ def huber(
     return ordinary_least_squares(gathered.total), gathered, change
 
 
-def held_out_errors(
-    recordings: Sequence[Recording],
-    model: ArmModel,
-    base: BaseParameters,
-    start: LeastSquares,
-    torque_scales: Array,
-    shares: Array,
-) -> dict[str, float]:
+def held_out_errors(spread: SpreadRows, start: LeastSquares) -> dict[str, float]:
     """Return the torque errors of each third, predicted from the other two, with and without Huber's weights.
 
     Args:
-        recordings: to fit to; each is read once.
-        model: the arm.
-        base: grouping of the parameters.
+        spread: rows of the recordings that are fitted to.
         start: weighted least squares of all of them; its weights make the joints' errors comparable.
-        torque_scales: what each joint's measured torque is multiplied by, shape (joints,).
-        shares: what rows near standstill are multiplied by, shape (joints,).
 
     Returns:
         Relative torque error [percent] of `wls` and of `huber`, the joints weighed as `start` has it.
-
-    Raises:
-        RecordingError: a recording cannot be used.
     """
-    spread = _spread(recordings, model, base, torque_scales, shares)
     errors, torques = np.zeros(2), 0.0
     for number in range(_FOLDS):
         rest, unseen = spread.without(number), spread.only(number)
         plain = rest.moments().solved(start.weights)
         robust, _ = rest.huber(plain, _FOLD_ROUNDS)
         errors += [float(np.sum(start.weights**2 * unseen.squared_residuals(beta))) for beta in (plain, robust)]
-        torques += float(np.sum(start.weights**2 * unseen.squared_residuals(np.zeros(base.size))))
+        torques += float(np.sum(start.weights**2 * unseen.squared_residuals(np.zeros(spread.base))))
     relative = 100.0 * np.sqrt(errors / max(torques, np.finfo(float).tiny))
     return {"wls": float(relative[0]), "huber": float(relative[1])}
 
@@ -125,7 +112,7 @@ def _weights(residuals: Array, scales: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Spread:
+class SpreadRows:
     """Rows spread evenly over the recordings: per joint the columns of rows that count, the torque as the last."""
 
     supports: tuple[NDArray[np.intp], ...]
@@ -153,11 +140,11 @@ class _Spread:
         """Return per joint the sum of squared residuals, shape (joints,)."""
         return np.array([float(one @ one) for one in self.residuals(beta)])
 
-    def only(self, part: int) -> _Spread:
+    def only(self, part: int) -> SpreadRows:
         """Return one third of the rows."""
         return self._with([np.array_split(table, _FOLDS)[part] for table in self.tables])
 
-    def without(self, part: int) -> _Spread:
+    def without(self, part: int) -> SpreadRows:
         """Return the other two thirds of the rows."""
         return self._with(
             [
@@ -167,6 +154,7 @@ class _Spread:
         )
 
     def residuals(self, beta: Array) -> list[Array]:
+        """Return the residuals of each joint's rows [N m or N]."""
         pairs = zip(self.tables, self.supports, strict=True)
         return [table[:, -1] - table[:, :-1] @ beta[support] for table, support in pairs]
 
@@ -186,13 +174,13 @@ class _Spread:
         rows = np.array([len(table) for table in self.tables], dtype=np.int64)
         return Moments(self.supports, tuple(products), rows, self.base)
 
-    def _with(self, tables: Sequence[Array]) -> _Spread:
-        return _Spread(self.supports, self.base, tuple(tables))
+    def _with(self, tables: Sequence[Array]) -> SpreadRows:
+        return SpreadRows(self.supports, self.base, tuple(tables))
 
 
-def _spread(
+def spread_rows(
     recordings: Sequence[Recording], model: ArmModel, base: BaseParameters, times: Array, shares: Array
-) -> _Spread:
+) -> SpreadRows:
     """Read every recording once and return its rows; of long ones every second, every fourth ... sample is kept.
 
     Raises:
@@ -219,7 +207,7 @@ def _spread(
                 kept = [tuple(np.concatenate(parts)[::2] for parts in zip(*kept, strict=True))]
                 every, samples = 2 * every, samples // 2
     tables = tuple(np.concatenate(parts) for parts in zip(*kept, strict=True))
-    return _Spread(felt, base.size, tables)
+    return SpreadRows(felt, base.size, tables)
 
 
 _SETTLED = 1e-3  # change of a share that counts as settled

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from ident_service.config.arm import Identification
 from ident_service.config.recording import RecordingFormat
 from ident_service.model.arm_model import ArmModel
+from ident_service.recordings.cached_recording import memory_of
 from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid, uniform
 
@@ -121,6 +123,8 @@ def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[
 def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = False) -> Spectrum:
     """Return where motion ends and noise begins in the spectra of a recording's positions, in windows of about 20 s.
 
+    A recording that has a memory keeps it: the choice of the filter and remarks on noise ask for the same.
+
     Args:
         recording: to look at.
         fmt: what to trim, what a gap is, and the rate.
@@ -129,6 +133,16 @@ def spectrum(recording: Recording, fmt: RecordingFormat, *, measured: bool = Fal
     Raises:
         RecordingError: it cannot be read.
     """
+    memory, key = memory_of(recording), (fmt, measured)
+    if memory is not None and (found := memory.recall("spectrum", key)) is not None:
+        return cast("Spectrum", found)
+    seen = _spectrum(recording, fmt, measured)
+    if memory is not None:
+        memory.remember("spectrum", key, seen)
+    return seen
+
+
+def _spectrum(recording: Recording, fmt: RecordingFormat, measured: bool) -> Spectrum:
     stamps = grid(recording, fmt)
     period = stamps.period_s
     length = min(int(_WINDOW_S / period), _SAMPLES, stamps.samples)

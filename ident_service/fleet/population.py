@@ -341,7 +341,6 @@ def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -
         rho1=R1 @ beta,
         rho2=0.0,
         inverse=inverse.T * scale[:, None],
-        condition_number=float(np.linalg.cond(R1)),
         rank=len(beta),
         standard_deviations=np.linalg.norm(inverse.T * scale[:, None], axis=1),
         weights=alone.fit.weights,

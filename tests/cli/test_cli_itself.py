@@ -170,7 +170,7 @@ IDENTIFY_LOADS = {
     # Clarabel takes LAPACK from scipy.linalg.
     *("scipy", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),
     *("scipy._cyutility", "scipy._distributor_init", "scipy._distributor_init_local"),
-    *("charset_normalizer", "cython_runtime"),  # numpy's, where it is there
+    "cython_runtime",  # scipy's
     *("cmeel_pth", "sitecustomize", "usercustomize", "distutils-precedence"),  # of environments
 }
 NOT_OF_PYTHON = {"urllib.request", "http.client", "ssl", "xml.sax", "sqlite3", "asyncio", "multiprocessing"}
@@ -194,6 +194,7 @@ def test_identification_loads_what_it_needs(quick: Commissioned, tmp_path: Path)
     foreign |= {".".join(name.split(".")[:2]) for name in modules if name.split(".")[0] == "scipy"}
     assert foreign <= IDENTIFY_LOADS
     assert not NOT_OF_PYTHON & set(modules)
+    assert not {"numpy.f2py.crackfortran", "numpy.testing._private"} & set(modules)
 
 
 def test_foreign_packages_of_the_same_name_are_refused(

@@ -13,11 +13,13 @@ from estimation.synthetic import SampledRecording, Waves, recorded, waves, with_
 from ident_service.config.load import load_arm
 from ident_service.errors import SolverError
 from ident_service.estimation import misread_columns as misread_module
+from ident_service.estimation import signal_processing
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.misread_columns import Reading, misread_columns
 from ident_service.estimation.plausibility import reasons_against
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.recordings.adapters import RangeRecording
+from ident_service.recordings.cached_recording import CachedRecording
 
 
 @cache
@@ -136,15 +138,25 @@ def test_a_reading_that_no_solver_can_fit_ends_nothing(monkeypatch: pytest.Monke
     solve = misread_module.constrained_least_squares
     calls = []
 
-    def fails_but_for_the_columns_as_they_are(*given: Any) -> Any:
+    def fails_but_for_the_columns_as_they_are(*given: Any, **options: Any) -> Any:
         calls.append(given)
         if len(calls) > 1:
             raise SolverError("estimating", "stopped without an optimum")
-        return solve(*given)
+        return solve(*given, **options)
 
     monkeypatch.setattr(misread_module, "constrained_least_squares", fails_but_for_the_columns_as_they_are)
     assert misread_columns(estimate, [recording]) is None
     assert len(calls) > 1
+
+
+def test_the_first_minute_of_a_longer_recording_is_not_smoothed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = CachedRecording(misread(Reading("torque", (1,))))
+    estimate = identify(elbowed()[0], [wrong], method="wls")
+    monkeypatch.setattr(misread_module, "_LONGEST", 10.0)
+    monkeypatch.setattr(signal_processing._Smoother, "__call__", lambda *_: pytest.fail("smoothed again"))
+    found = misread_columns(estimate, [wrong])
+    assert found is not None
+    assert found.reading == Reading("torque", (1,))
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.recording import RecordingFormat
 from ident_service.estimation.spectra import remarks_on_noise, spectrum, with_filter
 from ident_service.model.arm_model import arm_model
+from ident_service.recordings.cached_recording import CachedRecording
 
 
 def moving(frequency: float, rate: float, noise: float = 0.0, seconds: float = 40.0) -> SampledRecording:
@@ -87,3 +88,10 @@ def test_an_arm_that_stands_still_or_was_hardly_recorded_gets_the_usual_filter()
     assert with_filter([still], Identification()).smoothing.cutoff == 8.0
     short = SampledRecording(stamps(3, 100.0), np.ones((3, 2)), np.zeros((3, 2)))
     assert with_filter([short], Identification()).smoothing.cutoff == 8.0
+
+
+def test_a_kept_recording_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = CachedRecording(moving(0.5, 250.0))
+    first = spectrum(kept, RecordingFormat())
+    monkeypatch.setattr(np.fft, "rfft", lambda *_, **__: pytest.fail("looked at again"))
+    assert spectrum(kept, RecordingFormat()) == first

@@ -261,5 +261,5 @@ def test_the_rows_that_weights_are_found_on_do_not_grow_with_the_recording(monke
     monkeypatch.setattr(robust, "_SPREAD", 300)
     for count in (1, 2, 5):
         recordings = [with_noise(0.0, seed=seed) for seed in range(count)]
-        found = robust._spread(recordings, model, base, np.ones(3), np.ones(3))
+        found = robust.spread_rows(recordings, model, base, np.ones(3), np.ones(3))
         assert all(300 < len(table) <= 600 for table in found.tables)

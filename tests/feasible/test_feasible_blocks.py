@@ -10,8 +10,11 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from ident_service.errors import ParameterError
+from ident_service.estimation.feasible.conic import ConicProblem
 from ident_service.estimation.feasible.feasible_set import FeasibleSet, feasible_set
+from ident_service.estimation.feasible.formulation import minimise
 from ident_service.estimation.feasible.problems import (
+    ENOUGH,
     constrained_least_squares,
     feasibility_correction,
     feasibility_test,
@@ -114,6 +117,35 @@ def test_a_mirrored_cloud_fulfils_its_plane_and_no_other(plane: str, axis: int) 
             assert name == f"link 1: symmetric about its {other} plane"
 
 
+def test_an_estimate_to_compare_is_as_near_to_five_digits_and_inside() -> None:
+    conditions = feasible_set("pseudo_inertia", NAMES, one_link())
+    base = base_from_expressions(("Lzz1", "ly1", "lx1", "Lxx1"), NAMES)
+    beta = np.array([-0.3, 0.1, 0.2, 0.05])
+    fit = LeastSquares(beta, np.eye(4), beta, 0.0, np.eye(4), 4, np.ones(4), np.ones(1))
+    exact = constrained_least_squares(fit, base, conditions)
+    near = constrained_least_squares(fit, base, conditions, enough=ENOUGH)
+    assert near.iterations < exact.iterations
+    assert near.margin > 0.0
+    np.testing.assert_allclose(near.objective, exact.objective, rtol=1e-5)
+
+
+def test_a_rough_optimum_that_is_not_accepted_is_found_to_all_digits() -> None:
+    conditions = feasible_set("pseudo_inertia", NAMES, one_link())
+    problem = ConicProblem(1)
+    problem.nonnegative(np.eye(1), np.array([-1.0]))
+    to_delta = np.zeros((len(NAMES), 1)), np.zeros(len(NAMES))
+    tried: list[float] = []
+
+    def second(x: np.ndarray) -> bool:
+        tried.append(float(x[0]))
+        return len(tried) > 1
+
+    found = minimise(problem, np.ones(1), "least", to_delta, conditions, accept=second, enough=1e-2)
+    assert len(tried) == 2
+    assert found.tolerance <= 1e-7
+    assert abs(tried[1] - 1.0) < abs(tried[0] - 1.0)
+
+
 def test_symmetry_is_held_to_the_last_digit() -> None:
     conditions = feasible_set("pseudo_inertia", NAMES, one_link(symmetry=["xy", "xz"]))
     assert [len(block.f) for block in conditions.equalities] == [3, 2]
@@ -131,7 +163,6 @@ def test_symmetry_is_held_to_the_last_digit() -> None:
         rho1=beta,
         rho2=0.0,
         inverse=np.eye(4),
-        condition_number=1.0,
         rank=4,
         standard_deviations=np.ones(4),
         weights=np.ones(1),

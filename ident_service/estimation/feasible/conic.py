@@ -260,7 +260,9 @@ class ConicProblem:
         self._rows.append(rows)
         self._scales.append(scale)
 
-    def minimise(self, objective: Array, name: str, quadratic: Array | None = None) -> Solution:
+    def minimise(
+        self, objective: Array, name: str, quadratic: Array | None = None, enough: float | None = None
+    ) -> Solution:
         """Minimise an objective over the constraints.
 
         Args:
@@ -268,6 +270,7 @@ class ConicProblem:
             name: what to call the problem in an error.
             quadratic: non-negative diagonal of the Hessian, shape (variables,); the objective is
                 `objective^T x + x^T diag(quadratic) x / 2`.
+            enough: tolerance that is enough, of a problem that is posed once; None for nine digits, in any pose.
 
         Raises:
             SolverError: the solver stopped anywhere but at an optimum, in every pose; with the first pose's status.
@@ -277,7 +280,10 @@ class ConicProblem:
         status, attempts, iterations, seconds = "", 0, 0, 0.0
         # Orthonormal coordinates make every constraint one of all variables, which costs twenty times as much.
         close = [attempt for attempt in _POSES if not (self.rough and attempt.around == "orthonormal")]
-        for tolerance in _TOLERANCES[-1:] if self.rough else _TOLERANCES:
+        tolerances = _TOLERANCES[-1:] if self.rough else _TOLERANCES
+        if enough is not None:
+            close, tolerances = close[:1], (enough,)
+        for tolerance in tolerances:
             for attempt in tuple(close):
                 pose = precondition(self._rows, objective, hessian, around, attempt.around)
                 result = _solve(pose, attempt, tolerance)
@@ -338,7 +344,8 @@ def _solve(pose: ScaledProblem, attempt: _SolverAttempt, tolerance: float) -> cl
     settings.max_threads = 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     # `AlmostSolved` then means that the loosest tolerance was reached.
-    settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = _TOLERANCES[-1]
+    loosest = max(tolerance, _TOLERANCES[-1])
+    settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = loosest
     settings.max_step_fraction = attempt.step
     settings.equilibrate_max_iter = attempt.equilibrations
     cones = [_cone(block) for block in pose.rows]

@@ -91,6 +91,7 @@ def minimise(
     quadratic: Array | None = None,
     accept: Callable[[Array], bool] = lambda _: True,
     reaches: Sequence[float] = OF_TESTS,
+    enough: float | None = None,
 ) -> Solution:
     """Solve within the first bound on the links' tr(P) (a reach) that has an acceptable optimum.
 
@@ -104,6 +105,8 @@ def minimise(
         quadratic: diagonal of the Hessian, shape (variables,).
         accept: whether an optimum is accurate enough to be used.
         reaches: bounds of tr(P) to try, in turn.
+        enough: tolerance that is enough within the first reach; where it gives nothing, and when None, all digits are
+            asked for.
 
     Raises:
         SolverError: no optimum within any reach, or none that is acceptable.
@@ -111,14 +114,17 @@ def minimise(
     T, d = to_delta
     trace, top = traces(conditions), largest(conditions, size)
     status = ""
-    for reach in reaches:
+    tries = [(reach, None) for reach in reaches]
+    for reach, tolerance in tries if enough is None else [(reaches[0], enough), *tries]:
         bounded = problem
         if np.isfinite(reach):
             bounded = problem.copy()
             bounded.nonnegative(-trace @ T / reach, top - trace @ d / reach)
         try:
-            solution = bounded.minimise(objective, name, quadratic)
+            solution = bounded.minimise(objective, name, quadratic, tolerance)
         except SolverError as error:
+            if tolerance is not None:
+                continue
             # Without a bound, infeasibility is that of the problem itself.
             if error.status.endswith("Infeasible") and bounded is problem:
                 raise

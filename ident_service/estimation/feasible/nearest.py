@@ -93,6 +93,7 @@ def solve_inside(
     size: float,
     quadratic: Array | None = None,
     reaches: Sequence[float] = OF_ESTIMATES,
+    enough: float | None = None,
 ) -> tuple[Array, Solution]:
     """Solve a problem whose answer must lie inside the set.
 
@@ -105,6 +106,7 @@ def solve_inside(
         size: of the largest base parameter.
         quadratic: diagonal of the Hessian, shape (variables,).
         reaches: bounds of links' masses to try, in turn, see `formulation.py`.
+        enough: tolerance that is enough, where one is, see `formulation.py`.
 
     Returns:
         Delta, with a positive margin and the equalities fulfilled to the last digit, and the solution.
@@ -128,6 +130,7 @@ def solve_inside(
             quadratic=quadratic,
             accept=inside,
             reaches=reaches,
+            enough=enough,
         )
     except SolverError as error:
         if blocks := conflicting_constraints(conditions):
@@ -144,6 +147,7 @@ def nearest(
     conditions: FeasibleSet,
     name: str,
     reaches: Sequence[float] = OF_ESTIMATES,
+    enough: float | None = None,
 ) -> FeasibleEstimate:
     """Minimise |metric b - target| over feasible b.
 
@@ -155,6 +159,7 @@ def nearest(
         conditions: the set.
         name: of the problem, for errors.
         reaches: bounds of links' masses to try, in turn, see `formulation.py`.
+        enough: tolerance that is enough, where one is, see `formulation.py`.
 
     Raises:
         ConditionsError: no parameters at all fulfil the conditions.
@@ -180,7 +185,9 @@ def nearest(
     for weight in _WEIGHTS:
         objective = np.append(np.zeros(variables - 1), weight)
         try:
-            delta, solution = solve_inside(problem, objective, name, to_delta, conditions, size, reaches=reaches)
+            delta, solution = solve_inside(
+                problem, objective, name, to_delta, conditions, size, reaches=reaches, enough=enough
+            )
         except ConditionsError:
             raise
         except SolverError as error:

@@ -34,6 +34,7 @@ from ident_service.estimation.least_squares import LeastSquares
 from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 
+ENOUGH = 1e-6  # tolerance of estimates that are compared by hundredths; their distances are right to five digits
 _LARGEST_CONDITION = 1e13  # of the correlations, beyond which their inverse is rounding
 
 
@@ -207,12 +208,25 @@ def feasibility_correction(
 
 
 def constrained_least_squares(
-    fit: LeastSquares, base: BaseParameters, conditions: FeasibleSet, prior: Prior | None = None
+    fit: LeastSquares,
+    base: BaseParameters,
+    conditions: FeasibleSet,
+    prior: Prior | None = None,
+    *,
+    enough: float | None = None,
 ) -> FeasibleEstimate:
     """Return the feasible base parameters that explain the torques best (FBPE-OLS, eq. 74).
 
     `objective` is |rho_1 - R_1 beta|, the part of the residual that beta can change (eq. 70). With a prior, what is
     minimised is |rho_1 - R_1 beta|^2 / sigma^2 + weight * divergence(delta, prior), see `priors.py`.
+
+    Args:
+        fit: unconstrained.
+        base: grouping of the parameters.
+        conditions: the feasible set.
+        prior: that the estimate is drawn to.
+        enough: tolerance of the objective that is enough to compare estimates, such as `ENOUGH`; all digits when None,
+            and with a prior.
 
     Raises:
         ParameterError: shapes or names do not fit, or the prior is not one that a divergence can be measured from.
@@ -221,7 +235,7 @@ def constrained_least_squares(
     """
     check(fit.beta, base, conditions)
     if prior is None or prior.weight == 0.0:
-        found = nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares")
+        found = nearest(fit.R1, fit.rho1, fit.beta, base, conditions, "constrained least squares", enough=enough)
         return _unless_feasible(found, fit.beta, base, conditions, OF_ESTIMATES[0])
     return solve_with_prior(fit, base, conditions, prior)
 
