@@ -55,7 +55,7 @@ def assert_same(one: SearchResult, other: SearchResult) -> None:
         np.testing.assert_array_equal(first.coefficients, second.coefficients)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_same_seed_and_starts_give_the_same_result_to_the_last_bit() -> None:
     found, _ = searched(3)
     assert found.finished == 3

@@ -90,7 +90,7 @@ def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
         np.testing.assert_allclose(report.peak_following_error, alone.error, rtol=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -> None:
     """Soft gains: friction moves the arm farther off than it may be, wherever it moves at all."""
     soft = {name: {"kp": 2.0, "kd": 1.0, "following_error": 0.02} for name in ("shoulder", "elbow")}
@@ -231,7 +231,7 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
     assert words(40.0).endswith("; stiffer gains would not be stable")
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(400)
 def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     """An elbow too soft to move: with the gains, which are stable at this rate, it moves freely."""

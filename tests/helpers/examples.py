@@ -5,6 +5,7 @@ from __future__ import annotations
 from hypothesis import settings
 
 _USUAL = 25  # of the profile `default`, tests/conftest.py
+NIGHT = settings().max_examples > _USUAL  # in `make campaign`
 
 
 def some(number: int) -> settings:

@@ -9,6 +9,7 @@ import ctypes
 import faulthandler
 import fcntl
 import gc
+import importlib
 import importlib.util
 import logging
 import multiprocessing.process
@@ -16,6 +17,7 @@ import multiprocessing.resource_tracker
 import multiprocessing.util
 import os
 import pickle
+import pkgutil
 import re
 import signal
 import socket
@@ -34,10 +36,13 @@ from typing import Any, Final, NoReturn
 
 import pytest
 
+from ident_service import cli, daemon, operations
+
 # What our own code starts by `-m`. Not there: processes that limit their memory, which this one may have taken already.
 PROGRAMS: Final = frozenset(
     {
         "ident_service",
+        "ident_service.daemon.jobs.socket_activation",
         "ident_service.motion.process",
         "ident_service.operations.target_process",
         "ident_service.recordings.recorder_main",
@@ -68,6 +73,8 @@ class ForkedProcess(subprocess.Popen[Any]):
     this process' command line in `/proc`, and what a test has put in the place of functions is there as well.
     """
 
+    _forks_daemons = False
+
     def _execute_child(self, args: Any, *rest: Any) -> None:
         # Since Python 3.11: executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags, shell,
         # six ends of pipes, restore_signals, gid, gids, uid, umask, start_new_session, process_group.
@@ -76,7 +83,8 @@ class ForkedProcess(subprocess.Popen[Any]):
             begin = 2 if words[1:2] == ["-P"] else 1
             usual = rest[:2] == (None, None) and rest[2] and not rest[8] and rest[16:20] == (None, None, None, -1)
             module = words[begin + 1 : begin + 3] if words[begin : begin + 1] == ["-m"] else []
-            if usual and rest[21] == -1 and module[:1] and module[0] in PROGRAMS and module[1:] != ["serve"]:
+            known = module[:1] and module[0] in PROGRAMS and (self._forks_daemons or module[1:] != ["serve"])
+            if usual and rest[21] == -1 and known:
                 self._fork(words[begin + 1 :], *rest)
                 return
         super()._execute_child(args, *rest)  # type: ignore[misc]
@@ -113,6 +121,7 @@ class _Start:
     folder: str | os.PathLike[str] | None
     environment: dict[str, str] | None
     own_session: bool
+    registry: bool = False  # whether it may open one
 
     def go(self) -> NoReturn:
         """Be the program."""
@@ -123,6 +132,11 @@ class _Start:
                 os.chdir(self.folder)
             _keep_only(*self.streams, self.others)
             _forget_the_parent(self.environment)
+            if not self.registry:
+                # SQLite knows in each process which files that has locked; a fork would believe to have those locks.
+                sqlite3.connect = _no_registry
+            if self.words[:2] == ["ident_service", "serve"]:
+                subprocess.Popen = served_by(ForkServer())  # type: ignore[misc]
             os.close(self.others[-1])
             contextvars.Context().run(_be, *self.words)
         finally:
@@ -156,6 +170,7 @@ class ForkServer:
             streams=streams,
             folder=start.folder or Path.cwd(),
             environment=dict(os.environ) if start.environment is None else start.environment,
+            registry=True,
         )
         with self._lock:
             _adopt_orphans(True)
@@ -183,10 +198,14 @@ def _serve(link: socket.socket) -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     _keep_only(nothing, nothing, nothing, [link.fileno()])
     subprocess.Popen = ForkedProcess  # type: ignore[misc]  # of programs that start others
+    loaded = False
     while True:
         request, received, _, _ = socket.recv_fds(link, 1 << 20, 250)
         if not request:
             return
+        if not loaded:
+            loaded = True
+            _load_all()
         start, umask = pickle.loads(request)  # noqa: S301 - our own parent's
         named, waits = os.pipe()
         middle = fork()
@@ -203,6 +222,13 @@ def _serve(link: socket.socket) -> None:
         os.waitpid(middle, 0)  # now the program has been adopted
         link.send(os.read(named, 100))
         os.close(named)
+
+
+def _load_all() -> None:
+    """Import what programs import when they come to it: once, and not in each."""
+    for package in (cli, daemon, operations):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(found.name)
 
 
 def _placed(start: _Start, received: list[int]) -> _Start:
@@ -264,8 +290,6 @@ def _forget_the_parent(environment: dict[str, str] | None) -> None:
     warnings.resetwarnings()
     for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
         warnings.simplefilter("ignore", kind)
-    # SQLite knows in each process which files that has locked, and a fork would believe to have the parent's locks.
-    sqlite3.connect = _no_registry
     sys.excepthook, sys.unraisablehook = sys.__excepthook__, sys.__unraisablehook__
     threading.excepthook = threading.__excepthook__
     for handler in list(logging.root.handlers):
@@ -310,12 +334,18 @@ def _be(program: str, *words: str) -> NoReturn:
     os._exit(code)
 
 
-def fork_processes(patch: pytest.MonkeyPatch, server: ForkServer | None = None) -> None:
-    """Have our own programs that are started from here forked from this process, or by a server."""
+def served_by(server: ForkServer) -> type[ForkedProcess]:
+    """Return a `ForkedProcess` whose children a server forks, daemons too."""
 
-    class Served(ForkedProcess):
+    class ServedProcess(ForkedProcess):
+        _forks_daemons = True
+
         def _fork_as(self, start: _Start) -> int:
-            assert server is not None
             return server.start(start)
 
-    patch.setattr(subprocess, "Popen", ForkedProcess if server is None else Served)
+    return ServedProcess
+
+
+def fork_processes(patch: pytest.MonkeyPatch, server: ForkServer | None = None) -> None:
+    """Have our own programs that are started from here forked from this process, or by a server."""
+    patch.setattr(subprocess, "Popen", ForkedProcess if server is None else served_by(server))

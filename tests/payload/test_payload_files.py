@@ -42,10 +42,10 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of results `bare` and `tooled`, recordings `bare.mcap` and `tooled.mcap`."""
 
     def make(folder: Path) -> None:
-        identified_folder(changed("planar2", rate=COARSE, seed=11), folder / "bare")
-        identified_folder(changed("planar2", rate=COARSE, seed=12, added=TOOL), folder / "tooled")
-        recorded_arm(changed("planar2", rate=COARSE, seed=13), folder / "bare.mcap")
-        recorded_arm(changed("planar2", rate=COARSE, seed=14, added=TOOL), folder / "tooled.mcap")
+        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=11), folder / "bare")
+        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=12, added=TOOL), folder / "tooled")
+        recorded_arm(changed("planar2", rate=COARSE, periods=1, seed=13), folder / "bare.mcap")
+        recorded_arm(changed("planar2", rate=COARSE, periods=1, seed=14, added=TOOL), folder / "tooled.mcap")
 
     return made_once(tmp_path_factory, "payload", make)
 

@@ -231,7 +231,7 @@ SOUND = {"sound": {}, "Craig": {"kinematics": craig("modified")}}
 
 
 # What no other test has by the command, or in the estimate (`test_a_spike_and_wrong_units_of_an_arm_without_limits`).
-QUICK = ("q and tau", "two joints", "one sign", "gravity", "convention")
+QUICK = ("two joints", "gravity")
 
 
 @pytest.mark.slow
@@ -247,8 +247,8 @@ def test_the_command_ends_with_3_for_what_cannot_be_right(
     assert (tmp_path / "out" / "report.txt").read_text().startswith("DO NOT USE")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param("sound", marks=pytest.mark.campaign), "Craig"])
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", ["sound", "Craig"])
 def test_the_command_objects_to_nothing_sound(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*written(tmp_path, nothing, SOUND[name]), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["unusable"] == []
