@@ -39,9 +39,9 @@ _ALLOWED = (
 # Folders, and files of others, about what a command does and not about how its processes begin, talk and end; those
 # with a daemon's threads, which must not be forked with it; and files in these folders that are about processes.
 _FORKED = {"cli", "payload"}
-_FORKED |= {"test_can_log", "test_finish", "test_recover", "test_zero"}
+_FORKED |= {"test_can_log", "test_finish", "test_recover", "test_runs", "test_zero"}
 _FORKED |= {"test_canopen_matrix", "test_canopen_positions", "test_pucks_run_virtual"}
-_SERVED = {"daemon", "maintenance", "page"}
+_SERVED = {"daemon", "maintenance", "page", "test_fleet_server"}
 _STARTED = {"test_answer", "test_cli_itself", "test_image"}
 
 # A part of hypothesis' usual hundred examples; `make campaign` has a thousand, wherever a test says no number.

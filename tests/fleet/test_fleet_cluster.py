@@ -321,6 +321,7 @@ def test_after_a_killed_client_the_next_call_goes_on(
 
 
 @pytest.mark.campaign
+@pytest.mark.campaign
 def test_recordings_and_store_on_s3(
     fleet: Run, endpoint: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

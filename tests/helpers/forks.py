@@ -349,3 +349,8 @@ def served_by(server: ForkServer) -> type[ForkedProcess]:
 def fork_processes(patch: pytest.MonkeyPatch, server: ForkServer | None = None) -> None:
     """Have our own programs that are started from here forked from this process, or by a server."""
     patch.setattr(subprocess, "Popen", ForkedProcess if server is None else served_by(server))
+
+
+def start_processes(patch: pytest.MonkeyPatch) -> None:
+    """Have programs started anew where a module's are forked."""
+    patch.setattr(subprocess, "Popen", ForkedProcess.__base__)

@@ -21,7 +21,7 @@ SEEDS = 20
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_an_unchanged_arm_is_due_no_more_and_raises_nothing(
     db: Database, state: Path, accepted: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
