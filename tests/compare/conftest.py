@@ -27,11 +27,9 @@ def commissioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders `accepted` and `again` of the same small arm, and `dry` with 30 % more friction in its elbow."""
 
     def make(folder: Path) -> None:
-        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=1), folder / "accepted")
-        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=2), folder / "again")
-        identified_folder(
-            changed("planar2", rate=COARSE, periods=1, seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry"
-        )
+        identified_folder(changed("planar2", rate=COARSE, seed=1), folder / "accepted")
+        identified_folder(changed("planar2", rate=COARSE, seed=2), folder / "again")
+        identified_folder(changed("planar2", rate=COARSE, seed=3, factors={"fv2": 1.3, "fc2": 1.3}), folder / "dry")
 
     return made_once(tmp_path_factory, "compared", make)
 

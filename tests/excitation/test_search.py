@@ -138,7 +138,7 @@ def test_cancelling_ends_a_search_soon_with_what_it_has() -> None:
     assert found.candidates[0].start >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_cancelling_ends_the_work_of_other_processes_too() -> None:
     told: list[Progress] = []
     found = starts(10_000, workers=2, tell=told.append, cancelled=lambda: bool(told) and told[-1].finished > 0)

@@ -73,7 +73,7 @@ def as_in(case: int, model: ArmModel) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [0, 1])
+@pytest.mark.parametrize("case", [0, pytest.param(1, marks=pytest.mark.campaign)])
 def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
     model = small()
     model = small(driver=as_in(case, model))

@@ -242,6 +242,7 @@ def undisturbed(cluster: LocalCluster, folder: Path, tmp_path_factory: pytest.Te
     return bits(place / "out")
 
 
+@pytest.mark.campaign
 def test_killed_workers_change_nothing(
     fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -299,6 +300,7 @@ def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
         assert client.submit(_ends, 2, pure=False).result() == 2
 
 
+@pytest.mark.campaign
 def test_after_a_killed_client_the_next_call_goes_on(
     fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
