@@ -8,6 +8,7 @@ import contextvars
 import ctypes
 import faulthandler
 import fcntl
+import functools
 import gc
 import importlib
 import importlib.util
@@ -198,14 +199,11 @@ def _serve(link: socket.socket) -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     _keep_only(nothing, nothing, nothing, [link.fileno()])
     subprocess.Popen = ForkedProcess  # type: ignore[misc]  # of programs that start others
-    loaded = False
     while True:
         request, received, _, _ = socket.recv_fds(link, 1 << 20, 250)
         if not request:
             return
-        if not loaded:
-            loaded = True
-            _load_all()
+        _load_all()
         start, umask = pickle.loads(request)  # noqa: S301 - our own parent's
         named, waits = os.pipe()
         middle = fork()
@@ -224,6 +222,7 @@ def _serve(link: socket.socket) -> None:
         os.close(named)
 
 
+@functools.cache
 def _load_all() -> None:
     """Import what programs import when they come to it: once, and not in each."""
     for package in (cli, daemon, operations):
