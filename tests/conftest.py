@@ -40,7 +40,7 @@ _ALLOWED = (
 # with a daemon's threads, which must not be forked with it; and files in these folders that are about processes.
 _FORKED = {"cli", "payload"}
 _FORKED |= {"test_can_log", "test_finish", "test_recover", "test_runs", "test_zero"}
-_FORKED |= {"test_canopen_matrix", "test_canopen_positions", "test_pucks_run_virtual"}
+_FORKED |= {"test_canopen_matrix", "test_canopen_positions"}
 _SERVED = {"daemon", "maintenance", "page", "test_fleet_server"}
 _STARTED = {"test_answer", "test_cli_itself", "test_image"}
 

@@ -279,11 +279,9 @@ def test_a_gain_is_a_percentage_until_a_factor_says_more(criterion: Criterion, f
     assert gain_words(criterion, factor) == words
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize(
-    ("kp", "reason"), [pytest.param(100.0, "lags by", marks=pytest.mark.campaign), (200.0, "comes within")]
-)
+@pytest.mark.parametrize(("kp", "reason"), [(100.0, "lags by"), (200.0, "comes within")])
 def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller(kp: float, reason: str) -> None:
     """A soft arm above a floor: its heavier links, which no forecast knows, and the tube around its motion."""
     gains = {"kp": kp, "kd": 2.0 * kp**0.5}

@@ -284,6 +284,7 @@ def _allow(failures: int, dask_scheduler: Any = None) -> None:
     dask_scheduler.allowed_failures = failures
 
 
+@pytest.mark.campaign
 def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
     """After one try here, after four as a rule."""
     from distributed import Client

@@ -51,7 +51,7 @@ def cases(arm: str, times: int, drives: int) -> Iterator[Case]:
 
 
 def sample() -> list[Case]:
-    """One of each kind on the small arm while it moves, one of a differential on the large one.
+    """One of each kind on the small arm while it moves.
 
     Pauses and stops are the same for all arms: samples of the simulated arm and of pucks have them.
     """
@@ -61,8 +61,6 @@ def sample() -> list[Case]:
     # While it moves, drives that are given positions react in their own way.
     moving = [case for case in cases("bench positions", 1, 1) if case.state is State.EXCITING]
     chosen += rng.sample([case for case in moving if case.kind not in FOREIGN], 5)
-    # Early in its motion: simulating the WAM up to the fault is what takes time.
-    chosen += [Case("wam canopen", "stuck_torque", State.EXCITING, 0.2 * rng.random(), 1)]
     return chosen
 
 
