@@ -63,7 +63,7 @@ def test_the_same_seed_and_starts_give_the_same_result_to_the_last_bit() -> None
     assert_same(found, starts(3))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_however_many_processes_there_are() -> None:
     assert_same(searched(3)[0], starts(3, workers=2))
 

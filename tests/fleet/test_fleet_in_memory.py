@@ -148,6 +148,7 @@ def _fill(share: float) -> None:
     worker.held = b"x" * max(int(share * limit) - own, 0)
 
 
+@pytest.mark.campaign
 def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
     """Above 80 % Dask would pause it, and the command waited for ever."""
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), workers=1, memory="400MiB")

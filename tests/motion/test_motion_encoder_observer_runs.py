@@ -44,7 +44,8 @@ def slow(which: Subject, joint: int, speed: float, first: int) -> list[Fault]:
 @pytest.mark.parametrize(
     ("arm", "joints", "speed"),
     [
-        *(("bench", 2, 1.0), ("bench", 2, 0.2)),
+        ("bench", 2, 0.2),
+        pytest.param("bench", 2, 1.0, marks=pytest.mark.campaign),
         *(pytest.param("wam", 7, speed, marks=pytest.mark.campaign) for speed in (1.0, 0.2)),
     ],
 )
