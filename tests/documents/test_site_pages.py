@@ -18,7 +18,7 @@ from ident_service.operations.arm_checks import TITLES
 DOCS = ROOT / "docs"
 # The newcomer's walk; at night with what else the same folder is good for, and the arm of one's own.
 WALKS = (
-    ("../README.md", "tutorial.md", "troubleshooting.md", "reference/command-line.md"),
+    ("../README.md", "tutorial.md", "reference/command-line.md", "troubleshooting.md"),
     (
         *("../README.md", "tutorial.md", "identify-recordings.md", "reidentification.md", "reference/python-api.md"),
         *("concepts/base-parameters.md", "concepts/excitation.md", "tasks.md", "security.md", "troubleshooting.md"),
