@@ -187,6 +187,8 @@ def _in_steps(value: Vector, steps: _Steps) -> Vector:
 
 
 Load = tuple[float, tuple[float, float, float]]
+# Position, velocity and acceleration of the joints, and the drives' velocities.
+PlantState = tuple[Array, Array, Array, Array]
 
 _ROUNDING = 1e-12  # of the largest number in an inverse
 
@@ -268,6 +270,11 @@ class Plant:
         """Return the inertia of each joint, all others held: the diagonal of M(q) [kg m^2 or kg], shape (joints,)."""
         return np.array(np.diag(self._inverse.mass_matrix(self._position)))
 
+    @property
+    def conditions(self) -> tuple[object, ...]:
+        """Return what a step depends on besides its torque and period; each of these is replaced when it changes."""
+        return self._position, self._velocity, self._acceleration, self._braking, self._loads
+
     def brake(self, damping: Array) -> None:
         """Add viscous friction to every step from now on.
 
@@ -290,7 +297,7 @@ class Plant:
             position: [rad or m], shape (joints,).
         """
         still = np.zeros(self._chain.joints)
-        self._set(np.array(position, dtype=float), still, still, still)
+        self.take(_read_only(np.array(position, dtype=float), still, still, still))
 
     def load(self, loads: tuple[Load, ...]) -> None:
         """Attach point masses to the last link, in place of those attached before.
@@ -320,6 +327,14 @@ class Plant:
         Raises:
             DriverError: the state is no longer finite; it stays what it was before the step.
         """
+        self.take(self.after(torque, period))
+
+    def take(self, state: PlantState) -> None:
+        """Take over a state that `after` has returned."""
+        self._position, self._velocity, self._acceleration, self._rate = state
+
+    def after(self, torque: Array, period: float | None = None) -> PlantState:
+        """Return the state after a step, and leave the plant where it is; arguments and errors as for `step`."""
         h = self._period if period is None else period
         if h != self._stepped:
             self._stepped, self._half = h, 0.5 * h
@@ -340,7 +355,7 @@ class Plant:
                 v_next, rate = self._stick_or_slip(q_m, v_m, smooth)
         else:
             v_next, rate = self._stick_or_slip(q_m, v_m, smooth)
-        self._set(self._position + self._half * (v + v_next), v_next, (v_next - v) / h, rate)
+        return _read_only(self._position + self._half * (v + v_next), v_next, (v_next - v) / h, rate)
 
     def inverse_dynamics(self, position: Array, velocity: Array, acceleration: Array) -> Array:
         """Return the torque that the true parameters need at one state, without noise: the truth to score against.
@@ -399,8 +414,10 @@ class Plant:
         rate = stick_slip_velocity(inverse.T @ A @ inverse, inverse.T @ b, bound, self._rate)
         return np.asarray(inverse @ rate), rate
 
-    def _set(self, position: Array, velocity: Array, acceleration: Array, rate: Array) -> None:
-        # Replaced, never written into, so that whoever holds an old state keeps it.
-        for array in (position, velocity, acceleration, rate):
-            array.setflags(write=False)
-        self._position, self._velocity, self._acceleration, self._rate = position, velocity, acceleration, rate
+
+def _read_only(*arrays: Array) -> PlantState:
+    """Return the state of these arrays, which are replaced, never written into: whoever holds an old state keeps it."""
+    for array in arrays:
+        array.setflags(write=False)
+    position, velocity, acceleration, rate = arrays
+    return position, velocity, acceleration, rate

@@ -468,7 +468,7 @@ class CanopenDrive:
         self._firmware = Firmware(node, self._personality, self._control)
         self._makers = VendorWatchdogs(node, self.emergency, self._late, there=like.shipped)
         self._failure = 0
-        self._warned = self._evaluated = False
+        self._warned = self._evaluated = self._synced = False
         self._ears: set[int] = set()
         self.sync_identifier = 0
         self.deaf = False
@@ -532,13 +532,26 @@ class CanopenDrive:
         elif identifier == self.sync_identifier:
             if state is not State.STOPPED:
                 self._sync(frame.data)
+                out, self._node.out = self._node.out, []
+                return out
         elif identifier == 0x600 + self._node.number:
             if state is not State.STOPPED and (answer := self._sdo.answer(frame.data)) is not None:
                 self._node.send(0x580 + self._node.number, answer)
         elif identifier in self._pdos.rpdos:
-            self._pdos.receive(identifier, frame.data)
+            if not self._pdos.receive(identifier, frame.data):
+                return []
         elif 0x700 < identifier < 0x780:
             self.nmt.heard(frame)
+        return self._finish()
+
+    def finish_sync(self, now_ns: int) -> list[Frame]:
+        """Let the received torques act, after a SYNC that `receive` has answered; returns what the drive sends."""
+        self._node.now_ns = now_ns
+        if self._synced:
+            self._synced = self._evaluated = False
+            self._pdos.act()  # limits depend on where the motor is, whether a torque has come or not
+            if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
+                self._torque.evaluate(now_ns)
         return self._finish()
 
     def tick(self, now_ns: int) -> list[Frame]:
@@ -640,10 +653,8 @@ class CanopenDrive:
             self._makers.synced()
         self._sample(self._node.now_ns)
         self._torque.tell_mean(self._node.now_ns)
-        self._evaluated = False
-        self._pdos.sync()  # limits depend on where the motor is, whether a torque has come or not
-        if not self._evaluated and self.power.state is PowerState.OPERATION_ENABLED:
-            self._torque.evaluate(self._node.now_ns)
+        self._pdos.sync()
+        self._synced = True
 
     def _sample(self, now_ns: int) -> None:
         values = self.objects.values

@@ -236,17 +236,20 @@ class Pdos:
         for name in [name for name in self._node.timers if name.startswith((_DEADLINE, _EVENT, _INHIBITED))]:
             self._node.stop(name)
 
-    def receive(self, identifier: int, data: bytes) -> None:
-        """Process a frame with the identifier of an RPDO."""
+    def receive(self, identifier: int, data: bytes) -> bool:
+        """Process a frame with the identifier of an RPDO; return whether more has changed than what waits for SYNC."""
+        changed = bool(self._emergency.active)
         if not self._active:
-            return
+            return False
         for rpdo in self.rpdos.get(identifier, ()):
             size = rpdo.layout.packing.size
             if len(data) < size:
                 self._emergency.occurs(PDO_SHORT)
+                changed = True
                 continue
             if len(data) > size:
                 self._emergency.occurs(PDO_LONG)
+                changed = True
             elif self._emergency.active:
                 self._emergency.is_over(PDO_SHORT, PDO_LONG, RPDO_TIMEOUT)
             if rpdo.deadline_ns:
@@ -258,9 +261,11 @@ class Pdos:
                 rpdo.waiting = data[:size]
             else:
                 self._act(rpdo, data[:size])
+                changed = True
+        return changed
 
     def sync(self) -> None:
-        """Process a SYNC: send synchronous TPDOs with present values, then let received torques act."""
+        """Process a SYNC: send synchronous TPDOs with present values; `act` follows."""
         self._synced_ns = self._node.now_ns
         if not self._active:
             return
@@ -274,6 +279,9 @@ class Pdos:
             if tpdo.syncs >= tpdo.kind:
                 tpdo.syncs, tpdo.last = 0, data
                 self._node.send(tpdo.identifier, data)
+
+    def act(self) -> None:
+        """Let what synchronous RPDOs have brought since the last SYNC act."""
         for group in self.rpdos.values():
             for rpdo in group:
                 if rpdo.waiting is not None:

@@ -10,12 +10,17 @@ Between two instants at which something changes, motors do the same, and the pla
 is divided into steps near the nominal period, between which `watch` is called, so that whoever limits torques by
 position and speed can. A step of exactly the nominal period is the simulated arm's. The arm is supported until all
 motors are powered and one of them has been given torque, or holds a position: drives are enabled with no torque.
+
+In real time cycles come a little early or late. There the plant may be `slack_ns` away from the time it is asked for,
+its motors are where their speeds have brought them by then, and its steps stay nominal, so that `prepare` can compute
+the next one before it is due.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import ceil
+from operator import is_
 
 import numpy as np
 
@@ -24,7 +29,7 @@ from ident_service.config.recording import Transmission
 from ident_service.errors import DriverError
 from sim_backend.emulator.motor import Motor, Power
 from sim_backend.machine import Truth
-from sim_backend.plant import Plant
+from sim_backend.plant import Plant, PlantState
 
 
 class Gears:
@@ -113,6 +118,7 @@ class Body:
         now_ns: the time that the plant has been moved to.
         watch: called after each step but the last of a longer silence, with the time.
         supported: whether the arm is still supported.
+        slack_ns: how far from the plant's time a time may be that needs no step; 0 in virtual time.
     """
 
     def __init__(self, plant: Plant, gears: Gears, noise: Vector, seed: int) -> None:
@@ -129,6 +135,9 @@ class Body:
         self.now_ns = 0
         self.watch: Callable[[int], None] = lambda now_ns: None
         self.supported = True
+        self.slack_ns = 0
+        self._prepared: tuple[tuple[object, ...], PlantState] | None = None  # its conditions and its end
+        self._regular = False  # whether the last step was nominal
         self._period_ns = round(plant.period * 1e9)
         self._noise_level = noise
         self._random = np.random.default_rng(seed) if noise.any() else None
@@ -150,7 +159,7 @@ class Body:
         """Return the angle of a motor [rad]."""
         self.advance(now_ns)
         self._look()
-        return self._angles[motor]
+        return self._angles[motor] + self._speeds[motor] * (now_ns - self.now_ns) * 1e-9
 
     def speed(self, motor: int, now_ns: int) -> float:
         """Return the speed of a motor [rad/s]."""
@@ -170,7 +179,7 @@ class Body:
         """
         begun = self.now_ns
         interval = now_ns - begun
-        if interval <= 0:
+        if interval <= self.slack_ns:
             return
         steps = ceil(interval / (_LONGEST * self._period_ns))
         for number in range(1, steps + 1):
@@ -207,6 +216,16 @@ class Body:
         if now_ns - self.now_ns > _LONGEST * self._period_ns:
             self.advance(now_ns)
 
+    def prepare(self) -> None:
+        """Compute the next nominal step in advance, where steps are regular; `advance` takes it if it still fits.
+
+        Raises:
+            DriverError: the plant will run away.
+        """
+        self._collect()
+        if self._regular and not self.supported and self._prepared is None:
+            self._prepared = self._conditions(), self.plant.after(self._acting_torque())
+
     @property
     def overdue_ns(self) -> int | None:
         """Return when a moving plant's next cycle is clearly overdue [ns]; None while the arm is supported."""
@@ -219,22 +238,37 @@ class Body:
         return Truth(stamp_ns, plant.position, plant.velocity, plant.acceleration, self._torque)
 
     def _step(self, end_ns: int) -> None:
-        interval, begun = end_ns - self.now_ns, self.now_ns
-        self.now_ns = end_ns
+        interval = end_ns - self.now_ns
         self._collect()
         if self.supported:
+            self.now_ns = end_ns
             return
+        prepared, self._prepared = self._prepared, None
+        self._regular = abs(interval - self._period_ns) <= self.slack_ns
+        if not self._regular:
+            self.plant.step(self._acting_torque(), interval * 1e-9)
+            self.now_ns = end_ns
+            return
+        if prepared is not None and all(map(is_, prepared[0], self._conditions())):
+            self.plant.take(prepared[1])
+        else:
+            self.plant.step(self._acting_torque())
+        self.now_ns += self._period_ns
+
+    def _conditions(self) -> tuple[object, ...]:
+        """Return what a prepared step depends on; each of these is replaced when it changes."""
+        return *self.plant.conditions, self._torque, self._driven
+
+    def _acting_torque(self) -> Vector:
+        """Return the torque that acts on the joints from now on [N m or N], with its noise, shape (joints,)."""
         torque = self._torque
         if self._random is not None and self._driven.any():
             # Once per cycle, however a cycle is divided: two buses have their SYNCs a little apart.
-            if 2 * (begun - self._drawn_ns) >= self._period_ns or self._noise is None:
+            if 2 * (self.now_ns - self._drawn_ns) >= self._period_ns or self._noise is None:
                 self._noise = self._noise_level * self._random.standard_normal(torque.size)
-                self._drawn_ns = begun
+                self._drawn_ns = self.now_ns
             torque = torque + self._noise * self._driven
-        if interval == self._period_ns:
-            self.plant.step(torque)
-        else:
-            self.plant.step(torque, interval * 1e-9)
+        return torque
 
     def _collect(self) -> None:
         """Collect the motors' torques and braking at the joints; computed again only when a motor changed."""

@@ -121,7 +121,14 @@ class Emulator:
             companion.power_up(now_ns)
         self._deadline = None
 
-    def receive(self, bus: int, frame: Frame, now_ns: int, sender: int | None = None) -> list[Sent]:
+    def receive(
+        self,
+        bus: int,
+        frame: Frame,
+        now_ns: int,
+        sender: int | None = None,
+        answer: Callable[[list[Sent]], object] | None = None,
+    ) -> list[Sent]:
         """Process a frame that has come over a bus.
 
         Args:
@@ -129,9 +136,11 @@ class Emulator:
             frame: of any kind.
             now_ns: time of reception.
             sender: the drive that sent it, which does not hear it; None for the host.
+            answer: given the answers to a SYNC before torques act, for a host that waits for them; None to have them
+                returned with the rest.
 
         Returns:
-            What the drives send, in order.
+            What else the drives send, in order.
 
         Raises:
             DriverError: the plant ran away.
@@ -141,12 +150,18 @@ class Emulator:
             return []
         self.body.catch_up(now_ns)
         sent: list[Sent] = []
-        is_sync = False
+        synced: list[tuple[int, EmulatedDevice]] = []
         for drive, face in self._on_bus.get(bus, ()):
             if face.listens(frame.identifier) and drive != sender and not self._injection.dead(drive):
                 self._deadline = None
-                is_sync = is_sync or frame.identifier == face.sync_identifier
+                if frame.identifier == face.sync_identifier:
+                    synced.append((drive, face))
                 sent += self._injection.apply_to_frames(drive, face.receive(frame, now_ns), now_ns)
+        if synced and answer is not None:
+            answer(sent)
+            sent = []
+        for drive, face in synced:
+            sent += self._injection.apply_to_frames(drive, face.finish_sync(now_ns), now_ns)
         for companion in self.companions if bus == 0 and sender is None else ():
             if companion.listens(frame.identifier):
                 self._deadline = None
@@ -154,7 +169,7 @@ class Emulator:
         if not self.body.supported and all(face.released for face in self.faces):
             self.body.support(now_ns)
             self._deadline = None
-        if is_sync and not (frame.error or frame.remote or frame.extended):
+        if synced and not (frame.error or frame.remote or frame.extended):
             self._sync(bus, now_ns)
         return sent
 
@@ -190,12 +205,14 @@ class Emulator:
         self._deadline = None
 
     def go_on(self, now_ns: int) -> None:
-        """Advance the arm when the next cycle is late, by `Body.overdue_ns`, instead of when the cycle comes.
+        """Compute the arm's next step before its cycle; take it when the cycle is late, by `Body.overdue_ns`.
 
-        Moving the arm takes longest; without this, a cycle that came late would have its answers late, too.
+        Moving the arm takes longest; without this the answers to each cycle would come later, and late ones late.
         """
         overdue = self.body.overdue_ns
-        if overdue is not None and overdue <= now_ns:
+        if overdue is None or now_ns < overdue:
+            self.body.prepare()
+        else:
             self.body.advance(now_ns)
             self._watch(now_ns)
             self._now_ns = max(now_ns, self._now_ns)

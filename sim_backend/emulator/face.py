@@ -80,7 +80,10 @@ class EmulatedDevice(Protocol):
         """Start the firmware."""
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of another node."""
+        """Process a frame of another node; of a SYNC, what its answer needs."""
+
+    def finish_sync(self, now_ns: int) -> list[Frame]:
+        """Do what else a SYNC asks for, when its answer is on its way; called after each `receive` of one."""
 
     def tick(self, now_ns: int) -> list[Frame]:
         """Process the timers that are due."""

@@ -20,6 +20,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import can
@@ -238,6 +239,7 @@ class HostedBuses:
 
 _POLL_NS = 20_000_000  # commands, stop and states are looked at this often
 _GIVEN_UP = 0.9  # of a period after SYNC, when a host hardly waits for positions any more
+_SLACK = 0.05  # of a period, by which a cycle may be early or late and the arm's step is still a nominal one
 _AT_ONCE = 256  # frames handled before time is looked at again
 # Speed below which an arm is said to rest when it has been so for a while, and above which to move [rad/s or m/s].
 _RESTS, _MOVES = 1e-2, 3e-2  # closed brakes creep by some 1e-3
@@ -327,6 +329,7 @@ class _Run:
         self._emulator, self._station = emulator, station
         self._stamps = isinstance(station, HostedBuses)  # whether frames say when they were on the wire
         self._given_up_ns = round(_GIVEN_UP * 1e9 * emulator.body.plant.period)
+        emulator.body.slack_ns = round(_SLACK * 1e9 * emulator.body.plant.period)
         self._tell, self._commands = tell, commands
         self._clock = RealClock()
         self._later: list[tuple[int, int, Sent]] = []
@@ -365,7 +368,8 @@ class _Run:
                     bus, frame = heard
                     # Drives act when a frame is on the wire, not when this process comes to it.
                     at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
-                    self._send_ready_frames(emulator.receive(bus, frame, at_ns), at_ns)
+                    answer = partial(self._send_ready_frames, requested_ns=at_ns)
+                    answer(emulator.receive(bus, frame, at_ns, answer=answer))
                     now = clock.now_ns()
                     heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
                 if at_once:

@@ -163,6 +163,10 @@ class EmulatedPuck:
             return [position_frame(self._node, counts, None if self._joint is None else self._joint(now_ns))]
         return [reply(self._node, request.number, self._value(name, now_ns), wide=self._properties.is_wide(name))]
 
+    def finish_sync(self, now_ns: int) -> list[Frame]:
+        """Do nothing: torques act when they come."""
+        return []
+
     def set_mode(self, mode: Mode, now_ns: int) -> None:
         """Take the mode that the safety puck sets."""
         if self._stat is not Status.READY:

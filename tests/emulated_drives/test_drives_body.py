@@ -172,6 +172,53 @@ def test_an_encoder_counts_motor_turns_from_the_zero_of_the_joints(tmp_path: Pat
     assert [motor.encoder(0) for motor in relative.body.motors] == [0, 0]
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_a_step_that_was_prepared_is_the_step_to_the_bit(tmp_path: Path, noise: float) -> None:
+    prepared, plain = (body_of(tmp_path, torque_noise=noise) for _ in range(2))
+    random = np.random.default_rng(1)
+    taken = 0
+    for cycle in range(300):
+        at_motors = random.uniform(-0.5, 0.5, 2).tolist()
+        for body in (prepared, plain):
+            for motor, torque in zip(body.motors, at_motors, strict=True):
+                motor.drive(torque, cycle * MS)
+        prepared.prepare()
+        foreseen = prepared._prepared
+        changed = cycle % 50
+        for body in (prepared, plain):  # what changes after it was prepared counts
+            if changed == 10:
+                body.motors[0].drive(0.25, cycle * MS)
+            elif changed == 20 and not noise:  # which acts on no joint that is braked, and is drawn for none then
+                body.motors[1].brake(cycle * MS)
+            elif changed == 30:
+                body.plant.load(((0.5 + cycle * 1e-3, (0.0, 0.0, 0.0)),))
+            body.advance((cycle + 1) * MS)
+        taken += foreseen is not None and foreseen[1][0] is prepared.plant.position
+        assert (prepared.plant.position == plain.plant.position).all()
+        assert (prepared.plant.velocity == plain.plant.velocity).all()
+    assert taken == 300 - 1 - (12 if noise else 18)  # the first, and two or three of each fifty
+
+
+def test_cycles_a_little_early_or_late_find_the_motors_where_their_speed_has_brought_them(tmp_path: Path) -> None:
+    body, exact = (body_of(tmp_path) for _ in range(2))
+    body.slack_ns = MS // 20
+    random = np.random.default_rng(1)
+    for motor, other in zip(body.motors, exact.motors, strict=True):
+        motor.drive(0.5, 0)
+        other.drive(0.5, 0)
+    for cycle in range(1, 200):
+        body.prepare()
+        at = cycle * MS + int(random.integers(-body.slack_ns, body.slack_ns))
+        found = [body.angle(motor, at) for motor in range(2)]
+        assert found == pytest.approx([exact.angle(motor, at) for motor in range(2)], abs=2e-5)  # of 20 turns a joint
+        assert body.now_ns == cycle * MS
+        body.catch_up(at)
+        assert abs(body.now_ns - at) <= body.slack_ns
+    late = 200 * MS + 3 * body.slack_ns
+    body.advance(late)  # too late for a step in advance
+    assert body.now_ns == late
+
+
 def test_a_late_host_finds_the_arm_moved_on_already(tmp_path: Path) -> None:
     emulator = build_emulator(drives_config(tmp_path))
     emulator.power_up(0)

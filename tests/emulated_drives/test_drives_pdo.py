@@ -7,6 +7,9 @@ import struct
 import pytest
 from drives_bench import MS, Host
 
+from drivers.can.can_frame import Frame
+from sim_backend.emulator.faults import Sent
+
 WRONG_STATE, WRONG_VALUE = 0x08000022, 0x06090030
 
 
@@ -16,6 +19,20 @@ def test_a_shared_frame_gives_each_drive_its_own_torque_at_the_sync(enabled: Hos
     enabled.send(0x080)
     assert [enabled.read(node, 0x6071, 0, "h") for node in (1, 2)] == [111, -222]
     assert [enabled.read(node, 0x6077, 0, "h") for node in (1, 2)] == [111, -222]
+
+
+def test_a_host_that_waits_has_the_answers_to_a_sync_before_torques_act(enabled: Host) -> None:
+    emulator, order = enabled.arm.emulator, list[tuple[int, list[float]]]()
+    enabled.torques(111, -222)
+    torques = [motor.torque for motor in emulator.body.motors]
+
+    def answer(sent: list[Sent]) -> None:
+        order.extend((item.frame.identifier, [motor.torque for motor in emulator.body.motors]) for item in sent)
+
+    rest = emulator.receive(0, Frame(0x080), enabled.now, answer=answer)
+    assert order == [(0x181, torques), (0x182, torques)]
+    assert [item.frame.identifier for item in rest] == [0x281, 0x282]  # the torque that acts now
+    assert [motor.torque != before for motor, before in zip(emulator.body.motors, torques, strict=True)] == [True, True]
 
 
 @pytest.mark.parametrize(("data", "code", "acts"), [(b"\x01\x00", 0x8210, False), (b"\x05\0\x06\0\0\0", 0x8220, True)])
