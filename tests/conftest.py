@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import pytest
 from helpers import tickets
-from helpers.forks import fork_processes
+from helpers.forks import ForkServer, fork_processes
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
@@ -36,12 +36,13 @@ _ALLOWED = (
     "`make test-foreign` runs it",
 )
 
-# Folders, and files of others, about what a command does and not about how its processes begin, talk and end; and files
-# in these folders that are about that. Not those of the daemon: its threads would be forked with it.
+# Folders, and files of others, about what a command does and not about how its processes begin, talk and end; those
+# with a daemon's threads, which must not be forked with it; and files in these folders that are about processes.
 _FORKED = {"cli", "payload"}
-_FORKED |= {"test_can_log", "test_finish", "test_recover", "test_zero"}
-_FORKED |= {"test_canopen_matrix", "test_canopen_positions", "test_pucks_run_virtual"}
-_STARTED = {"test_answer", "test_cli_itself"}
+_FORKED |= {"test_can_log", "test_finish", "test_recover", "test_runs", "test_zero"}
+_FORKED |= {"test_canopen_matrix", "test_canopen_positions"}
+_SERVED = {"daemon", "maintenance", "page", "test_fleet_server"}
+_STARTED = {"test_answer", "test_cli_itself", "test_image"}
 
 # A part of hypothesis' usual hundred examples; `make campaign` has a thousand, wherever a test says no number.
 settings.register_profile("default", deadline=None, derandomize=_CI, print_blob=True, max_examples=25)
@@ -88,15 +89,26 @@ def hangups_are_heard() -> Iterator[None]:
     signal.signal(signal.SIGHUP, before)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def fork_server(request: pytest.FixtureRequest) -> Iterator[ForkServer | None]:
+    """The process that forks programs for daemons, made before there is any; None at night."""
+    if "campaign" in (request.config.getoption("--hypothesis-profile", ""), request.config.getoption("-m")):
+        yield None
+        return
+    server = ForkServer()
+    yield server
+    server.close()
+
+
 @pytest.fixture(scope="module", autouse=True)
-def processes(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Fork our own programs from this process where `_FORKED` says so; at night each is started anew."""
-    night = "campaign" in (request.config.getoption("--hypothesis-profile", ""), request.config.getoption("-m"))
-    if night or request.path.stem in _STARTED or not _FORKED & {request.path.parent.name, request.path.stem}:
+def processes(request: pytest.FixtureRequest, fork_server: ForkServer | None) -> Iterator[None]:
+    """Fork our own programs where `_FORKED` and `_SERVED` say so; at night each is started anew."""
+    names = {request.path.parent.name, request.path.stem}
+    if fork_server is None or _STARTED & names or not (_FORKED | _SERVED) & names:
         yield
         return
     with pytest.MonkeyPatch.context() as patch:
-        fork_processes(patch)
+        fork_processes(patch, fork_server if _SERVED & names else None)
         yield
 
 

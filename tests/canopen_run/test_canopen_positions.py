@@ -57,7 +57,8 @@ def of_makers(name: str) -> dict[str, Any]:
     return tree
 
 
-@pytest.mark.parametrize("make", [pytest.param(positions, marks=pytest.mark.campaign), of_makers])
+@pytest.mark.campaign
+@pytest.mark.parametrize("make", [positions, of_makers])
 def test_an_arm_is_checked_moved_and_identified_from_the_torque_that_its_drives_measure(
     make: Any, tmp_path: Path
 ) -> None:

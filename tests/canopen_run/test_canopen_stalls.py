@@ -122,8 +122,14 @@ def undisturbed(seen: Moved) -> None:
     assert np.isclose(slots, np.rint(slots), atol=1e-6).sum() >= len(slots) - 4
 
 
+SIDES = [
+    pytest.param(False, id="after the frame"),
+    pytest.param(True, id="before the frame", marks=pytest.mark.campaign),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("before", [False, True], ids=["after the frame", "before the frame"])
+@pytest.mark.parametrize("before", SIDES)
 def test_a_stall_of_nine_milliseconds_about_a_sync_is_survived_wherever_it_comes(tmp_path: Path, before: bool) -> None:
     seen = moved(tmp_path, {900: 5.0, 1100: 9.0, 1300: 9.0, 1301: 9.0}, before=before)
     undisturbed(seen)
@@ -152,7 +158,7 @@ def test_a_stall_that_is_too_long_or_comes_too_often_is_a_controlled_stop_of_its
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("before", [False, True], ids=["after the frame", "before the frame"])
+@pytest.mark.parametrize("before", SIDES)
 def test_a_runaway_that_begins_in_a_stall_is_seen_as_soon_as_without_one(tmp_path: Path, before: bool) -> None:
     calm, stalled = (
         moved(tmp_path, stalls, before=before, fault="torque_sign joint=elbow") for stalls in ({}, {1000: 9.0})

@@ -27,8 +27,8 @@ def arm(folder: Path, name: str, **driver: Any) -> Path:
     return write(folder, puck_arm(name, RATE, KP, KD, LOCK_STEP, **driver))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("firmware", [pytest.param(40, marks=pytest.mark.campaign), 200])
+@pytest.mark.campaign
+@pytest.mark.parametrize("firmware", [40, 200])  # in real time: `test_pucks_run_real`
 def test_an_arm_of_pucks_is_checked_run_and_identified(tmp_path: Path, firmware: int, capsys: Any) -> None:
     name = f"pucks{firmware}"
     path, run, out = arm(tmp_path, name, emulation={"firmware": firmware}), tmp_path / "run", tmp_path / "out"

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from certificate_samples import parameter_file, random_bodies, random_config, text
-from hypothesis import given, settings
+from helpers.examples import some
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.certificate_verifier import verify
@@ -17,7 +18,7 @@ from ident_service.model.parameter_layout import INERTIAL
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@some(6)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 5), square=st.booleans())
 def test_real_bodies_are_proven_feasible(seed: int, joints: int, square: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -35,7 +36,7 @@ def test_real_bodies_are_proven_feasible(seed: int, joints: int, square: bool) -
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@some(4)
 @given(seed=st.integers(0, 2**32 - 1), square=st.booleans())
 def test_impossible_bodies_are_proven_infeasible(seed: int, square: bool) -> None:
     rng = np.random.default_rng(seed)

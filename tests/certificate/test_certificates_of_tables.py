@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from certificate_samples import parameter_file, table_1, table_6, text
+from helpers.examples import NIGHT
 
 from ident_service.certificate_verifier import verify
 from ident_service.errors import ParameterError
@@ -105,16 +106,18 @@ def test_on_the_boundary_it_is_undecided_or_proven_but_never_wrong(wam7: ArmMode
     conditions = feasible_set("inertia", base.names, wam7.config)
     low, high = 0.0, 1.0
     verdicts = set()
-    for _ in range(24):
+    for halved in range(24):
         share = 0.5 * (low + high)
         beta = tables["beta_star_c"] + share * (tables["beta_ols"] - tables["beta_star_c"])
-        certificate = certify(beta, base, conditions)
         margin = feasibility_test(beta, base, conditions).margin
+        low, high = (share, high) if margin > 0.0 else (low, share)
+        if not NIGHT and halved % 4 not in (0, 1):
+            continue
+        certificate = certify(beta, base, conditions)
         verdicts.add(certificate.verdict)
         if abs(margin) > 1e-7:
             assert certificate.verdict == ("feasible" if margin > 0.0 else "infeasible")
         assert verify(text(parameter_file(beta, base, certificate))).verdict == certificate.verdict
-        low, high = (share, high) if margin > 0.0 else (low, share)
     assert {"feasible", "infeasible"} <= verdicts
 
 

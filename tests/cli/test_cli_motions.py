@@ -250,6 +250,7 @@ def test_the_whole_job_with_a_designed_motion(designed: DesignedBefore, tmp_path
     assert played["a"] == read(designed.folder / "motion.json")["a"]
 
 
+@pytest.mark.campaign
 def test_ctrl_c_ends_a_search_with_what_it_has(tmp_path: Path) -> None:
     command = [
         sys.executable,

@@ -284,7 +284,12 @@ def test_a_fault_stops_the_arm(place: Path, ident: Ident) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("cycles", "motion"), [(100, "identification"), (2250, "identification"), (4500, "validation")]
+    ("cycles", "motion"),
+    [
+        (100, "identification"),
+        pytest.param(2250, "identification", marks=pytest.mark.campaign),
+        (4500, "validation"),
+    ],
 )
 def test_a_stop_on_request_is_no_success_and_nothing_moves_again(place: Path, cycles: int, motion: str) -> None:
     config = load_arm(quick_arm(place, *COARSE))

@@ -201,7 +201,7 @@ def test_a_target_of_accuracy_is_for_a_run_without_the_key(tmp_path: Path, capsy
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [["run", "--hold-to-run"], ["rehearse"]])
+@pytest.mark.parametrize("words", [["run", "--hold-to-run"], pytest.param(["rehearse"], marks=pytest.mark.campaign)])
 def test_a_rehearsal_ends_with_the_key(
     words: list[str],
     keyboard: Keyboard,

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 import pytest
-from cli.conftest import Commissioned, quick_arm
+from cli.conftest import COARSE, Commissioned, quick_arm
 from helpers.tickets import write_checked_ticket
 
 from ident_service.cli.progress import Mark, estimate, time_left
@@ -150,7 +150,7 @@ def test_nothing_is_drawn_in_pipes_and_without_colours_where_they_are_not_wanted
 @pytest.mark.slow
 def test_a_terminal_that_takes_nothing_more_stops_no_motion(tmp_path: Path) -> None:
     """Its buffer is full within a second, and the lease is kept: only drawing waits."""
-    arm, state = quick_arm(tmp_path), tmp_path / "state"
+    arm, state = quick_arm(tmp_path, *COARSE), tmp_path / "state"
     state.mkdir(mode=0o700)
     write_checked_ticket(load_arm(arm), state)
     folder = tmp_path / "run"

@@ -49,7 +49,7 @@ def test_the_published_files_are_those_of_the_models(schema: dict[str, Any]) -> 
     assert (ROOT / "docs" / "reference-description.md").read_text() == reference(), RENEW
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_command_that_the_page_names_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = [arm_schema_file(), ROOT / "docs" / "reference-description.md"]
     files = [tmp_path / "schema.json", tmp_path / "page.md"]

@@ -83,7 +83,7 @@ def test_every_request_file_and_target_is_there(daemon: Asked) -> None:
     assert asked > 15
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(500)
 def test_the_programs_run(
     table: Path, state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

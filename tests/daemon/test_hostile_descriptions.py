@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from daemon.conftest import Asked
 from daemon.served import daemon_process
+from helpers.forks import start_processes
 
 from ident_service.daemon.routes.checks import MOST_CHECKS
 from ident_service.errors import ConfigError, ModelError
@@ -71,7 +72,8 @@ def test_a_mechanism_that_breaks_parsers_leaves_the_daemon_alive(
 
 
 @pytest.mark.slow
-def test_the_daemon_itself_reads_no_urdf_that_is_new(state: Path) -> None:
+def test_the_daemon_itself_reads_no_urdf_that_is_new(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start_processes(monkeypatch)  # one that has loaded nothing yet
     configs = Path(__file__).resolve().parents[2] / "configs"
     text = (configs / "threelink.yaml").read_text().replace("name: threelink", "name: mine")
     upload = {"description": text, "files": {"threelink.urdf": (configs / "threelink.urdf").read_text()}}

@@ -24,6 +24,8 @@ from ident_service.daemon.jobs.socket_activation import taken
 from ident_service.daemon.serve import notify_systemd, watchdog_seconds
 from ident_service.errors import ArmError, MotionRefused, UnknownId, UsageError
 from ident_service.motion.command_channel import ControlFile
+from ident_service.operations.run_archive import import_run
+from ident_service.registry.database import Database
 from ident_service.registry.state_folder import control_path
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -41,7 +43,7 @@ def ident(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict
     return code, document
 
 
-def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_drives_a_daemon(state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with daemon_process(state) as (process, client):
         # One instance, and everything below the state folder is its own.
         second = subprocess.run(
@@ -72,9 +74,8 @@ def test_the_command_drives_a_daemon(state: Path, tmp_path: Path, capsys: pytest
         assert {one["parameter"] for one in until.pop("missed")} == {"fv1", "fc1"}
         assert until == {**wanted, "reached": None}
         assert ident(capsys, "run", "quick", "--parameter", "fv1", "--confirm", "quick", *server)[0] == 2
-        code, document = ident(capsys, "simulate", "quick", *server)
-        assert (code, document["job"]["state"], document["answer"]["feasible"]) == (0, "done", True)
-        run = document["job"]["run"]
+        with Database(state) as db:
+            run = import_run(db, state, commissioned, "test")["id"]
         code, document = ident(capsys, "identify", f"{run}/identification.mcap", "--arm", "quick", *server)
         assert (code, document["answer"]["feasible"]) == (0, True)
         code, document = ident(capsys, "simulate", "wam7", *server)

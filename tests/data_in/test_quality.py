@@ -47,7 +47,7 @@ def test_stamps() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("samples", [4096, 37, 5])
+@pytest.mark.parametrize("samples", [4096, 37, pytest.param(5, marks=pytest.mark.campaign)])
 def test_saturation(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A sine of 10 N m that a drive cuts at 8 N m, and one that it lets pass."""
     sine = 10.0 * np.sin(2 * np.pi * 0.5 * MILLISECONDS * 1e-9)
@@ -83,7 +83,7 @@ def test_a_touch_of_the_extreme_is_no_saturation() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("samples", [4096, 7])
+@pytest.mark.parametrize("samples", [4096, 37, pytest.param(7, marks=pytest.mark.campaign)])
 def test_standstill_and_encoder_steps(samples: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The joint moves at 0.1 rad/s for a quarter of the time; read by an encoder of 1e-4 rad."""
     position = np.cumsum(np.where(np.arange(10_000) < 2500, 1e-4, 0.0))

@@ -145,6 +145,7 @@ def test_a_delay_is_chosen_where_there_is_one(seconds: float, taken: bool) -> No
     assert (errors[1] < 0.9 * errors[0]) is taken
 
 
+@pytest.mark.campaign
 def test_channels_that_do_not_belong_together_have_no_delay() -> None:
     model, _, _ = two_links()
     estimate = identify(with_options(model, plain_options(smoothing=SMOOTH, delay="choose")), [late(0.35)])

@@ -79,7 +79,7 @@ def drawn(setting: Setting, kind: str, weight: float | str) -> Estimate:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["euclidean", "entropic"])
+@pytest.mark.parametrize("kind", ["euclidean", pytest.param("entropic", marks=pytest.mark.campaign)])
 def test_a_prior_draws_as_strongly_as_its_weight(setting: Setting, plain: Estimate, kind: str) -> None:
     assert setting.model.prior is not None
     wanted = plain.base.K @ setting.model.prior

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.examples import some
 from helpers.random_arms import model_around, random_chain, random_delta
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.config.arm import ArmConfig
@@ -72,7 +73,7 @@ def assert_bounds(series: FourierSeries, points: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=20)
+@some(8)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.integers(1, 3), harmonics=st.integers(1, 3))
 def test_peaks_bound_a_thousand_times_finer_sampling(seed: int, joints: int, harmonics: int) -> None:
     rng = np.random.default_rng(seed)
@@ -177,7 +178,7 @@ def test_seeded_motions_are_the_same_for_the_same_seed() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=40)
+@some(12)
 @given(
     seed=st.integers(0, 2**31),
     harmonics=st.integers(1, 10),

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.examples import some
 from helpers.random_arms import model_around, random_chain, random_delta
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from motions import random_fourier_path, random_path, random_posture_path
 
@@ -97,7 +98,7 @@ def assert_bounds(asked: PeakBounds, found: dict[str, Array]) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=6)
+@some(3)
 @given(seed=SEEDS, joints=st.integers(1, 3))
 def test_a_thousand_times_finer_nothing_exceeds_the_bounds(seed: int, joints: int) -> None:
     model = random_arm(seed, joints)
@@ -106,7 +107,7 @@ def test_a_thousand_times_finer_nothing_exceeds_the_bounds(seed: int, joints: in
 
 
 @pytest.mark.slow
-@settings(max_examples=4)
+@some(2)
 @given(seed=SEEDS)
 def test_nor_in_the_ramps(seed: int) -> None:
     model = random_arm(seed, 2)
@@ -115,7 +116,7 @@ def test_nor_in_the_ramps(seed: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=4)
+@some(2)
 @given(seed=SEEDS)
 def test_nor_on_segments_between_postures(seed: int) -> None:
     model = random_arm(seed, 2)
@@ -124,7 +125,7 @@ def test_nor_on_segments_between_postures(seed: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=8)
+@some(3)
 @given(seed=SEEDS, share=st.floats(0.3, 1.5))
 def test_a_motion_without_violations_keeps_random_limits_a_thousand_times_finer(seed: int, share: float) -> None:
     model, path = random_arm(seed, 2), random_fourier_path(seed, 2, harmonics=2, ramps=bool(seed % 2))
@@ -151,7 +152,7 @@ def test_a_motion_without_violations_keeps_random_limits_a_thousand_times_finer(
 
 
 @pytest.mark.slow
-@settings(max_examples=15)
+@some(5)
 @given(seed=SEEDS, joints=st.integers(1, 3))
 def test_torque_and_power_lie_inside_their_enclosures_stretch_by_stretch(seed: int, joints: int) -> None:
     model, path = random_arm(seed, joints), random_path(seed, joints)
@@ -172,7 +173,7 @@ def test_torque_and_power_lie_inside_their_enclosures_stretch_by_stretch(seed: i
         assert supplied(model, torque, dq).max() <= drawn[at] * (1 + ROUNDING)
 
 
-@settings(max_examples=15)
+@some(5)
 @given(seed=SEEDS, joints=st.integers(1, 3))
 def test_bounds_are_tight_to_a_few_thousandths(seed: int, joints: int) -> None:
     model, path = without_dry_friction(random_arm(seed, joints)), random_path(seed, joints)
@@ -187,7 +188,7 @@ def test_bounds_are_tight_to_a_few_thousandths(seed: int, joints: int) -> None:
     assert asked.power <= found["power"] * (1.0 + 2e-2)
 
 
-@settings(max_examples=15)
+@some(5)
 @given(seed=SEEDS)
 def test_slack_is_what_a_bound_may_be_above_the_truth(seed: int) -> None:
     model, path = without_dry_friction(random_arm(seed, 2)), random_path(seed, 2)
@@ -201,7 +202,7 @@ def test_slack_is_what_a_bound_may_be_above_the_truth(seed: int) -> None:
         assert (excess <= slack + 1e-3 * (1.0 + np.abs(bound))).all(), name
 
 
-@settings(max_examples=15)
+@some(5)
 @given(seed=SEEDS)
 def test_bounds_are_reached_about_when_they_are_said_to_be(seed: int) -> None:
     model, path = random_arm(seed, 2), random_path(seed, 2)

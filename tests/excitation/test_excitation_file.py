@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.examples import some
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from motions import random_path
@@ -80,7 +81,7 @@ def mutilated(content: Any, place: tuple[Any, ...], value: Any) -> Any:
 
 
 @pytest.mark.slow
-@settings(max_examples=400)
+@some(100)
 @given(seed=st.integers(0, 2), data=st.data())
 def test_a_mutilated_file_is_read_or_refused_with_a_reason(seed: int, data: st.DataObject) -> None:
     content = content_of(seed)
@@ -99,7 +100,7 @@ def test_a_mutilated_file_is_read_or_refused_with_a_reason(seed: int, data: st.D
     assert excitation_from_json(motion.to_json()).to_json() == motion.to_json()
 
 
-@settings(max_examples=200)
+@some(50)
 @given(text=st.text(max_size=30))
 @example(text="[" * 100_000)
 @example(text='{"format": "ident-excitation", "version": 1}')

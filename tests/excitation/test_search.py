@@ -55,7 +55,7 @@ def assert_same(one: SearchResult, other: SearchResult) -> None:
         np.testing.assert_array_equal(first.coefficients, second.coefficients)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_same_seed_and_starts_give_the_same_result_to_the_last_bit() -> None:
     found, _ = searched(3)
     assert found.finished == 3
@@ -63,7 +63,7 @@ def test_the_same_seed_and_starts_give_the_same_result_to_the_last_bit() -> None
     assert_same(found, starts(3))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_however_many_processes_there_are() -> None:
     assert_same(searched(3)[0], starts(3, workers=2))
 
@@ -138,7 +138,7 @@ def test_cancelling_ends_a_search_soon_with_what_it_has() -> None:
     assert found.candidates[0].start >= 0
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_cancelling_ends_the_work_of_other_processes_too() -> None:
     told: list[Progress] = []
     found = starts(10_000, workers=2, tell=told.append, cancelled=lambda: bool(told) and told[-1].finished > 0)

@@ -73,7 +73,7 @@ def as_in(case: int, model: ArmModel) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [0, 1])
+@pytest.mark.parametrize("case", [0, pytest.param(1, marks=pytest.mark.campaign)])
 def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
     model = small()
     model = small(driver=as_in(case, model))
@@ -90,7 +90,7 @@ def test_the_simulated_arm_is_the_one_that_the_loop_drives(case: int) -> None:
         np.testing.assert_allclose(report.peak_following_error, alone.error, rtol=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_motion_that_the_arm_cannot_follow_is_objected_to_and_not_designed() -> None:
     """Soft gains: friction moves the arm farther off than it may be, wherever it moves at all."""
     soft = {name: {"kp": 2.0, "kd": 1.0, "following_error": 0.02} for name in ("shoulder", "elbow")}
@@ -231,7 +231,7 @@ def test_gains_are_proposed_only_as_stiff_as_is_stable(
     assert words(40.0).endswith("; stiffer gains would not be stable")
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(400)
 def test_with_the_gains_that_are_proposed_the_joint_uses_its_velocity() -> None:
     """An elbow too soft to move: with the gains, which are stable at this rate, it moves freely."""
@@ -279,11 +279,9 @@ def test_a_gain_is_a_percentage_until_a_factor_says_more(criterion: Criterion, f
     assert gain_words(criterion, factor) == words
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(400)
-@pytest.mark.parametrize(
-    ("kp", "reason"), [pytest.param(100.0, "lags by", marks=pytest.mark.campaign), (200.0, "comes within")]
-)
+@pytest.mark.parametrize(("kp", "reason"), [(100.0, "lags by"), (200.0, "comes within")])
 def test_what_a_proof_objects_to_is_searched_for_again_and_not_only_made_smaller(kp: float, reason: str) -> None:
     """A soft arm above a floor: its heavier links, which no forecast knows, and the tube around its motion."""
     gains = {"kp": kp, "kd": 2.0 * kp**0.5}

@@ -242,6 +242,7 @@ def undisturbed(cluster: LocalCluster, folder: Path, tmp_path_factory: pytest.Te
     return bits(place / "out")
 
 
+@pytest.mark.campaign
 def test_killed_workers_change_nothing(
     fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -283,6 +284,7 @@ def _allow(failures: int, dask_scheduler: Any = None) -> None:
     dask_scheduler.allowed_failures = failures
 
 
+@pytest.mark.campaign
 def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
     """After one try here, after four as a rule."""
     from distributed import Client
@@ -299,6 +301,7 @@ def test_a_task_that_ends_its_worker_is_given_up(cluster: LocalCluster) -> None:
         assert client.submit(_ends, 2, pure=False).result() == 2
 
 
+@pytest.mark.campaign
 def test_after_a_killed_client_the_next_call_goes_on(
     fleet: Run, cluster: LocalCluster, folder: Path, undisturbed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -320,6 +323,7 @@ def test_after_a_killed_client_the_next_call_goes_on(
     assert bits(tmp_path / "out") == undisturbed
 
 
+@pytest.mark.campaign
 @pytest.mark.campaign
 def test_recordings_and_store_on_s3(
     fleet: Run, endpoint: str, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

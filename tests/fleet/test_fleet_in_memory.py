@@ -148,6 +148,7 @@ def _fill(share: float) -> None:
     worker.held = b"x" * max(int(share * limit) - own, 0)
 
 
+@pytest.mark.campaign
 def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
     """Above 80 % Dask would pause it, and the command waited for ever."""
     request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), workers=1, memory="400MiB")
@@ -157,6 +158,7 @@ def test_a_worker_with_little_memory_left_goes_on(tmp_path: Path) -> None:
         assert client.submit(os.getpid, pure=False).result(timeout=20) in client.run(os.getpid).values()
 
 
+@pytest.mark.campaign
 def test_a_worker_of_others_that_dask_pauses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command would wait for it for ever, without a word."""
     monkeypatch.setattr(reduction, "_LOOKED_AFTER_S", 0.2)

@@ -95,7 +95,14 @@ def test_a_change_is_found_at_its_date_in_its_group() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("scatter", "told", "seeds"), [(0.0, NOISE, 30), (0.05, NOISE, 5), (0.0, 0.5 * NOISE, 5)])
+@pytest.mark.parametrize(
+    ("scatter", "told", "seeds"),
+    [
+        pytest.param(0.0, NOISE, 30, marks=pytest.mark.campaign),
+        (0.05, NOISE, 5),
+        (0.0, 0.5 * NOISE, 5),
+    ],
+)
 def test_unchanged_fleets_raise_no_alarm(scatter: float, told: float, seeds: int) -> None:
     """Also where recordings of one arm differ by more than their covariances say."""
     alarms = sum(any(one.changed for one in changes_of(fleet(seed, scatter), told)) for seed in range(seeds))

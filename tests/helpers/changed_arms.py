@@ -37,6 +37,7 @@ def changed(
     factors: Mapping[str, float] | None = None,
     added: Mapping[str, float] | None = None,
     rate: float | None = None,
+    periods: int | None = None,
 ) -> ArmConfig:
     """An arm whose plant is another one.
 
@@ -48,6 +49,7 @@ def changed(
         added: what is added to them, in SI units.
         rate: of the control loop [Hz], the description's when None; a quarter of it moves and records an arm in a
             quarter of the time.
+        periods: of a seeded identification motion; the description's when None.
     """
     config = load_arm(arm) if isinstance(arm, str) else arm
     truth = truth_of(config)
@@ -58,10 +60,12 @@ def changed(
     table = ParameterTable(names=tuple(truth), values=tuple(truth.values()))
     driver = config.driver.model_copy(update={"seed": seed, "truth": table})
     motions = config.motions
-    if motion is not None:
+    wanted = {"seed": motion, "periods": periods}
+    if any(value is not None for value in wanted.values()):
         planned = motions.identification
         assert isinstance(planned, SeededMotion)
-        motions = motions.model_copy(update={"identification": planned.model_copy(update={"seed": motion})})
+        given = {key: value for key, value in wanted.items() if value is not None}
+        motions = motions.model_copy(update={"identification": planned.model_copy(update=given)})
     control = config.control if rate is None else config.control.model_copy(update={"rate": rate})
     return config.model_copy(update={"driver": driver, "motions": motions, "control": control})
 

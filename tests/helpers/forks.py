@@ -5,16 +5,23 @@ from __future__ import annotations
 import atexit
 import concurrent.futures.thread
 import contextvars
+import ctypes
 import faulthandler
 import fcntl
+import functools
 import gc
+import importlib
 import importlib.util
 import logging
 import multiprocessing.process
 import multiprocessing.resource_tracker
 import multiprocessing.util
 import os
+import pickle
+import pkgutil
+import re
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -24,15 +31,19 @@ import types
 import warnings
 import weakref
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
 import pytest
 
+from ident_service import cli, daemon, operations
+
 # What our own code starts by `-m`. Not there: processes that limit their memory, which this one may have taken already.
 PROGRAMS: Final = frozenset(
     {
         "ident_service",
+        "ident_service.daemon.jobs.socket_activation",
         "ident_service.motion.process",
         "ident_service.operations.target_process",
         "ident_service.recordings.recorder_main",
@@ -63,6 +74,8 @@ class ForkedProcess(subprocess.Popen[Any]):
     this process' command line in `/proc`, and what a test has put in the place of functions is there as well.
     """
 
+    _forks_daemons = False
+
     def _execute_child(self, args: Any, *rest: Any) -> None:
         # Since Python 3.11: executable, preexec_fn, close_fds, pass_fds, cwd, env, startupinfo, creationflags, shell,
         # six ends of pipes, restore_signals, gid, gids, uid, umask, start_new_session, process_group.
@@ -71,7 +84,8 @@ class ForkedProcess(subprocess.Popen[Any]):
             begin = 2 if words[1:2] == ["-P"] else 1
             usual = rest[:2] == (None, None) and rest[2] and not rest[8] and rest[16:20] == (None, None, None, -1)
             module = words[begin + 1 : begin + 3] if words[begin : begin + 1] == ["-m"] else []
-            if usual and rest[21] == -1 and module[:1] and module[0] in PROGRAMS and module[1:] != ["serve"]:
+            known = module[:1] and module[0] in PROGRAMS and (self._forks_daemons or module[1:] != ["serve"])
+            if usual and rest[21] == -1 and known:
                 self._fork(words[begin + 1 :], *rest)
                 return
         super()._execute_child(args, *rest)  # type: ignore[misc]
@@ -82,24 +96,147 @@ class ForkedProcess(subprocess.Popen[Any]):
         if cwd is not None:
             Path(cwd).stat()  # a folder that is not there is the caller's error
         ready, prepared = os.pipe()
-        self.pid = fork()
-        if self.pid == 0:
-            try:
-                if own_session:
-                    os.setsid()
-                if cwd is not None:
-                    os.chdir(cwd)
-                _keep_only(ends[0], ends[3], ends[5], (*pass_fds, prepared))
-                _forget_the_parent(environment)
-                os.close(prepared)
-                contextvars.Context().run(_be, *words)
-            finally:
-                os._exit(255)
-        os.close(prepared)
+        start = _Start(words, (ends[0], ends[3], ends[5]), (*pass_fds, prepared), cwd, environment, own_session)
         with os.fdopen(ready, "rb") as told:
+            self.pid = self._fork_as(start)
+            os.close(prepared)
             told.read()  # its end: now it has its own session, descriptors and signals, as after `exec`
         self._child_created = True
         self._close_pipe_fds(*ends)  # type: ignore[attr-defined]
+
+    def _fork_as(self, start: _Start) -> int:
+        """Fork a child that runs the program, and return its process id."""
+        child = fork()
+        if child == 0:
+            start.go()
+        return child
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What a program begins with: its words, descriptors, folder, environment and session."""
+
+    words: list[str]
+    streams: tuple[int, int, int]  # what becomes 0, 1 and 2; -1: as they are
+    others: tuple[int, ...]  # which keep their numbers; the last one is closed when all is as after `exec`
+    folder: str | os.PathLike[str] | None
+    environment: dict[str, str] | None
+    own_session: bool
+    registry: bool = False  # whether it may open one
+
+    def go(self) -> NoReturn:
+        """Be the program."""
+        try:
+            if self.own_session:
+                os.setsid()
+            if self.folder is not None:
+                os.chdir(self.folder)
+            _keep_only(*self.streams, self.others)
+            _forget_the_parent(self.environment)
+            if not self.registry:
+                # SQLite knows in each process which files that has locked; a fork would believe to have those locks.
+                sqlite3.connect = _no_registry
+            if self.words[:2] == ["ident_service", "serve"]:
+                subprocess.Popen = served_by(ForkServer())  # type: ignore[misc]
+            os.close(self.others[-1])
+            contextvars.Context().run(_be, *self.words)
+        finally:
+            os._exit(255)
+
+
+class ForkServer:
+    """Forks programs for a process with threads, a daemon's, whose locks a fork of its own would have.
+
+    It is itself forked from the tests before there is any daemon. The programs are children of the tests all the same:
+    each is forked by a process that ends at once, while the tests are whom the kernel gives such children to.
+    """
+
+    def __init__(self) -> None:
+        self._link, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._lock = threading.Lock()
+        self._pid = fork()
+        if self._pid == 0:
+            try:
+                _serve(its)
+            finally:
+                os._exit(255)
+        its.close()
+
+    def start(self, start: _Start) -> int:
+        """Return the process id of a new child of this process."""
+        umask = re.findall(r"(?m)^Umask:\s*(\d+)$", Path("/proc/self/status").read_text())[0]
+        streams = tuple(number if fd == -1 else fd for number, fd in enumerate(start.streams))
+        whole = replace(
+            start,
+            streams=streams,
+            folder=start.folder or Path.cwd(),
+            environment=dict(os.environ) if start.environment is None else start.environment,
+            registry=True,
+        )
+        with self._lock:
+            _adopt_orphans(True)
+            try:
+                socket.send_fds(self._link, [pickle.dumps((whole, int(umask, 8)))], [*streams, *start.others])
+                answer = self._link.recv(100)
+            finally:
+                _adopt_orphans(False)
+        return int(answer)
+
+    def close(self) -> None:
+        """End the server; programs go on."""
+        self._link.close()
+        os.waitpid(self._pid, 0)
+
+
+def _adopt_orphans(yes: bool) -> None:
+    """Have the kernel make orphans among this process' descendants its children (`PR_SET_CHILD_SUBREAPER`)."""
+    assert ctypes.CDLL(None).prctl(36, int(yes), 0, 0, 0) == 0
+
+
+def _serve(link: socket.socket) -> None:
+    """Fork what is asked for, until nobody can ask any more."""
+    os.setsid()  # an interrupt from the keyboard is the tests'
+    nothing = os.open(os.devnull, os.O_RDWR)
+    _keep_only(nothing, nothing, nothing, [link.fileno()])
+    subprocess.Popen = ForkedProcess  # type: ignore[misc]  # of programs that start others
+    while True:
+        request, received, _, _ = socket.recv_fds(link, 1 << 20, 250)
+        if not request:
+            return
+        _load_all()
+        start, umask = pickle.loads(request)  # noqa: S301 - our own parent's
+        named, waits = os.pipe()
+        middle = fork()
+        if middle == 0:
+            child = fork()
+            if child:
+                os.write(waits, str(child).encode())
+                os._exit(0)
+            os.umask(umask)
+            _placed(start, received).go()
+        os.close(waits)
+        for fd in received:
+            os.close(fd)
+        os.waitpid(middle, 0)  # now the program has been adopted
+        link.send(os.read(named, 100))
+        os.close(named)
+
+
+@functools.cache
+def _load_all() -> None:
+    """Import what programs import when they come to it: once, and not in each."""
+    for package in (cli, daemon, operations):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(found.name)
+
+
+def _placed(start: _Start, received: list[int]) -> _Start:
+    """Give the descriptors that were received the numbers that they have where they come from."""
+    beyond = max(*received, *start.others) + 1
+    copies = [fcntl.fcntl(fd, fcntl.F_DUPFD, beyond) for fd in received]
+    for fd, number in zip(copies[3:], start.others, strict=True):
+        os.dup2(fd, number)
+    return replace(start, streams=(copies[0], copies[1], copies[2]))
 
 
 def _keep_only(stdin: int, stdout: int, stderr: int, others: Sequence[int]) -> None:
@@ -152,8 +289,6 @@ def _forget_the_parent(environment: dict[str, str] | None) -> None:
     warnings.resetwarnings()
     for kind in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
         warnings.simplefilter("ignore", kind)
-    # SQLite knows in each process which files that has locked, and a fork would believe to have the parent's locks.
-    sqlite3.connect = _no_registry
     sys.excepthook, sys.unraisablehook = sys.__excepthook__, sys.__unraisablehook__
     threading.excepthook = threading.__excepthook__
     for handler in list(logging.root.handlers):
@@ -198,6 +333,23 @@ def _be(program: str, *words: str) -> NoReturn:
     os._exit(code)
 
 
-def fork_processes(patch: pytest.MonkeyPatch) -> None:
-    """Have our own programs that are started from here forked from this process."""
-    patch.setattr(subprocess, "Popen", ForkedProcess)
+def served_by(server: ForkServer) -> type[ForkedProcess]:
+    """Return a `ForkedProcess` whose children a server forks, daemons too."""
+
+    class ServedProcess(ForkedProcess):
+        _forks_daemons = True
+
+        def _fork_as(self, start: _Start) -> int:
+            return server.start(start)
+
+    return ServedProcess
+
+
+def fork_processes(patch: pytest.MonkeyPatch, server: ForkServer | None = None) -> None:
+    """Have our own programs that are started from here forked from this process, or by a server."""
+    patch.setattr(subprocess, "Popen", ForkedProcess if server is None else served_by(server))
+
+
+def start_processes(patch: pytest.MonkeyPatch) -> None:
+    """Have programs started anew where a module's are forked."""
+    patch.setattr(subprocess, "Popen", ForkedProcess.__base__)

@@ -55,7 +55,7 @@ def five_point_difference(values: Array) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("motion", ["traj1", "traj2"])
+@pytest.mark.parametrize("motion", ["traj1", pytest.param("traj2", marks=pytest.mark.campaign)])
 def test_along_the_reference_processed_as_the_authors_did(wam7: ArmModel, wam7_data: Path, motion: str) -> None:
     with gzip.open(wam7_data / f"{motion}_reference.csv.gz", "rt") as stream:
         reference = np.loadtxt(stream, delimiter=",", skiprows=1)

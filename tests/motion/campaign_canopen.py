@@ -174,7 +174,7 @@ class EmulatedArm(WatchedArm):
         self.states = self.behind.emulator.states
 
 
-def bench_canopen_config(*, brakes: bool = True) -> ArmConfig:
+def bench_canopen_config(*, brakes: bool = True, **floor: float) -> ArmConfig:
     """The bench's arm behind two drives with gears of 1; a thousandth is 1 mN m.
 
     Without brakes it is held after a stop, and drives stay in quick stop; without power they leave windings open.
@@ -183,7 +183,7 @@ def bench_canopen_config(*, brakes: bool = True) -> ArmConfig:
     drive = {"counts": 1 << 20, "rated_torque": 1.0, "max_speed": 6000.0}
     return bench_config(
         joints=JOINTS if brakes else loose,
-        control={} if brakes else {"after_stop": "hold"},
+        control={} if brakes else {"after_stop": "hold"} | floor,
         transmission={"ratios": [1.0, 1.0], "drive_terms": "joints"},
         driver={
             "kind": "canopen",
@@ -220,9 +220,14 @@ def of_joint(kind: str) -> bool:
 
 @cache
 def canopen_subject(name: str) -> Subject:
-    """`bench canopen`, `loose canopen`, which has no brakes, `wam canopen`, `wam two buses`, or `bench positions`."""
-    if name in ("bench canopen", "loose canopen"):
-        config, pause = bench_canopen_config(brakes=name == "bench canopen"), 900
+    """Return one by its name.
+
+    `bench canopen`, `loose canopen`, which has no brakes, `floored canopen` above a floor that ends its sinking,
+    `wam canopen`, `wam two buses`, or `bench positions`.
+    """
+    if name in ("bench canopen", "loose canopen", "floored canopen"):
+        floor = {"floor": -0.1} if name == "floored canopen" else {}
+        config, pause = bench_canopen_config(brakes=name == "bench canopen", **floor), 900
     elif name == "bench positions":
         config, pause = bench_positions_config(), 450
     else:

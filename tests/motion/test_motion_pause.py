@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import some
+from hypothesis import given
 from hypothesis import strategies as st
 from motion_bench import bench_excitation, bench_limits
 from reachable import close, keeps_to, random_limits, random_path, sampled
@@ -23,7 +24,7 @@ SHARES = st.floats(0.0, 1.0)
 
 
 @pytest.mark.slow
-@settings(max_examples=50)
+@some(15)
 @given(st.integers(0, 2**32 - 1), SHARES)
 def test_pause_and_resume_keep_to_all_limits_and_have_no_step(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
@@ -48,7 +49,7 @@ def test_pause_and_resume_keep_to_all_limits_and_have_no_step(seed: int, share: 
     keeps_to(limits, resumed, 5e-6, 600)
 
 
-@settings(max_examples=100)
+@some(25)
 @given(SHARES)
 def test_the_motion_goes_on_where_it_was_left(share: float) -> None:
     left = share * MOTION.duration

@@ -75,7 +75,9 @@ def no_step_anywhere(bench: Bench) -> None:
     assert (np.abs(np.diff(velocity, axis=0)) <= LIMITS.acceleration * PERIOD * 1.001).all()
 
 
-@pytest.mark.parametrize("cycle", [200, MIDWAY, 1900])
+@pytest.mark.parametrize(
+    "cycle", [pytest.param(200, marks=pytest.mark.campaign), MIDWAY, pytest.param(1900, marks=pytest.mark.campaign)]
+)
 def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None:
     bench = make()
     report = played(bench, Hands(((cycle, cycle + 600),)))

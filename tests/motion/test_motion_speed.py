@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from helpers.examples import some
+from hypothesis import given
 from hypothesis import strategies as st
 from motion_bench import bench_excitation, bench_limits
 from reachable import close, keeps_to, random_limits, random_path, sampled
@@ -19,7 +20,7 @@ SEEDS, FACTORS = st.integers(0, 2**32 - 1), st.floats(0.05, 1.0)
 
 
 @pytest.mark.slow
-@settings(max_examples=50)
+@some(15)
 @given(SEEDS, FACTORS)
 def test_a_slowed_motion_has_the_same_path_within_smaller_limits(seed: int, factor: float) -> None:
     rng = np.random.default_rng(seed)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import ruckig
+from helpers.examples import some
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from motion_bench import bench_excitation, bench_limits
@@ -43,7 +44,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@some(25)
 @given(setpoints(LIMITS))
 def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
     reference = stop(start, _unlimited(LIMITS))
@@ -64,7 +65,7 @@ def test_a_stop_ends_at_rest_within_limits(start: Setpoint) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@some(25)
 @given(st.floats(0.0, 1.0))
 def test_a_stop_out_of_an_excitation_passes_no_velocity_limit(share: float) -> None:
     exciting = PathReference(bench_excitation().path)
@@ -97,7 +98,7 @@ def test_each_joint_stops_as_soon_as_it_can() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=200)
+@some(50)
 @given(reached())
 def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reached) -> None:
     reference = stop(case.state, case.limits)
@@ -111,7 +112,7 @@ def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reach
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@some(25)
 @given(SEEDS)
 def test_a_stop_that_can_only_just_stay_inside_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -159,7 +160,7 @@ def test_a_stop_that_cannot_stay_inside_leaves_by_no_more_than_the_quickest(star
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@some(25)
 @given(setpoints(LIMITS, 1.5))
 def test_the_quickest_stop_is_the_one_that_ruckig_finds(start: Setpoint) -> None:
     wide = _unlimited(LIMITS)
@@ -192,7 +193,7 @@ def test_a_stop_exists_from_far_beyond_the_limits(size: float, signs: tuple[floa
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@some(25)
 @given(setpoints(LIMITS, 3.0))
 def test_an_acceleration_beyond_its_limit_is_led_back_first(start: Setpoint) -> None:
     reference = stop(start, LIMITS)
@@ -212,7 +213,7 @@ def test_a_stop_from_what_is_no_number_is_no_number_and_raises_nothing(which: st
 
 
 @pytest.mark.slow
-@settings(max_examples=5)
+@some(2)
 @given(SEEDS)
 def test_the_extent_of_the_stops_is_that_of_every_single_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -227,7 +228,7 @@ def test_the_extent_of_the_stops_is_that_of_every_single_one(seed: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=50)
+@some(15)
 @given(SEEDS)
 def test_no_motion_within_its_limits_is_refused_for_its_stops(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -245,7 +246,7 @@ def test_a_long_motion_is_looked_at_in_blocks() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=50)
+@some(15)
 @given(SEEDS)
 def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -259,7 +260,7 @@ def test_the_extent_of_any_pieces_is_where_they_lead(seed: int) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=30)
+@some(10)
 @given(SEEDS)
 def test_the_extent_of_a_stop_is_where_it_goes(seed: int) -> None:
     rng = np.random.default_rng(seed)

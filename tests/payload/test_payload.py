@@ -49,7 +49,13 @@ def deviations_off(payload: Payload, truth: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scale", [0.3, 3.0], ids=["arm well known", "arm badly known"])
+@pytest.mark.parametrize(
+    "scale",
+    [
+        pytest.param(0.3, id="arm well known", marks=pytest.mark.campaign),
+        pytest.param(3.0, id="arm badly known"),
+    ],
+)
 def test_errors_are_as_large_as_their_deviations(scale: float) -> None:
     rng = np.random.default_rng(1)
     found, noise_alone = [], []

@@ -42,10 +42,10 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of results `bare` and `tooled`, recordings `bare.mcap` and `tooled.mcap`."""
 
     def make(folder: Path) -> None:
-        identified_folder(changed("planar2", rate=COARSE, seed=11), folder / "bare")
-        identified_folder(changed("planar2", rate=COARSE, seed=12, added=TOOL), folder / "tooled")
-        recorded_arm(changed("planar2", rate=COARSE, seed=13), folder / "bare.mcap")
-        recorded_arm(changed("planar2", rate=COARSE, seed=14, added=TOOL), folder / "tooled.mcap")
+        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=11), folder / "bare")
+        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=12, added=TOOL), folder / "tooled")
+        recorded_arm(changed("planar2", rate=COARSE, periods=1, seed=13), folder / "bare.mcap")
+        recorded_arm(changed("planar2", rate=COARSE, periods=1, seed=14, added=TOOL), folder / "tooled.mcap")
 
     return made_once(tmp_path_factory, "payload", make)
 
@@ -114,17 +114,17 @@ def test_the_arm_with_its_tool_is_a_folder_like_any_other(arms: Path, ident: Ide
 
 def test_a_recording_that_ended_in_a_fault_is_refused(arms: Path, ident: Ident, tmp_path: Path) -> None:
     faulty = tmp_path / "fault.mcap"
-    with_event(arms / "tooled.mcap", faulty, 20.0, 40, "following_error: j1 lags by 0.3 rad")
+    with_event(arms / "tooled.mcap", faulty, 10.0, 40, "following_error: j1 lags by 0.3 rad")
     out = tmp_path / "out"
     code, _, err = ident("payload", arms / "bare", faulty, "--out", out)
     assert code == 2
-    assert "fault.mcap: ended in a fault 20 s after its first sample: following_error: j1 lags by 0.3 rad" in err
+    assert "fault.mcap: ended in a fault 10 s after its first sample: following_error: j1 lags by 0.3 rad" in err
     assert "give a part before: fault.mcap@0:SECONDS" in err
     assert not out.exists()
-    code, text, _ = ident("payload", arms / "bare", f"{faulty}@0:19", "--out", out)
+    code, text, _ = ident("payload", arms / "bare", f"{faulty}@0:9", "--out", out)
     assert (code, text[:6]) == (0, "ADDED:")
     # A warning is no fault.
-    with_event(arms / "tooled.mcap", tmp_path / "warned.mcap", 20.0, 30, "late_cycle: 2 ms")
+    with_event(arms / "tooled.mcap", tmp_path / "warned.mcap", 10.0, 30, "late_cycle: 2 ms")
     assert ident("payload", arms / "bare", tmp_path / "warned.mcap", "--out", tmp_path / "warned")[0] == 0
 
 

@@ -296,7 +296,7 @@ def geared(ratio: float, joint: int) -> Callable[[FlightArm], None]:
     ("ratio", "shows"),
     # An answer of 0.45^2 is within its doubt of the least that links twice as heavy give; but the arm goes twice
     # as far as it is told.
-    [(0.4, "response"), (0.45, "displacement"), (1.6, "response")],
+    [pytest.param(0.4, "response", marks=pytest.mark.campaign), (0.45, "displacement"), (1.6, "response")],
 )
 def test_a_wrong_gear_ratio_shows_in_what_the_joint_does(ratio: float, shows: str) -> None:
     level = {"gravity": (0.0, 0.0, -9.81)}  # the axes upright: gravity cannot tell
@@ -316,6 +316,7 @@ def responses(check: Check) -> dict[str, float]:
     return {one.joint: one.value for one in found if one.joint is not None and one.value is not None}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 2.0])
 def test_twice_the_torque_is_refused_where_the_prior_is_identified(factor: float) -> None:
     level = {"gravity": (0.0, 0.0, -9.81), "prior": TRUTH}  # the axes upright: gravity cannot tell
@@ -329,6 +330,7 @@ def test_twice_the_torque_is_refused_where_the_prior_is_identified(factor: float
         assert check.reason.startswith("elbow: response to torque")
 
 
+@pytest.mark.slow
 def test_gravity_that_changes_along_the_way_is_no_part_of_the_response() -> None:
     hangs = Flight(changes={"prior": TRUTH, "joints": joint_changes("shoulder", home=-1.5)})
     found = responses(check_of(hangs.ticket(), "direction"))

@@ -132,8 +132,8 @@ def test_the_watchdog_of_a_plant_in_its_own_process_is_seen_to_act(monkeypatch: 
     assert 0.002 < travel < 0.06
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["planar2", pytest.param("sixaxis", marks=pytest.mark.campaign)])
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", ["planar2", "sixaxis"])
 def test_a_shipped_arm_with_geometry_and_noise_passes(name: str) -> None:
     """Gears as dry as the six-axis arm's change the torque fastest, where a test motion sets off."""
     model = arm_model(load_arm(name))

@@ -33,7 +33,7 @@ def shown_furthest(flight: Flight) -> tuple[Ticket, float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("start", [-1.0, 1.5, UPPER + 0.5 * AWAY])
+@pytest.mark.parametrize("start", [-1.0, pytest.param(1.5, marks=pytest.mark.campaign), UPPER + 0.5 * AWAY])
 def test_an_arm_inside_or_a_little_outside_passes(start: float) -> None:
     flight = standing(start)
     before = motion_limits(flight.model.config)

@@ -61,7 +61,7 @@ def two_kernels() -> list[str]:
     return known[-2:]
 
 
-NIGHT = ("tx40",)  # beside two real arms and that of the demo
+NIGHT = ("tx40", "kuka_lwr4", "ur10")  # beside the arm of the demo
 
 
 @pytest.mark.usefixtures("shared")

@@ -230,12 +230,8 @@ WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
 SOUND = {"sound": {}, "Craig": {"kinematics": craig("modified")}}
 
 
-# What no other test has by the command, or in the estimate (`test_a_spike_and_wrong_units_of_an_arm_without_limits`).
-QUICK = ("q and tau", "two joints", "one sign", "gravity", "convention")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in QUICK else pytest.mark.campaign) for n in WRONG])
+@pytest.mark.campaign  # but for `test_the_command_says_no_where_people_look`
+@pytest.mark.parametrize("name", WRONG)
 def test_the_command_ends_with_3_for_what_cannot_be_right(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -247,8 +243,8 @@ def test_the_command_ends_with_3_for_what_cannot_be_right(
     assert (tmp_path / "out" / "report.txt").read_text().startswith("DO NOT USE")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [pytest.param("sound", marks=pytest.mark.campaign), "Craig"])
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", ["sound", "Craig"])
 def test_the_command_objects_to_nothing_sound(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*written(tmp_path, nothing, SOUND[name]), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["unusable"] == []

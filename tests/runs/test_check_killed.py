@@ -15,7 +15,7 @@ from ident_service.registry.state_folder import control_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.campaign)])
 def test_a_killed_check_says_so_and_leaves_no_ticket(real_arm: Path, tmp_path: Path, number: signal.Signals) -> None:
     state = tmp_path / "state"
     words = ["check", str(real_arm), "--confirm", "planar2", "--state", str(state)]

@@ -59,7 +59,7 @@ def when(monkeypatch: pytest.MonkeyPatch, then: dict[str, Callable[[], None]]) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["text", "json"])
+@pytest.mark.parametrize("form", ["text", pytest.param("json", marks=pytest.mark.campaign)])
 def test_a_full_disk_is_the_fault_that_it_is(
     form: str, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

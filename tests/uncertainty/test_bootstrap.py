@@ -59,7 +59,7 @@ def arm_equations(noise: float = 0.3) -> tuple[Equations, BaseParameters, Feasib
     return Equations(tuple(blocks), 360), base, feasible_set("pseudo_inertia", base.names, arm.config)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_it_is_calibrated_where_noise_is_coloured_and_a_bound_binds() -> None:
     # The second parameter is a quarter of its deviation above zero, so that the bound binds two times out of five.
     truth = np.array([1.0, 0.03, 2.0, 0.5])
