@@ -26,7 +26,15 @@ from ident_service.config.arm import ArmConfig
 from ident_service.config.can_bus import CanBus
 from ident_service.config.control import Realtime
 from ident_service.motion.cycle_timing import LATE, SUCCESS, longest_stall
-from ident_service.motion.realtime import CAP_IPC_LOCK, CAP_SYS_NICE, capable, core_numbers, temporary_privileges
+from ident_service.motion.realtime import (
+    CAP_IPC_LOCK,
+    CAP_SYS_NICE,
+    IDLE_DRIVER,
+    capable,
+    core_numbers,
+    halts,
+    temporary_privileges,
+)
 
 LEAST_RATE = 1000.0  # Hz, at which lateness is measured at least
 _SHARES = (1, 2, 4, 5, 10)  # of that rate, that are judged
@@ -268,6 +276,8 @@ def _memory() -> Finding:
 
 def _wake_up(root: Path) -> Finding:
     what, file = "deep sleep of cores", root / "dev/cpu_dma_latency"
+    if halts(root / IDLE_DRIVER.relative_to("/")):
+        return Finding(what, State.GOOD, "not this kernel's (virtual machine); a motion keeps its core from halting")
     if not file.exists():
         return Finding(what, State.UNKNOWN, "no /dev/cpu_dma_latency in this container, or kernel")
     if os.access(file, os.W_OK):

@@ -10,8 +10,10 @@ import ctypes
 import gc
 import os
 import resource
+import signal
 import socket
 import struct
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -20,6 +22,7 @@ from pathlib import Path
 from ident_service.config.control import Realtime
 
 LATENCY = Path("/dev/cpu_dma_latency")  # Documentation/power/pm_qos_interface.rst
+IDLE_DRIVER = Path("/sys/devices/system/cpu/cpuidle/current_driver")  # Documentation/admin-guide/pm/cpuidle.rst
 ISOLATED = Path("/sys/devices/system/cpu/isolated")
 CAP_IPC_LOCK, CAP_SYS_NICE = 14, 23  # linux/capability.h
 _MCL_CURRENT, _MCL_FUTURE = 1, 2  # sys/mman.h
@@ -28,6 +31,8 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _TRIM_THRESHOLD, _MMAP_MAX = 128 * 1024, 65536
 HEAP = 32 << 20  # bytes that the loop may take and give back without asking the kernel for a page
 STACK = 512 << 10  # bytes, likewise
+# Has a core whenever nobody else wants it, until its standard input ends.
+_SPIN = "import select\nwhile not select.select([0], [], [], 0)[0]:\n    for _ in range(10_000):\n        pass"
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,7 @@ class RealtimePrivileges:
         refusals: one sentence each.
         awake: whether cores stay out of deep sleep.
         prefaulted: whether heap and stack have their pages, and keep them.
+        spinning: whether its own core is kept from halting where only whoever runs this virtual machine could.
         held: what ends with the kernel's promises when it is closed, or forgotten.
     """
 
@@ -52,6 +58,7 @@ class RealtimePrivileges:
     refusals: tuple[str, ...]
     awake: bool = False
     prefaulted: bool = False
+    spinning: bool = False
     held: ExitStack = field(default_factory=ExitStack, repr=False, compare=False)
 
     def sentence(self) -> str:
@@ -64,6 +71,7 @@ class RealtimePrivileges:
                 ("heap and stack in place", self.prefaulted),
                 (f"core {self.core}", self.core is not None),
                 ("cores kept awake", self.awake),
+                ("a core that never halts", self.spinning),
                 ("no garbage collection", self.collector),
             )
             if one
@@ -95,10 +103,11 @@ def request_privileges(core_from_last: int = 0, settings: Realtime | None = None
     memory = _lock_memory(refusals)
     core = _own_core(_candidates(settings, core_from_last), bool(settings.cores), held, refusals)
     awake = _keep_awake(held, refusals)
+    spinning = core is not None and _keep_from_halting(core, held, refusals)
     gc.collect()
     gc.freeze()
     gc.disable()
-    return RealtimePrivileges(scheduling, memory, core, True, tuple(refusals), awake, prefaulted, held)
+    return RealtimePrivileges(scheduling, memory, core, True, tuple(refusals), awake, prefaulted, spinning, held)
 
 
 @contextmanager
@@ -232,6 +241,41 @@ def _own_core(cores: list[int], described: bool, held: ExitStack, refusals: list
     elif not cores:
         refusals.append("one core only")
     return None
+
+
+def halts(driver: Path = IDLE_DRIVER) -> bool:
+    """Return whether idle cores halt in spite of `LATENCY`: the kernel has no idle driver, as in a virtual machine."""
+    with suppress(OSError):
+        return driver.read_text(encoding="utf-8").strip() == "none"
+    return False
+
+
+def _keep_from_halting(core: int, held: ExitStack, refusals: list[str]) -> bool:
+    """Keep a core busy at the lowest priority, where a halted one is given back late by whoever runs the machine."""
+    if not halts():
+        return False
+    ends, lives = os.pipe()
+    silent = [(os.POSIX_SPAWN_OPEN, number, os.devnull, os.O_WRONLY, 0) for number in (1, 2)]
+    try:
+        pid = os.posix_spawn(
+            sys.executable,
+            [sys.executable, "-I", "-S", "-c", _SPIN],
+            {},
+            file_actions=[(os.POSIX_SPAWN_DUP2, ends, 0), *silent],
+            scheduler=(os.SCHED_OTHER, os.sched_param(0)),  # not the loop's own
+        )
+    except OSError as error:
+        os.close(lives)
+        refusals.append(f"nothing keeps core {core} from halting ({error.strerror})")
+        return False
+    finally:
+        os.close(ends)
+    held.callback(os.waitpid, pid, 0)
+    held.callback(os.kill, pid, signal.SIGKILL)
+    held.callback(os.close, lives)
+    os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
+    os.sched_setaffinity(pid, {core})
+    return True
 
 
 def _keep_awake(held: ExitStack, refusals: list[str]) -> bool:

@@ -27,6 +27,7 @@ from ident_service.motion.doctor import (
     measure_wake_up,
     measuring_rate,
 )
+from ident_service.motion.realtime import halts
 
 GOOD = {
     "sys/kernel/realtime": "1\n",
@@ -38,6 +39,7 @@ GOOD = {
     "sys/devices/system/cpu/isolated": "6-7\n",
     "proc/cpuinfo": "processor : 0\nflags : fpu tsc\n",
     "dev/cpu_dma_latency": "",
+    "sys/devices/system/cpu/cpuidle/current_driver": "intel_idle\n",
 }
 # What an unprivileged process sees of this user's own limits is not in files.
 OF_FILES = ("kernel", "real-time throttling", "processor frequency", "deep sleep of cores", "cores", "computer")
@@ -94,6 +96,12 @@ def test_what_is_poor_has_its_remedy(
     assert [found[one].state for one in others] == [State.GOOD] * len(others)
 
 
+def test_where_the_kernel_has_no_say_in_sleep_the_core_is_kept_busy(tmp_path: Path) -> None:
+    found = looked(tmp_path, {"sys/devices/system/cpu/cpuidle/current_driver": "none\n"})["deep sleep of cores"]
+    assert found.state is State.GOOD
+    assert "a motion keeps its core from halting" in found.found
+
+
 def test_what_cannot_be_looked_at_is_unknown_and_no_error(tmp_path: Path) -> None:
     found = looked(tmp_path, dict.fromkeys(GOOD))
     unknown = {"real-time throttling", "processor frequency", "deep sleep of cores", "computer"}
@@ -118,7 +126,7 @@ def test_limits_of_a_user_without_privileges_are_reported_with_the_lines_that_me
     state, found, remedy = told["locked memory"]
     assert (state, found.split(";")[0]) == ("poor", "4 kB for this user")
     assert "memlock unlimited" in remedy
-    if Path("/dev/cpu_dma_latency").exists() and os.getuid() == 0:
+    if Path("/dev/cpu_dma_latency").exists() and os.getuid() == 0 and not halts():
         assert told["deep sleep of cores"][0] == "poor"
         assert "udev" in told["deep sleep of cores"][2]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ident_service.config.control import Realtime
+from ident_service.motion import realtime
 from ident_service.motion.cycle_timing import Histogram
 from ident_service.motion.realtime import LATENCY, STACK, core_numbers, temporary_privileges
 
@@ -25,8 +27,8 @@ ASK = "from ident_service.motion.realtime import *; granted = request_privileges
 @given(times=st.lists(st.integers(0, 10**9), min_size=1, max_size=200), share=st.sampled_from([0.5, 0.99, 0.999]))
 def test_a_share_of_all_times_is_below_what_it_says(times: list[int], share: float) -> None:
     histogram = Histogram()
-    for time in times:
-        histogram.add(time)
+    for one in times:
+        histogram.add(one)
     assert histogram.count == len(times)
     assert histogram.worst_ns == max(times)
     assert np.mean(np.array(times) <= histogram.below_us(share) * 1e3 + 1e-6) >= share
@@ -107,6 +109,52 @@ def test_cores_are_kept_awake_for_as_long_as_the_loop_runs() -> None:
         assert granted.awake
         assert held()
     assert not held()
+
+
+def test_a_core_is_kept_from_halting_where_the_kernel_cannot_and_no_longer_than_the_loop_runs(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    driver = tmp_path / "current_driver"
+    monkeypatch.setattr(realtime.halts, "__defaults__", (driver,))
+
+    def spinners() -> list[int]:
+        children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        return [int(one) for one in children if b"select.select" in Path("/proc", one, "cmdline").read_bytes()]
+
+    for text, spins in (("intel_idle\n", False), ("none\n", True)):
+        driver.write_text(text)
+        with temporary_privileges(settings=Realtime(cores=tuple(CORES))) as granted:
+            if granted.core is None:
+                pytest.skip("loops outside of this test have every core")
+            assert granted.spinning is spins
+            deadline = time.monotonic() + 30.0
+            while spins and not spinners() and time.monotonic() < deadline:
+                time.sleep(0.001)  # it has a name only once it has had the core
+            assert len(spinners()) == spins
+            for pid in spinners():
+                assert os.sched_getscheduler(pid) == os.SCHED_IDLE
+                assert os.sched_getaffinity(pid) == {granted.core}
+        assert not spinners()
+    assert not realtime.halts(tmp_path / "none")
+
+
+def test_what_keeps_a_core_from_halting_ends_with_a_loop_that_is_killed() -> None:
+    code = (
+        "import os, sys, contextlib; from pathlib import Path; from ident_service.motion import realtime\n"
+        "realtime.halts = lambda: True\n"
+        "held = contextlib.ExitStack(); print(realtime._keep_from_halting(0, held, []))\n"
+        "print(*Path(f'/proc/self/task/{os.getpid()}/children').read_text().split(), flush=True)\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    spins, pid = done.stdout.split()
+    assert spins == "True"
+    deadline = time.monotonic() + 30.0
+    while Path("/proc", pid).exists() and time.monotonic() < deadline:
+        if Path("/proc", pid, "stat").read_text().rpartition(")")[2].split()[0] == "Z":
+            return
+        time.sleep(0.01)
+    assert not Path("/proc", pid).exists()
 
 
 def test_heap_and_stack_have_their_pages_before_the_loop_begins() -> None:
