@@ -31,8 +31,16 @@ _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _TRIM_THRESHOLD, _MMAP_MAX = 128 * 1024, 65536
 HEAP = 32 << 20  # bytes that the loop may take and give back without asking the kernel for a page
 STACK = 512 << 10  # bytes, likewise
-# Has a core whenever nobody else wants it, until its standard input ends.
-_SPIN = "import select\nwhile not select.select([0], [], [], 0)[0]:\n    for _ in range(10_000):\n        pass"
+# Waits on a core, whenever nobody else wants it, for a lock that it has itself: gently to a core that shares its units
+# with this one, as the C library pauses between two looks. Ends with its standard input.
+_SPIN = """
+import ctypes, os, threading
+lock, libc = ctypes.c_int(), ctypes.CDLL(None)
+libc.pthread_spin_init(ctypes.byref(lock), 0)
+threading.Thread(target=lambda: (os.read(0, 1), os._exit(0))).start()
+while True:
+    libc.pthread_spin_lock(ctypes.byref(lock))
+"""
 
 
 @dataclass(frozen=True)
