@@ -251,8 +251,12 @@ def _own_core(cores: list[int], described: bool, held: ExitStack, refusals: list
     return None
 
 
-def halts(driver: Path = IDLE_DRIVER) -> bool:
-    """Return whether idle cores halt in spite of `LATENCY`: the kernel has no idle driver, as in a virtual machine."""
+def halts(driver: Path) -> bool:
+    """Return whether idle cores halt in spite of `LATENCY`: the kernel has no idle driver, as in a virtual machine.
+
+    Args:
+        driver: the file that names it, `IDLE_DRIVER`.
+    """
     with suppress(OSError):
         return driver.read_text(encoding="utf-8").strip() == "none"
     return False
@@ -260,7 +264,7 @@ def halts(driver: Path = IDLE_DRIVER) -> bool:
 
 def _keep_from_halting(core: int, held: ExitStack, refusals: list[str]) -> bool:
     """Keep a core busy at the lowest priority, where a halted one is given back late by whoever runs the machine."""
-    if not halts():
+    if not halts(IDLE_DRIVER):
         return False
     ends, lives = os.pipe()
     silent = [(os.POSIX_SPAWN_OPEN, number, os.devnull, os.O_WRONLY, 0) for number in (1, 2)]
@@ -278,12 +282,25 @@ def _keep_from_halting(core: int, held: ExitStack, refusals: list[str]) -> bool:
         return False
     finally:
         os.close(ends)
-    held.callback(os.waitpid, pid, 0)
-    held.callback(os.kill, pid, signal.SIGKILL)
-    held.callback(os.close, lives)
-    os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
-    os.sched_setaffinity(pid, {core})
+    spinner = ExitStack()
+    spinner.callback(_end, pid)
+    spinner.callback(os.close, lives)
+    try:
+        os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))
+        os.sched_setaffinity(pid, {core})
+    except OSError as error:  # at any other priority, or on another core, it would be in somebody's way
+        spinner.close()
+        refusals.append(f"nothing keeps core {core} from halting ({error.strerror})")
+        return False
+    held.push(spinner)
     return True
+
+
+def _end(pid: int) -> None:
+    """End a child, which may have ended, or have been waited for, already."""
+    with suppress(OSError):
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
 
 
 def _keep_awake(held: ExitStack, refusals: list[str]) -> bool:

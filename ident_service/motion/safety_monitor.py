@@ -310,7 +310,7 @@ class SafetyMonitor:
             seconds = _FROZEN_SECONDS, _SUDDEN_SECONDS
             frozen, sudden = (max(_LEAST_UNCHANGED, round(one / period)) for one in seconds)
             self._frozen_after = frozen, sudden
-        self._target = self._given = position.copy()
+        self._target = self._previous_target = position.copy()
         self._healthy: tuple[int, ...] = ()
         self._was_powered = np.zeros(joints, dtype=bool)
         self._jump = JUMP * limits.velocity * period
@@ -372,8 +372,8 @@ class SafetyMonitor:
         same = (steps == 0.0) & valid
         if self._most_torque is not None:
             # A drive that has been given no other position brings its joint to a stand.
-            same &= encoders.steps(self._target, self._given) != 0.0
-            self._given = self._target
+            same &= encoders.steps(self._target, self._previous_target) != 0.0
+            self._previous_target = self._target
         self._count_unchanged(same, velocity)
         if self._encoder_observer is not None and answer is not None:
             direction = np.where(valid, (steps > 0.0) * 1.0 - (steps < 0.0), 0.0)

@@ -114,7 +114,7 @@ class ForkedProcess(subprocess.Popen[Any]):
 
 @dataclass(frozen=True)
 class _Start:
-    """What a program begins with: its words, descriptors, folder, environment and session."""
+    """Hold what a program begins with: its words, descriptors, folder, environment and session."""
 
     words: list[str]
     streams: tuple[int, int, int]  # what becomes 0, 1 and 2; -1: as they are

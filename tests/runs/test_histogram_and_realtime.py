@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -127,7 +127,7 @@ def test_a_core_is_kept_from_halting_where_the_kernel_cannot_and_no_longer_than_
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     driver = tmp_path / "current_driver"
-    monkeypatch.setattr(realtime.halts, "__defaults__", (driver,))
+    monkeypatch.setattr(realtime, "IDLE_DRIVER", driver)
 
     def spinners() -> list[int]:
         children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
@@ -149,11 +149,21 @@ def test_a_core_is_kept_from_halting_where_the_kernel_cannot_and_no_longer_than_
     assert not realtime.halts(tmp_path / "none")
 
 
+def test_what_cannot_be_put_on_its_core_is_not_left_running_and_nothing_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(realtime, "halts", lambda driver: True)
+    refusals = list[str]()
+    with ExitStack() as held:
+        assert not realtime._keep_from_halting(8191, held, refusals)
+        children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        assert not [one for one in children if b"pthread_spin_lock" in Path("/proc", one, "cmdline").read_bytes()]
+    assert refusals == ["nothing keeps core 8191 from halting (Invalid argument)"]
+
+
 def test_what_keeps_a_core_from_halting_ends_with_a_loop_that_is_killed() -> None:
     code = (
         "import os, sys, contextlib; from pathlib import Path; from ident_service.motion import realtime\n"
-        "realtime.halts = lambda: True\n"
-        "held = contextlib.ExitStack(); print(realtime._keep_from_halting(0, held, []))\n"
+        "realtime.halts = lambda driver: True\n"
+        f"held = contextlib.ExitStack(); print(realtime._keep_from_halting({CORES[0]}, held, []))\n"
         "print(*Path(f'/proc/self/task/{os.getpid()}/children').read_text().split(), flush=True)\n"
         "os.kill(os.getpid(), 9)"
     )
