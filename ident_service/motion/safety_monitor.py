@@ -53,8 +53,9 @@ SUDDEN_CYCLES, SUDDEN_SPEED = 10, 0.1
 # A position loop in the drive pushes far harder for the same distance: there these are times, of 1 kHz.
 _FROZEN_SECONDS, _SUDDEN_SECONDS, _LEAST_UNCHANGED = 0.020, 0.010, 3  # s; cycles
 # It also pushes at its limit long before the following error is large. Beside the model's torque no joint needs as much
-# as this share of its limit for longer than that: preflight allows the model a tenth, and friction.
-PUSHES = 0.4
+# as this share of its limit for longer than that: preflight allows the model a tenth, and friction. After a cycle that
+# was `_STALLED` periods late it is given what lies cycles ahead, and needs up to twice that time to catch up.
+PUSHES, _STALLED = 0.4, 1.5
 FOLLOWING_LOST = 2.0  # times the following error allowed
 # Towards a position limit no motion within the acceleration limit a is faster than sqrt(2 a d) at a distance d from it
 # (FIELDBUS.md). The arm may brake `ENVELOPE` times as hard, and be `ENVELOPE_SLACK` of its velocity limit faster.
@@ -305,6 +306,7 @@ class SafetyMonitor:
         self._sent: Vector | None = None
         self._most_torque = most_torque
         self._pushing: Counts = np.zeros(joints, dtype=np.int64)
+        self._catching_up = 0  # cycles in which a drive may push because of a stall
         self._frozen_after = FROZEN_CYCLES, SUDDEN_CYCLES
         if most_torque is not None:
             seconds = _FROZEN_SECONDS, _SUDDEN_SECONDS
@@ -578,7 +580,10 @@ class SafetyMonitor:
 
     def _count_pushes(self, unexplained: Vector | float) -> Fault | None:
         """Count for how many cycles each drive has pushed beside the model's torque; returns a fault after too many."""
-        hit = np.abs(unexplained) > PUSHES * self._limits.torque
+        if self._elapsed > _STALLED * self._period:
+            self._catching_up = 2 * self._frozen_after[0]
+        hit = (np.abs(unexplained) > PUSHES * self._limits.torque) & (self._catching_up == 0)
+        self._catching_up = max(0, self._catching_up - 1)
         self._pushing = np.where(hit, self._pushing + 1, 0)
         if not (long := self._pushing >= self._frozen_after[0]).any():
             return None

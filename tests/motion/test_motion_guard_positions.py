@@ -123,6 +123,19 @@ def test_a_drive_that_pushes_hard_quick_stops_although_its_joint_moves() -> None
         assert is_fault(fault, "feedback_not_finite")
 
 
+def test_what_a_drive_pushes_to_catch_up_after_a_stall_is_no_push_and_what_goes_on_is() -> None:
+    """It is given what lies cycles ahead, as the emulated drives were after 12 ms: 0.8 of the limit for up to 40 ms."""
+    for late, cycles in ((1.4, 5), (1.6, 15)):
+        seen = bench()
+        seen.guard = SafetyMonitor(NAMES, LIMITS, 4e-3, HOME, most_torque=MOST)
+        for number in range(cycles):
+            elapsed = 4e-3 * (late if number == 0 else 1.0)
+            at, push = HOME + number * 1e-5, 0.82 * LIMITS.torque * unit(1)
+            _, fault = seen.see(at, elapsed=elapsed, unexplained=push)
+            assert (fault is not None) == (number == cycles - 1)
+        is_fault(fault, "torque_unexplained", 1)
+
+
 def test_a_joint_that_stands_still_although_it_shall_move_is_a_frozen_encoder() -> None:
     """Find a frozen encoder by the torque that the law would add for the following error, though it is not sent."""
     seen, fault = bench(), None
