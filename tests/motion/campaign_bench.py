@@ -173,9 +173,14 @@ def subject(name: str) -> Subject:
 
 
 def wam_config(name: str, **changes: Any) -> ArmConfig:
-    """A shipped WAM with a short motion; `changes` replace top-level sections."""
+    """A shipped WAM with a short motion; `changes` replace top-level sections.
+
+    A floor ends its sinking after 10 s instead of 70; that it also sinks until it rests is seen in
+    `test_motion_after_stop.py`.
+    """
     motions = {"identification": {"kind": "seeded", "seed": 7, "base_frequency": 0.4, "harmonics": 3, "periods": 1}}
     document = load_arm(name).model_dump(mode="json", by_alias=True)
+    document["control"]["floor"] = -0.1
     return ArmConfig.model_validate(document | {"motions": motions} | changes)
 
 

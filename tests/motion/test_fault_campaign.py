@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 from branches import outcomes
-from campaign_bench import PROMISES, STALLS, STOPPED, Case, Outcome, subject
+from campaign_bench import PROMISES, STALLS, STOPPED, Case, Outcome, play, subject
 from campaign_checks import in_runs, keep_their_promises, keeps_its_promise, together
 
 from ident_service.config.simulation import FAULT_RULES
+from ident_service.model.arm_model import arm_model
 from ident_service.motion.faults import FAULTS, Reaction
+from ident_service.motion.lowering import STILL, lowest_point
 from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 
@@ -128,6 +132,19 @@ def test_the_campaign(some: list[Case], tmp_path: Path) -> None:
 @pytest.mark.parametrize("case", [pytest.param(case, id=str(case)) for case in campaign() if str(case) in REMAINING])
 def test_what_is_known_to_fail_goes_on_failing_or_is_taken_off_the_list(case: Case, tmp_path: Path) -> None:
     keeps_its_promise(case, tmp_path)
+
+
+@pytest.mark.campaign
+def test_without_a_floor_the_large_arm_sinks_until_it_rests() -> None:
+    which = subject("wam")
+    control = which.config.control.model_copy(update={"floor": None})
+    config = which.config.model_copy(update={"control": control})
+    outcome = play(replace(which, config=config, model=arm_model(config)), State.STOPPING, (), None)
+    assert outcome.fault is None
+    assert outcome.story.states[-1] == "stopped"
+    speeds = np.abs([moment.velocity for moment in outcome.truth[-100:]])
+    assert (speeds < STILL * which.limits.velocity).all()
+    assert lowest_point(which.model)(outcome.truth[-1].position) < -0.5
 
 
 def test_what_is_known_to_fail_is_a_case() -> None:
