@@ -14,11 +14,13 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
+import pinocchio as pin
 
 from drivers.arm import Vector
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.kinematics import link_poses
+from ident_service.model.collision import kinematics
+from ident_service.model.pinocchio_models import link_frame
 from ident_service.motion.faults import LOWER
 
 SPEED: Final = 0.1  # of the velocity limit, at which the arm sinks; the path home is as slow
@@ -109,13 +111,22 @@ def lowest_point(model: ArmModel) -> Callable[[Vector], float]:
     """
     gravity = np.array(model.config.gravity)
     up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 0.0, 1.0])
-    balls: list[tuple[int, Vector, float]] = [(link, np.zeros(3), 0.0) for link in range(model.chain.joints)]
+    mechanism = kinematics(model.chain)
+    data, links = mechanism.createData(), []
     for link, name in enumerate(model.chain.names):
+        frame = link_frame(model.chain, link)
+        points, radii = [np.zeros(3)], [0.0]
         for capsule in model.config.geometry.get(name, ()):
-            balls += [(link, np.array(end), capsule.radius) for end in (capsule.start, capsule.end)]
+            points += [np.array(capsule.start), np.array(capsule.end)]
+            radii += [capsule.radius] * 2
+        links.append((link + 1, np.array([frame.act(point) for point in points]), np.array(radii)))
 
     def height(position: Vector) -> float:
-        (turns,), (places,) = link_poses(model.chain, position[None])
-        return min(float(up @ (turns[link] @ point + places[link])) - radius for link, point, radius in balls)
+        pin.forwardKinematics(mechanism, data, position)
+        lowest = []
+        for joint, points, radii in links:
+            pose = data.oMi[joint]
+            lowest.append((points @ (up @ pose.rotation) - radii).min() + up @ pose.translation)
+        return float(min(lowest))
 
     return height

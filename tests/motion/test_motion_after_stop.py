@@ -17,6 +17,7 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
+from ident_service.model.kinematics import link_poses
 from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
 from ident_service.motion.command_channel import ControlFile, Homing, SupervisedCommands
 from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
@@ -233,6 +234,17 @@ def test_the_height_of_the_lowest_point_is_that_of_bodies_or_frames() -> None:
     geometry = {"elbow": [{"from": (-0.5, 0.0, 0.0), "to": (0.1, 0.0, 0.0), "radius": 0.03}]}
     thick = lowest_point(arm_model(loose("lower", geometry=geometry)))
     assert thick(np.array([-np.pi / 2, 0.0])) == pytest.approx(-1.13)
+    # Frames that are turned in their joints, and capsules of every link.
+    large = arm_model(load_arm("wam7_sim"))
+    for position in np.random.default_rng(1).uniform(-2.0, 2.0, (5, 7)):
+        (turns,), (places,) = link_poses(large.chain, position[None])
+        ends = [
+            (places[link] + turns[link] @ end)[2] - capsule.radius
+            for link, name in enumerate(large.chain.names)
+            for capsule in large.config.geometry.get(name, ())
+            for end in (capsule.start, capsule.end)
+        ]
+        assert lowest_point(large)(position) == pytest.approx(min([*ends, *places[:, 2]]))
 
 
 @pytest.mark.slow
