@@ -1,34 +1,25 @@
-"""Measure exact signed distances between an arm's bodies and its surroundings.
+"""Measure exact signed distances between an arm's bodies and its surroundings, and how fast they can change.
 
 A link is a union of convex solids that stand still in its joint's frame; the base and the obstacles stand still in the
 base frame. Two links that a joint connects are no pair, nor are two that the configuration lets touch; a half space
 of `workspace.inside` is an obstacle like any other. The distance of a pair is the smallest of any solid of one to any
-solid of the other.
-
-Distances are computed by `collision.py` (exact) and `capsule_distances.py` (fast, differentiable).
+solid of the other: how far they are apart, or, negative, how far one must be moved to free them (of two capsules, the
+distance of their axes less both radii). The search for motions uses `capsule_distances.py`, fast and differentiable.
 
 The signed distance of two convex sets changes no more than their points move against each other, and joint k moves a
 point by at most its distance from k's axis per radian (its travel per metre). What hangs on joint k stays, however the
 joints behind it stand, inside a cylinder about k's axis and inside a ball about k's origin; both follow from those of
-the next joint outwards, since a cylinder about an axis is left where it is by a turn about that axis.
+the next joint outwards, since a cylinder about an axis is left where it is by a turn about that axis. Joints that carry
+both bodies do not move them against each other and have constant zero.
 
-Joints that carry both bodies do not move them against each other and have constant zero.
-
-Distances of convex solids: how far they are apart, or, negative, how far one must be moved to free them (of two
-capsules, the distance of their axes less both radii). `collision.py` defines the pairs, `collision.py` how fast
-distances change; the search for motions uses `capsule_distances.py`.
-
-The exact distances of `collision.py`, of which all is computed but only the smallest is read while nothing touches.
-Up to `AT_ONCE` pairs of solids are looked at in every cycle; more of them in turn, so that of up to 400 pairs each is
-looked at at least every 10 cycles. Between capsules, and of anything to a plane, a pair takes less than 0.1 us; of
-boxes and cylinders a few.
-
-`collision.py` defines the pairs.
+In motion up to `AT_ONCE` pairs of solids are looked at in every cycle; more of them in turn, so that of up to 400 pairs
+each is looked at at least every 10 cycles. Between capsules, and of anything to a plane, a pair takes less than 0.1 us;
+of boxes and cylinders a few.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,6 +30,7 @@ from ident_service.config.motion_design import BASE
 from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
+from ident_service.model.pinocchio_models import link_frame
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace, Solid, rotation_rpy
 from ident_service.model.urdf import urdf_solids
 
@@ -410,6 +402,38 @@ def kinematics(chain: Chain) -> pin.Model:
         parent = 0 if chain.parents[k] == WORLD else chain.parents[k] + 1
         model.addJoint(parent, joint, pin.SE3(chain.rotation[k], chain.translation[k]), chain.names[k])
     return model
+
+
+def lowest_point(model: ArmModel) -> Callable[[Array], float]:
+    """Create the function that returns the height of the lowest point of the arm.
+
+    Args:
+        model: of the arm; links are the capsules of its geometry, and the origins of their frames.
+
+    Returns:
+        From a position [rad or m], shape (joints,), to the height above the base's origin, against gravity [m].
+    """
+    gravity = np.array(model.config.gravity)
+    up = -gravity / np.linalg.norm(gravity) if gravity.any() else np.array([0.0, 0.0, 1.0])
+    mechanism = kinematics(model.chain)
+    data, links = mechanism.createData(), []
+    for link, name in enumerate(model.chain.names):
+        frame = link_frame(model.chain, link)
+        points, radii = [np.zeros(3)], [0.0]
+        for capsule in model.config.geometry.get(name, ()):
+            points += [np.array(capsule.start), np.array(capsule.end)]
+            radii += [capsule.radius] * 2
+        links.append((link + 1, np.array([frame.act(point) for point in points]), np.array(radii)))
+
+    def height(position: Array) -> float:
+        pin.forwardKinematics(mechanism, data, position)
+        lowest = []
+        for joint, points, radii in links:
+            pose = data.oMi[joint]
+            lowest.append((points @ (up @ pose.rotation) - radii).min() + up @ pose.translation)
+        return float(min(lowest))
+
+    return height
 
 
 def geometry(around: Scene, contacts: Sequence[tuple[int, int]]) -> tuple[pin.GeometryModel, pin.GeometryData]:

@@ -9,7 +9,7 @@ lowering, its drives quick-stop.
 
 Reactions that end torque are an `ArmFault` out of `Loop.run`; taking the torque away is `run.py`'s. After a stop the
 loop goes on until the arm has been measured at rest and held for a while, see `faults.py`; one without brakes until a
-person has confirmed that it is supported, or until it has been lowered (`after_stop.py`, `lowering.py`).
+person has confirmed that it is supported, or until it has been lowered (`after_stop.py`).
 """
 
 from __future__ import annotations
@@ -25,12 +25,11 @@ import numpy as np
 from drivers.arm import Arm, Flags, Sample, Vector
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.errors import ArmFault, DriverError
-from ident_service.motion.after_stop import HOME_AFTER, StopSecuring
+from ident_service.motion.after_stop import HOME_AFTER, MEANT, Anchor, Lowering, StopSecuring
 from ident_service.motion.command_channel import Controls, Homing
 from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, ActiveFaults, Fault, Reaction, Severity
-from ident_service.motion.lowering import MEANT, Anchor, Lowering
 from ident_service.motion.safety_monitor import SafetyMonitor
 from ident_service.motion.sequencer import TrajectorySequencer
 from ident_service.motion.state_machine import State, StateMachine

@@ -11,7 +11,7 @@ Reactions, from mild to severe; a motion only ever goes from a milder one to a m
   supported or home, or lowered; either ends without torque when the arm rests.
 * **damped lowering**: for an arm that does not follow although it can be measured. No position is asked for any more:
   `LOWER_AFTER` seconds of damped gravity compensation, which is then taken away as fast as the arm sinks slowly
-  (`lowering.py`). With brakes a quick stop follows `LOWER` seconds later, without them when the arm rests.
+  (`after_stop.py`). With brakes a quick stop follows `LOWER` seconds later, without them when the arm rests.
 * **quick stop**: in the same cycle the drives brake by themselves; for faults of ours or of single axes, where the
   drives still know what they do.
 * **torque off**: in the same cycle; where the drives' own measurement or sign cannot be believed either.

@@ -25,7 +25,7 @@ from ident_service.config.motion_limits import MotionLimits, motion_limits
 from ident_service.errors import ArmFault, DriverError, EmergencyStopped, MotionRefused, NobodyEnabled
 from ident_service.excitation.motion_file import Excitation
 from ident_service.model.arm_model import ArmModel, control_model
-from ident_service.model.collision import Contact
+from ident_service.model.collision import Contact, lowest_point
 from ident_service.model.expected_friction import friction_feedforward
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import ONLY_BRAKED, StopSecuring, after_stop
@@ -37,7 +37,6 @@ from ident_service.motion.controller import ComputedTorque
 from ident_service.motion.cycle_timing import Deadlines, longest_stall
 from ident_service.motion.encoder_observer import encoder_coupling, frozen_encoder_observer
 from ident_service.motion.faults import FAULTS, HOLD, ActiveFaults
-from ident_service.motion.lowering import lowest_point
 from ident_service.motion.run_plan import ExcitationPlan, Plan
 from ident_service.motion.safety_monitor import NOT_APPLIED, SafetyMonitor
 from ident_service.motion.sequencer import TrajectorySequencer

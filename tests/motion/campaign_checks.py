@@ -32,9 +32,9 @@ from motion_bench import LOOKED
 
 from drivers.arm import StopKind
 from ident_service.errors import MotionRefused
+from ident_service.motion.after_stop import RESTING, SPEED
 from ident_service.motion.control_loop import REST_CYCLES
 from ident_service.motion.faults import FAULTS, LOWER, LOWER_AFTER, SETTLE, Reaction
-from ident_service.motion.lowering import RESTING, SPEED
 from ident_service.motion.run import run
 from ident_service.motion.safety_monitor import VELOCITY_OFF
 from ident_service.recordings.cycle import Cycle

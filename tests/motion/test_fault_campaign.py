@@ -20,8 +20,9 @@ from campaign_checks import in_runs, keep_their_promises, keeps_its_promise, tog
 
 from ident_service.config.simulation import FAULT_RULES
 from ident_service.model.arm_model import arm_model
+from ident_service.model.collision import lowest_point
+from ident_service.motion.after_stop import STILL
 from ident_service.motion.faults import FAULTS, Reaction
-from ident_service.motion.lowering import STILL, lowest_point
 from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
 

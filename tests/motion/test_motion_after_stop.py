@@ -17,12 +17,12 @@ from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault, MotionRefused, UsageError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
+from ident_service.model.collision import lowest_point
 from ident_service.model.kinematics import link_poses
-from ident_service.motion.after_stop import StopSecuring, after_stop, falling_joints
+from ident_service.motion.after_stop import SPEED, StopSecuring, after_stop, falling_joints
 from ident_service.motion.command_channel import ControlFile, Homing, SupervisedCommands
 from ident_service.motion.control_loop import LEADS, LOWERS, WAITS
 from ident_service.motion.faults import ActiveFaults
-from ident_service.motion.lowering import SPEED, lowest_point
 from ident_service.motion.run import RunReport, follow, run
 from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.state_machine import State
