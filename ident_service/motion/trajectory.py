@@ -1,9 +1,7 @@
-"""Plan where the arm should be: a state, the excitation, and jerk-limited trajectories between moving states.
+"""Plan where the arm should be: a state, the excitation, and jerk-limited trajectories from one moving state to another.
 
-The other references are in `trajectory.py` (from one moving state to another), `stop_trajectory.py`, `sequencer.py` and
-`speed_scaling.py`.
-
-Every way is a ruckig trajectory within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else.
+Such a trajectory is ruckig's, within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else. Stops
+are planned in `stop_trajectory.py`; `sequencer.py` leads through them all.
 """
 
 from __future__ import annotations
