@@ -1,4 +1,4 @@
-"""Convert to the integers of CANopen drives: counts of 32 bits, thousandths of a rated torque (`motor_units.py`)."""
+"""Convert to the integers of CANopen drives: counts of 32 bits, thousandths of a rated torque."""
 
 from __future__ import annotations
 

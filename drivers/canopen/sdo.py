@@ -5,7 +5,7 @@ the link and receives until the reply has come, so that the same code configures
 time too, and no thread is left when streaming begins. Other frames received meanwhile go to a given function.
 
 Each node serves its own requests, so that all of them may be asked before the first has answered. Only what one frame
-holds is read, and nothing is ever written; texts, and what is written, go through `sdo.py`.
+holds is read so, and nothing is written; texts, and what is written, take the library's client.
 """
 
 from __future__ import annotations

@@ -21,16 +21,12 @@ Constrained estimates: their covariance here is that of the unconstrained fit. P
 estimates closer together, not apart, so such a test is on the careful side. Where a file has its unconstrained values,
 those are compared, to which the covariance belongs.
 
-`change_detection.py` explains what a change may mean.
-
-Base parameters group the parameters of neighbouring links, so a tool on the last link moves the base parameters of all
-links before it. A cause is a few link parameters (friction of a joint, drive inertia of a joint, the body of a link)
-with their columns C of K. How much of a difference d it explains is said in torque on the recorded motion, each joint
-in units of its residual:
+A cause only describes a change; whether there is one, the tests say. Base parameters group the parameters of
+neighbouring links, so a tool on the last link moves the base parameters of all links before it. A cause is a few link
+parameters (friction of a joint, drive inertia of a joint, the body of a link) with their columns C of K. How much of a
+difference d it explains is said in torque on the recorded motion, each joint in units of its residual:
 
     1 - min_x |R (d - C x)|^2 / |R d|^2
-
-It describes, it does not test: whether anything has changed is for `change_detection.py` to say.
 """
 
 from __future__ import annotations

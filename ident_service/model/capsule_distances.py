@@ -4,17 +4,13 @@ Arrays have their three components first and the samples last: points are of sha
 lines the distance is smallest comes back too, because the gradient of a smallest distance is that of the distance
 between those points held fast (envelope theorem).
 
-`capsule_distances.py` supplies the end points.
-
 Capsules are exact, other solids of moving links are replaced by a capsule around them, so that while two bodies are
-apart no distance here is larger than the exact one of `collision.py`. Boxes and half spaces that do not move stay what
-they are. Overlap of a capsule with a box is measured by the deepest point of the capsule's axis and pushes through the
-nearest face.
+apart no distance here is larger than the exact one of `collision.py`, which defines the pairs. Boxes and half spaces
+that do not move stay what they are. Overlap of a capsule with a box is measured by the deepest point of the capsule's
+axis and pushes through the nearest face.
 
 With end points e(q) and closest points held fast, the gradient of a distance is that of its direction times the
-points' motion; forward kinematics is traced once per arm (`symbolic.py`) and run backwards for it (`symbolic.py`).
-
-`collision.py` defines the pairs.
+points' motion; forward kinematics is traced once per arm and run backwards for it (`symbolic.py`).
 """
 
 from __future__ import annotations

@@ -1,19 +1,15 @@
 """Model what dry friction is multiplied by: the sign of the velocity, or Dahl's pre-sliding state.
 
-`model/friction_state.py` has it for a whole recording; this is one step of the same solution. Where the drive moves by
-`step` without turning round, the direction s goes to
-
-    s' = sign(step) + (s - sign(step)) exp(-|step| / x0)
-
-exactly, however long the step is. With x0 = 0 it is the sign. Pure computation, no I/O.
-
 A drive that turns round does not change its friction at once: teeth and bearings give by some micrometres or
 milliradians first. The simplest law for that is Dahl's (1968),
 
     ds/dx = (1 - s sign(v)) / x0
 
-whose solution between two reversals is an exponential in the distance travelled, so it costs nothing to compute. With
-x0 = 0 it is the sign.
+Where the drive moves by `step` without turning round, the direction s goes to
+
+    s' = sign(step) + (s - sign(step)) exp(-|step| / x0)
+
+exactly, however long the step is: an exponential in the distance travelled. With x0 = 0 it is the sign.
 """
 
 from __future__ import annotations

@@ -9,13 +9,12 @@ and joint i feels `u . n + v . f`, where (u, v) is its unit screw seen from the 
 sliding joint), v the velocity of the link's origin per unit of joint speed. Both are linear in delta, so each joint's
 row is ten products of vectors, computed for whole blocks with the samples along the last, contiguous axis.
 
-The formulas are traced once per chain (`symbolic.py`), which drops everything that the geometry makes zero or one.
-
-No loop over samples runs in Python.
+The formulas are traced once per chain (`symbolic.py`), which drops everything that the geometry makes zero or one. No
+loop over samples runs in Python.
 
 For a scalar function of H, `pull` turns its derivatives with respect to the entries of H into those with respect to
-position, velocity, acceleration and direction: what a search for a motion needs. Exact, from the same traced formulas
-as `regressor.py`, for about twice the time of H itself.
+position, velocity, acceleration and direction: what a search for a motion needs. Exact, from the same traced formulas,
+for about twice the time of H itself.
 """
 
 from __future__ import annotations

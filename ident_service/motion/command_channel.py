@@ -28,9 +28,6 @@ Every word is written by one side at a time and read whole. The loop reads memor
 other process can make it wait. The process that moves the arm holds an exclusive lock on the file, which vanishes with
 the process: a second one is refused, and a file without a lock belongs to no process.
 
-The lease is measured on the machine's clock: it is about a process that hangs, not about the arm. `command_channel.py`
-says when it counts.
-
 The pipe ends with the process at its other end, however that dies, and within a cycle; so does the motion, in real and
 in virtual time. The lease is for one that lives but hangs. It is measured on the machine's clock, because that is where
 a process hangs, and counts in real time only: in lock step the arm's time waits for nobody but the plant and the
@@ -139,7 +136,7 @@ _TRIES, _TRY_AGAIN = 20, 0.005  # s; a process that checks whether the file is i
 
 
 class ControlFile:
-    """Represent the controls of one arm; `motion/command_channel.py` says how the loop reads them."""
+    """Represent the controls of one arm; the module says how the loop reads them."""
 
     def __init__(self, fd: int, memory: mmap.mmap, now_ns: Callable[[], int]) -> None:
         self._fd, self._memory, self._now_ns = fd, memory, now_ns

@@ -1,4 +1,4 @@
-"""Plan where the arm should be: a state, the excitation, and jerk-limited trajectories from one moving state to another.
+"""Plan where the arm should be: a state, the excitation, and jerk-limited trajectories between moving states.
 
 Such a trajectory is ruckig's, within the arm's velocity, acceleration and jerk; ruckig is imported nowhere else. Stops
 are planned in `stop_trajectory.py`; `sequencer.py` leads through them all.

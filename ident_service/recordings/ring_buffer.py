@@ -68,9 +68,8 @@ below, n long written     the writer was torn out of `put` (by a signal's except
 ========================= ===================================================================================
 
 So at any time `cursor = records returned + records lost`. A writer that dies between any two stores leaves the slot's
-sequence odd, or the record whole: nothing wrong can be read, and only the record in the making is missing. What is
-assumed of the machine stands in `ring_buffer.py`, the bytes of a slot in `ring_buffer.py`. The two processes, and what
-they tell each other beside the records, are `ring_sink.py`'s and `recorder.py`'s business.
+sequence odd, or the record whole: nothing wrong can be read, and only the record in the making is missing.
+`ring_sink.py` and `recorder.py` say what the two processes tell each other besides.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 Colours follow Okabe and Ito, "Color Universal Design" (2008), so that no meaning hangs on telling red from green.
 
-A drawing is one self-contained text: no script, no font, no identifier that could clash inside a larger page. What the
-kinds of shape look like is in `plots.py`.
+A drawing is one self-contained text: no script, no font, no identifier that could clash inside a larger page.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ Each block is an affine map of delta into symmetric matrices or numbers that mus
 - `inertia`, the paper's: D_k(delta_k) of eq. 17, equivalent to m > 0 and I > 0 about the centre of mass;
 - `pseudo_inertia`, stricter: the 4x4 matrix [[tr(L)/2 1 - L, l], [l^T, m]] > 0, equivalent to a mass distribution
   that has these moments (Wensing, Kim and Slotine 2018); it adds the triangle inequalities;
-- what the arm's configuration knows besides (eqs. 25, 26, 28 and more), from `feasible_set.py`.
+- what the arm's configuration knows besides (eqs. 25, 26, 28 and more).
 
 Equalities (symmetry planes) stand beside the blocks: they have no inside, so they take no part in a margin.
 """

@@ -1,7 +1,5 @@
 """Compare parameter sets with a reference: sides, the values in use, differences, findings.
 
-Nothing is judged here; `comparison.py` does that.
-
 Tests are made of unconstrained values, to which the covariances belong. Exports, models and torque errors are made of
 the values held in a feasible set, so these may differ where the arm has not changed: by another set, another method, or
 an edited file. Pure computation, no I/O.

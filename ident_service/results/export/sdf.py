@@ -5,7 +5,7 @@ are fixed-axis roll, pitch, yaw [rad]. An axis is expressed in its joint's frame
 in the frame of the inertial's pose. Whatever could mean something else is refused.
 
 The arm stands on `world`. SDF keeps gravity with the world and has no place for drive inertia. What is written is read
-back by `sdf.py`, which follows the specification and knows nothing of this writer.
+back by a reader that follows the specification and knows nothing of the writer.
 """
 
 from __future__ import annotations
