@@ -685,7 +685,8 @@ _ASKED = {
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
-    from ident_service.motion.command_channel import ControlFile, in_use
+    from ident_service.motion.command_channel import in_use
+    from ident_service.operations.moving_arms import ask_process
 
     os.umask(0o077)
     name, path = _control(arguments)
@@ -696,14 +697,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
         )
         if not held:
             return _release_drives(arguments)
-    with ControlFile.reach(path) as controls:
-        if arguments.asks == "supported":
-            controls.confirm_support()
-        else:
-            if arguments.asks == "finish":
-                controls.request_finish()
-            controls.request_pause(arguments.asks == "pause")
-        pid = controls.pid
+    pid = ask_process(path, arguments.asks)
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document

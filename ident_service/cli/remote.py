@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 Verb = Callable[["IdentClient", argparse.Namespace], Answer]
+Reader = Callable[["IdentClient", argparse.Namespace], Any]
 Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 RemoteVerb = tuple[Verb, frozenset[str]]  # and the arguments that are sent to a daemon; any other one is an error
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
@@ -106,13 +107,24 @@ def carrying(words: str, verb: Verb) -> RemoteVerb:
     return verb, frozenset(words.split())
 
 
-def plain_job(words: str, kind: str | None = None) -> RemoteVerb:
-    """Return a verb that is a job of exactly these arguments; its kind is the verb when None."""
+def job(
+    words: str, kind: str | None = None, *, more: str = "", ended: Ended = with_answer_lines, **fields: Reader
+) -> RemoteVerb:
+    """Return a verb that is a job with the arguments' values.
 
-    def make(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-        return {"kind": kind} | {name: getattr(arguments, name) for name in words.split()}
+    Args:
+        words: arguments that are fields of the job under their own names.
+        kind: of the job; the verb when None.
+        more: further arguments, which `fields` read.
+        ended: turns the job's answer into the verb's.
+        fields: reads the value of a field.
+    """
 
-    return carrying(words, job_verb(make))
+    def make(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+        plain = {name: getattr(arguments, name) for name in words.split()}
+        return {"kind": kind} | plain | {name: read(client, arguments) for name, read in fields.items()}
+
+    return carrying(f"{words} {more}", job_verb(make, ended))
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
@@ -174,16 +186,6 @@ def job_verb(
     return verb
 
 
-def _simulate(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    motion = motion_id(client, arguments.arm, arguments.motion)
-    return {
-        "arm": arguments.arm,
-        "motion": motion,
-        "seed": arguments.seed,
-        "feasible_set": arguments.feasible_set,
-    }
-
-
 def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     of_all, of_one = columns_files(arguments.columns)
     if lost := [path for path in of_one if not path.is_file()]:
@@ -202,30 +204,25 @@ def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, A
     }
 
 
-def _design(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    limit = arguments.search_time if arguments.search_time is not None or arguments.starts is not None else 60.0
-    return {
-        "arm": arguments.arm,
-        "seconds": limit,
-        "starts": arguments.starts,
-        "seed": arguments.seed,
-        "criterion": arguments.criterion,
-        "parameters": arguments.chosen,
-        "motion": arguments.motion,
-        "after": [recording(client, arguments, arguments.arm, path) for path in arguments.after],
-    }
+def _seconds(_: IdentClient, arguments: argparse.Namespace) -> float | None:
+    searched: float | None = arguments.search_time
+    return 60.0 if searched is None and arguments.starts is None else searched
 
 
-def _check(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    motion = motion_id(client, arguments.arm, arguments.motion)
-    return {"kind": "check", "arm": arguments.arm, "motion": motion, "home": arguments.home}
+def _after(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    return [recording(client, arguments, arguments.arm, path) for path in arguments.after]
+
+
+def motion_of(client: IdentClient, arguments: argparse.Namespace) -> str | None:
+    """Return the id of a verb's motion, as `motion_id`."""
+    return motion_id(client, arguments.arm, arguments.motion)
 
 
 def run_job(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the request of a run without a key; upload its motion first if it is a file."""
     return {
         "arm": arguments.arm,
-        "motion": motion_id(client, arguments.arm, arguments.motion),
+        "motion": motion_of(client, arguments),
         "speed": arguments.speed,
         "until": _until(arguments),
     }
@@ -309,10 +306,16 @@ def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 REMOTE: dict[str, RemoteVerb] = {
-    "simulate": carrying("arm feasible_set motion seed", job_verb(_simulate)),
+    "simulate": job("arm seed feasible_set", more="motion", motion=motion_of),
     "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
-    "design": carrying("after arm chosen criterion motion search_time seed starts", job_verb(_design)),
-    "preflight": carrying("arm confirm home motion", job_verb(_check)),
+    "design": job(
+        "arm starts seed criterion motion",
+        more="after chosen search_time",
+        seconds=_seconds,
+        parameters=lambda _, arguments: arguments.chosen,
+        after=_after,
+    ),
+    "preflight": job("arm home", "check", more="confirm motion", motion=motion_of),
     "home": carrying("arm confirm zero", job_verb(_home)),
     "set-home": carrying("arm confirm", job_verb(_home)),
     "stop": carrying("arm", _stop),

@@ -21,10 +21,11 @@ from ident_service.cli.remote import (
     RemoteVerb,
     carrying,
     confirmation,
+    job,
     job_answer,
     job_verb,
     motion_id,
-    plain_job,
+    motion_of,
     renew,
     run_job,
     telling_of_arm,
@@ -50,10 +51,6 @@ def _recovery_answer(client: IdentClient, arguments: argparse.Namespace, answer:
     """The commands of the next steps are for the daemon, too."""
     code, text, document = with_answer_lines(client, arguments, answer)
     return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
-
-
-def _preview(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"arm": arguments.arm, "motion": motion_id(client, arguments.arm, arguments.motion)}
 
 
 def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -167,13 +164,13 @@ def keep_rehearsal_lease(
 
 
 VERBS: dict[str, RemoteVerb] = {
-    "watch": plain_job("arm seconds"),
+    "watch": job("arm seconds"),
     "recover": carrying("arm confirm leave_limit", job_verb(_recover, _recovery_answer)),
-    "base-parameters": plain_job("arm", "base"),
-    "preview": carrying("arm motion", job_verb(_preview)),
-    "bus load": plain_job("arm rate", "bus_load"),
-    "bus scan": plain_job("arm", "bus_scan"),
-    "bus probe": plain_job("arm", "bus_probe"),
+    "base-parameters": job("arm", "base"),
+    "preview": job("arm", more="motion", motion=motion_of),
+    "bus load": job("arm rate", "bus_load"),
+    "bus scan": job("arm", "bus_scan"),
+    "bus probe": job("arm", "bus_probe"),
     "config check": carrying("file", _config_check),
     "run": carrying("arm chosen confirm hold_to_run motion speed until", _run),
     "rehearse": carrying("arm confirm motion no_key speed", _rehearse),

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
@@ -82,6 +82,13 @@ def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
 def operation_id(route: APIRoute) -> str:
     """Return the function's name as the operation id of a route, for generated clients."""
     return route.name
+
+
+def api_router(tag: str, *statuses: int) -> APIRouter:
+    """Return a router of `/api/v1` whose routes may have these failure statuses besides those that any may have."""
+    return APIRouter(
+        prefix="/api/v1", tags=[tag], responses=failures(*statuses), generate_unique_id_function=operation_id
+    )
 
 
 def status_of(error: IdentError) -> int:

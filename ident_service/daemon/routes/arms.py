@@ -11,16 +11,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ident_service.config.load import load_arm
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_BYTES
 from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
-from ident_service.daemon.jobs.requests import ArmName, FileName, Id
+from ident_service.daemon.errors import api_router, failures
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.daemon.responses import (
     PAGES,
     AcceptanceAnswer,
@@ -44,29 +43,26 @@ from ident_service.motion.command_channel import controlling_pid
 from ident_service.operations import deletion
 from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
 from ident_service.operations.description_process import describe_apart, draw_apart, judge_apart
+from ident_service.operations.moving_arms import Asked
 from ident_service.registry import arms as known
 from ident_service.registry import motions
 from ident_service.registry.database import note
 from ident_service.registry.runs import run_folder
 from ident_service.registry.state_folder import control_path, fault_file
 
-router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404), generate_unique_id_function=operation_id)
+router = api_router("arms", 404)
 Text = Annotated[str, Field(max_length=known.MOST_BYTES)]
 Note = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
 
 
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Description(_Body):
+class Description(RequestBody):
     """Description of an arm as YAML, and the files that it names, by name."""
 
     description: Annotated[str, Field(max_length=MOST_BYTES)]
-    files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+    files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}  # noqa: RUF012 - pydantic copies it
 
 
-class Support(_Body):
+class Support(RequestBody):
     """Confirmation that the arm is supported or home: its name, typed by a person who sees it."""
 
     confirm: Annotated[str, Field(max_length=200)]
@@ -80,24 +76,24 @@ class NewArm(Description):
     """
 
     replace: bool = False
-    meshes: Annotated[dict[FileName, str], Field(max_length=64)] = {}
+    meshes: Annotated[dict[FileName, str], Field(max_length=64)] = {}  # noqa: RUF012 - pydantic copies it
 
 
-class MotionUpload(_Body):
+class MotionUpload(RequestBody):
     """Motion for an arm: the content of a `motion.json`."""
 
     arm: ArmName
     motion: Annotated[str, Field(max_length=4 * 2**20)]
 
 
-class Acceptance(_Body):
+class Acceptance(RequestBody):
     """Decision of a person that the parameters of a run are the arm's."""
 
     run: Id
     note: Note
 
 
-class Rollback(_Body):
+class Rollback(RequestBody):
     """Decision of a person to return to an earlier set; the one before the current set if `to` is left out."""
 
     note: Note
@@ -127,10 +123,9 @@ class HomeJoint(BaseModel):
     unit: Literal["rad", "m"]
 
 
-class NewDescription(BaseModel):
+class NewDescription(RequestBody):
     """URDF of an arm, by name, with its meshes: each file's content in base 64. The arm gets `name`."""
 
-    model_config = ConfigDict(extra="forbid")
     name: ArmName
     urdf: FileName
     files: Annotated[dict[FileName, str], Field(min_length=1, max_length=64)]
@@ -220,20 +215,19 @@ def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> Faul
 @router.post("/arms/{arm}/pause")
 def pause(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
     """Pause the motion of an arm; it keeps its lease."""
-    return _pause(service, who.name, arm, wanted=True)
+    return _ask(service, who.name, arm, "pause")
 
 
 @router.post("/arms/{arm}/resume")
 def resume(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
     """Resume the motion of an arm."""
-    return _pause(service, who.name, arm, wanted=False)
+    return _ask(service, who.name, arm, "resume")
 
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
     """Finish a run early; the arm goes back to where it stood, and the run is done."""
-    name = known.known_arm(service.db, service.state, arm).name
-    return AskedAnswer(arm=name, asked="finish", reached=service.engine.finish(name, who.name))
+    return _ask(service, who.name, arm, "finish")
 
 
 @router.post("/arms/{arm}/supported")
@@ -242,7 +236,7 @@ def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> A
     name = known.known_arm(service.db, service.state, arm).name
     if body.confirm != name:
         raise MotionRefused(f"confirm that {name} is supported by its name, typed by a person who sees it")
-    return AskedAnswer(arm=name, asked="supported", reached=service.engine.confirm_support(name, who.name))
+    return _ask(service, who.name, name, "supported")
 
 
 @router.get("/arms/{arm}/acceptances")
@@ -348,7 +342,6 @@ def _arm(service: Service, arm: str) -> ArmAnswer:
     )
 
 
-def _pause(service: Service, who: str, arm: str, *, wanted: bool) -> AskedAnswer:
+def _ask(service: Service, who: str, arm: str, asked: Asked) -> AskedAnswer:
     name = known.known_arm(service.db, service.state, arm).name
-    reached = service.engine.pause(name, who, wanted=wanted)
-    return AskedAnswer(arm=name, asked="pause" if wanted else "resume", reached=reached)
+    return AskedAnswer(arm=name, asked=asked, reached=service.engine.ask(name, asked, who))

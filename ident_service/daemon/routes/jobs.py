@@ -12,16 +12,16 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Header, HTTPException, Query, Response
+from fastapi import Header, HTTPException, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Viewer, WhileAuthorized
-from ident_service.daemon.errors import failures, operation_id
+from ident_service.daemon.errors import api_router, failures
 from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import held_until, is_end_unobserved, process_output
-from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id
+from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id, RequestBody
 from ident_service.daemon.responses import (
     PAGES,
     BeforeNumber,
@@ -40,9 +40,7 @@ from ident_service.registry.database import Row
 from ident_service.registry.state_folder import arm_folder
 from ident_service.registry.tokens import Access
 
-router = APIRouter(
-    prefix="/api/v1", tags=["jobs"], responses=failures(404, 409), generate_unique_id_function=operation_id
-)
+router = api_router("jobs", 404, 409)
 MOST_LOG: Final = 2**20
 NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 _EVENTS = 0.2  # s between looks at a job that is watched
@@ -73,18 +71,16 @@ Key = Annotated[
 State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
 
 
-class Confirmation(BaseModel):
+class Confirmation(RequestBody):
     """Confirmation of one motion by a person: the arm's name, typed, and the challenge that was given for it."""
 
-    model_config = ConfigDict(extra="forbid")
     name: Annotated[str, Field(max_length=64)]
     challenge: Annotated[str, Field(max_length=64)]
 
 
-class JobRequest(BaseModel):
+class JobRequest(RequestBody):
     """Job to be done; one that may move an arm needs the confirmation, and its lease renewed from now on."""
 
-    model_config = ConfigDict(extra="forbid")
     job: AnyJobRequest
     confirm: Confirmation | None = None
 

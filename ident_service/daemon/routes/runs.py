@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
-from ident_service.daemon.jobs.requests import ArmName, FileName, Id
+from ident_service.daemon.errors import api_router, failures
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.daemon.responses import (
     PAGES,
     Anyway,
@@ -35,7 +35,7 @@ from ident_service.registry import runs
 from ident_service.registry.database import Row
 from ident_service.registry.runs import REPORTS
 
-router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404), generate_unique_id_function=operation_id)
+router = api_router("runs", 404)
 _REPORT = "report.html"
 _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
@@ -52,11 +52,10 @@ _PAGE: dict[int | str, dict[str, Any]] = {
 }
 
 
-class Labels(BaseModel):
+class Labels(RequestBody):
     """Tags and note of a run, by which it is found in lists."""
 
-    model_config = ConfigDict(extra="forbid")
-    tags: Annotated[list[Annotated[str, Field(max_length=40)]], Field(max_length=runs.MOST_TAGS)] = []
+    tags: Annotated[tuple[Annotated[str, Field(max_length=40)], ...], Field(max_length=runs.MOST_TAGS)] = ()
     note: Annotated[str, Field(max_length=runs.LONGEST_NOTE)] = ""
 
 
@@ -72,10 +71,9 @@ class ExportAnswer(BaseModel):
     files: dict[str, int]
 
 
-class Pruning(BaseModel):
+class Pruning(RequestBody):
     """Number of each arm's newest runs whose recordings are kept; nothing is deleted without `yes`."""
 
-    model_config = ConfigDict(extra="forbid")
     keep: Annotated[int, Field(ge=1, le=1_000_000)]
     yes: Annotated[bool, Field(strict=True)] = False
 
