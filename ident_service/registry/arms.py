@@ -83,9 +83,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
         UnknownId: there is none.
         ConfigError: its description has become unreadable.
     """
-    row = db.row("SELECT * FROM arms WHERE name = ?", name)
-    if row is None:
-        raise UnknownId(f"no arm {name!r} is known; see the list of arms")
+    row = db.known("arms", "arm", name, "name")
     path = description_path(state, row)
     try:
         config = load_arm(path)

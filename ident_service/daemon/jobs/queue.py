@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, SubprocessJob, UnitChild
-from ident_service.daemon.jobs.commands import JOBS, Command, command
+from ident_service.daemon.jobs.commands import JOBS, READS_BUS, Command, command
 from ident_service.daemon.jobs.outcome import (
     Orphan,
     explain_interrupted,
@@ -563,7 +563,7 @@ class Engine:
 
     def _resources(self, row: Row) -> frozenset[str]:
         """Return what the process of a job has for itself."""
-        if not row["motion"] and row["kind"] not in ("watch", "recover", "bus_scan", "bus_probe"):
+        if not row["motion"] and row["kind"] not in READS_BUS:
             return frozenset()
         known = self.db.row("SELECT resources FROM arms WHERE name = ?", row["arm"])
         return frozenset((f"arm {row['arm']}", *(json.loads(known["resources"]) if known else ())))

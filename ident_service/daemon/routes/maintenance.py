@@ -24,7 +24,7 @@ from ident_service.motion.command_channel import LEASE_SECONDS
 from ident_service.operations import drift_alarms as raised
 from ident_service.operations import maintenance_schedule as planned
 from ident_service.registry.arms import known_arm
-from ident_service.registry.database import Row
+from ident_service.registry.database import LONGEST_NOTE, Row
 
 
 class ScheduleAnswer(BaseModel):
@@ -124,7 +124,7 @@ class AlarmAnswer(BaseModel):
 
 router = api_router("maintenance", 404, 409)
 Number = Annotated[int, Path(ge=1, lt=2**62)]
-Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
+Words = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
 
 
 class NewSchedule(RequestBody):
@@ -147,7 +147,7 @@ class Event(RequestBody):
     """Maintenance that was done."""
 
     what: Annotated[str, Field(min_length=1, max_length=planned.LONGEST_WHAT)]
-    note: Annotated[str, Field(max_length=planned.LONGEST_NOTE)] = ""
+    note: Annotated[str, Field(max_length=LONGEST_NOTE)] = ""
 
 
 class Remark(RequestBody):

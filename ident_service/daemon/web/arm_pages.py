@@ -532,7 +532,14 @@ def _requested_job(arm: str, form: dict[str, str]) -> dict[str, Any]:
         raise UsageError(f"{kind}: a number is missing, or is none") from None
     asked["kind"] = kind
     if kind in ("report", "export"):
-        return {**asked, **({"formats": _formats(form)} if kind == "export" else {})}
+        return {
+            **asked,
+            **(
+                {"formats": [name.removeprefix("format-") for name in form if name.startswith("format-")]}
+                if kind == "export"
+                else {}
+            ),
+        }
     if "until" in asked:
         asked["until"] = {"share": asked["until"]}
     if kind == "identify":
@@ -553,10 +560,6 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "report": ("run",),
     "export": ("run",),
 }
-
-
-def _formats(form: dict[str, str]) -> list[str]:
-    return [name.removeprefix("format-") for name in form if name.startswith("format-")]
 
 
 def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str], problem: str) -> Response:

@@ -32,7 +32,7 @@ from ident_service.registry import jobs as rows
 from ident_service.registry import motions as known_motions
 from ident_service.registry import runs
 from ident_service.registry.arms import known_arm
-from ident_service.registry.database import Database, Row, note
+from ident_service.registry.database import LONGEST_NOTE, Database, Row, note
 from ident_service.registry.tokens import Access
 from ident_service.results.manifest import file_sha256
 
@@ -172,7 +172,6 @@ def _jobs(db: Database, row: Row) -> dict[str, str]:
 
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
-_LONGEST_NOTE = 2000
 _NOTED = "re-identification note"
 
 
@@ -186,8 +185,8 @@ def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) 
 def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Begin a re-identification that a person has confirmed; its page keeps the lease from then on."""
     remark = form.get("note", "").strip()
-    if len(remark) > _LONGEST_NOTE:
-        raise UsageError(f"a note has {_LONGEST_NOTE} characters at most; nothing has moved")
+    if len(remark) > LONGEST_NOTE:
+        raise UsageError(f"a note has {LONGEST_NOTE} characters at most; nothing has moved")
     body = {"arm": arm, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
     if form.get("motion"):
         body["motion"] = form["motion"]
@@ -273,7 +272,7 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
         motion=motion,
         against=against,
         note=form.get("note", ""),
-        longest=_LONGEST_NOTE,
+        longest=LONGEST_NOTE,
         steps=[(TITLES[key], WORDS[key]) for key in TITLES],
         problem=problem,
     )
