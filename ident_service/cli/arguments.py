@@ -307,6 +307,11 @@ def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answe
     parser.set_defaults(verb=run, word=word, words=parser, json=False, server=None)
 
 
+def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable[[str], Any] = str) -> None:
+    """Add an option that may be given several times; its value is a list."""
+    sub.add_argument(option, action="append", default=[], type=read, metavar=metavar, help=text)
+
+
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
     """Separate the columns file of all recordings from those of single recordings.
 

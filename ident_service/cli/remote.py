@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext
@@ -27,7 +26,7 @@ from ident_service.cli.output import (
     tell,
     with_answer_lines,
 )
-from ident_service.cli.progress import ask, step_of
+from ident_service.cli.progress import step_of, typed
 from ident_service.cli.remote_recordings import file_of, recording, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.errors import AccessRefused, ArmError, IdentError, UnknownId, UsageError
@@ -268,7 +267,7 @@ def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    name = typed(arguments)
+    name = typed_name(arguments)
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
         raise UsageError(
@@ -383,26 +382,23 @@ def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 
-def typed(arguments: argparse.Namespace) -> str:
+def typed_name(arguments: argparse.Namespace) -> str:
     """Return the arm's name as a person types it, now or as `--confirm`.
 
     Raises:
         UsageError: another word, or nobody to ask.
     """
-    name = arguments.confirm
-    if name is None and sys.stdin.isatty() and not arguments.json:
-        what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
-        what = "is lowered" if getattr(arguments, "word", "") == "supported" else what
-        question = f"{arguments.arm} {what} where you may not see it. Type its name to confirm: "
-        name = ask(arguments, question).strip()
+    what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
+    what = "is lowered" if arguments.word == "supported" else what
+    name = typed(arguments, f"{arguments.arm} {what} where you may not see it. Type its name to confirm:")
     if name != arguments.arm:
         raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
-    return str(name)
+    return name
 
 
 def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
     """Return the confirmation of a motion: the arm's name as a person typed it, and a fresh challenge."""
-    name = typed(arguments) if name is None else name
+    name = typed_name(arguments) if name is None else name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 

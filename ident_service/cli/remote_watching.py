@@ -29,7 +29,7 @@ from ident_service.cli.remote import (
     renew,
     run_job,
     telling_of_arm,
-    typed,
+    typed_name,
     word_of_address,
 )
 from ident_service.errors import MotionRefused, UsageError
@@ -116,7 +116,7 @@ def _rehearse(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: int | None) -> Answer:
-    name, motion = typed(arguments), motion_id(client, arguments.arm, arguments.motion)
+    name, motion = typed_name(arguments), motion_id(client, arguments.arm, arguments.motion)
     job = {"kind": "rehearse", "arm": arguments.arm, "speed": SLOW if arguments.speed is None else arguments.speed}
     job |= {} if motion is None else {"motion": motion}
     stopping = StopOnSignal()
