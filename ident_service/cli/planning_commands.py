@@ -154,7 +154,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
     unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
     if unfinished:
         sys.stderr.write(f"ident: {unfinished}\n")
-    taught = bool(np.isfinite(seen.deviations).any())
+    teaches = bool(np.isfinite(seen.deviations).any())
     binding = "".join(f"  {line}\n" for line in designed.binding)
     binding = f"limits that restrict the motion\n{binding}\n" if binding else ""
     text = preview_text(seen) + f"\n{binding}files: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
@@ -167,7 +167,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
     document |= preview_document(seen)
     document["binding"] = list(designed.binding)
     document["warnings"] = [*([unfinished] if unfinished else []), *seen.warnings]
-    return (VERDICT_NO if seen.objections or not taught else DONE), text, document
+    return (VERDICT_NO if seen.objections or not teaches else DONE), text, document
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:

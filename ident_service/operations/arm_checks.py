@@ -141,8 +141,8 @@ class SampleLines:
         self._next_ns = at + _TOLD_NS
         known = zip(sample.position.tolist(), sample.valid.tolist(), strict=True)
         position = [[round(value, 6) if valid and isfinite(value) else None] for value, valid in known]
-        told = {"joints": list(described.joint_names), "time": [round(at * 1e-9, 3)], "position": position}
-        print(SAMPLES + json.dumps(told), file=sys.stderr, flush=True)
+        shown = {"joints": list(described.joint_names), "time": [round(at * 1e-9, 3)], "position": position}
+        print(SAMPLES + json.dumps(shown), file=sys.stderr, flush=True)
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:

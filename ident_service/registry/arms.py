@@ -180,8 +180,8 @@ def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
         text = (_description_folder(state, config.name, config.sha256) / _DRAWN / DRAWN_LIST).read_text("utf-8")
     except FileNotFoundError:
         return {"joints": {}, "notes": []}
-    told: dict[str, Any] = json.loads(text)
-    return told
+    document: dict[str, Any] = json.loads(text)
+    return document
 
 
 def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:

@@ -86,7 +86,7 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
     """Enter every run folder that the registry does not know; return the folders that cannot be read, and why."""
     known = {row["id"] for row in db.rows("SELECT id FROM runs")}
     busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state = 'running' AND run IS NOT NULL")}
-    told = []
+    unreadable = []
     place = state / RUNS
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         if folder.name.startswith(".") or folder.name in known | busy or folder.is_symlink():
@@ -94,8 +94,8 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
         try:
             index_run(db, state, folder.name)
         except (IdentError, OSError) as error:
-            told.append(f"{folder.name}: {error}")
-    return told
+            unreadable.append(f"{folder.name}: {error}")
+    return unreadable
 
 
 def known_run(db: Database, run: str) -> Row:

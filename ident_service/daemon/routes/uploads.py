@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated, Any, Final
 
 from fastapi import Header, HTTPException, Request
@@ -101,13 +102,4 @@ def delete_upload(service: Serving, _: Operator, upload: Id) -> None:
 
 
 def _answer(seen: uploads.Upload) -> UploadAnswer:
-    told = seen.announced
-    return UploadAnswer(
-        id=seen.id,
-        arm=told.arm,
-        name=told.name,
-        bytes=told.bytes,
-        sha256=told.sha256,
-        received=seen.received,
-        run=seen.run,
-    )
+    return UploadAnswer(**asdict(seen.announced), id=seen.id, received=seen.received, run=seen.run)
