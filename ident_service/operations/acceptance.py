@@ -169,6 +169,11 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
     return act, folder
 
 
+def current_file(state: Path, arm: str) -> Path:
+    """Return the file with an arm's current parameters, there or not."""
+    return arm_folder(state, arm) / CURRENT / PARAMETERS
+
+
 def synchronise(db: Database, state: Path) -> None:
     """Bring `current` and the registry up to date with the accepted sets of every arm; after a kill, for example."""
     place = state / "arms"
