@@ -294,6 +294,18 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     return sys.stdin.fileno()
 
 
+def require_held(arguments: argparse.Namespace, arm: str, key: HeldKey, stopping: StopOnSignal) -> None:
+    """Ask a person to hold the key, and wait until it is held.
+
+    Raises:
+        MotionRefused: it was not.
+    """
+    tell(arguments, f"{arm}: hold the space bar: the arm begins to move some seconds later")
+    tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
+    if not key.wait(stopping.requested):
+        raise MotionRefused("the space bar was not held; nothing has moved")
+
+
 def _target_text(until: dict[str, Any]) -> str:
     """Format whether the accuracy target of a run was reached, and which parameters missed it."""
     if (missed := until["missed"]) is None:
@@ -617,10 +629,7 @@ def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
     with stopping, HeldKey(terminal) as key:
-        tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
-        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
-        if not key.wait(stopping.requested):
-            raise MotionRefused("the space bar was not held; nothing has moved")
+        require_held(arguments, config.name, key, stopping)
         return run_and_report(
             arguments,
             config,

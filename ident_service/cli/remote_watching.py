@@ -14,7 +14,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.motion_commands import RELEASED, SLOW, HeldKey, require_no_target, require_terminal
+from ident_service.cli.motion_commands import SLOW, HeldKey, require_held, require_no_target, require_terminal
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.remote import (
     LIVE,
@@ -32,7 +32,7 @@ from ident_service.cli.remote import (
     typed_name,
     word_of_address,
 )
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -122,10 +122,7 @@ def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: i
     stopping = StopOnSignal()
     with stopping, nullcontext() if terminal is None else HeldKey(terminal) as key:
         if key is not None:
-            tell(arguments, f"{arguments.arm}: hold the space bar: the arm begins to move some seconds later")
-            tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
-            if not key.wait(stopping.requested):
-                raise MotionRefused("the space bar was not held; nothing has moved")
+            require_held(arguments, arguments.arm, key, stopping)
         # Asked for only now, so that the challenge is fresh however long it took until the key was held.
         body = {"job": job, "confirm": confirmation(client, arguments, name)}
         made = client.post(f"{_API}/jobs", body)

@@ -71,36 +71,18 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One change that a comparison has found.
-
-    Attributes:
-        what: and of which joint or link.
-        joint: the one whose torque changes most for its size; may be empty.
-        sigma: size of the change in standard deviations.
-        size: how much, in words; may be empty.
-        meaning: what it may mean.
-    """
-
-    what: str
-    joint: str
-    sigma: float
-    size: str
-    meaning: str
-
-
-@dataclass(frozen=True)
 class Compared:
     """Comparison that a verdict was concluded from.
 
     Attributes:
         folder: of the run that keeps it.
-        findings: what has changed.
+        findings: what has changed: `what` and of which joint or link; `joint`, whose torque changes most for its size;
+            `sigma`, the change in standard deviations; `size`, in words; `meaning`. Joint and size may be empty.
         errors: torque error on the new recording with the accepted parameters and with its own [%]; None if unknown.
     """
 
     folder: Path
-    findings: tuple[Finding, ...]
+    findings: tuple[dict[str, Any], ...]
     errors: tuple[float, float] | None
 
 
@@ -146,7 +128,7 @@ def compared(db: Database, state: Path, run: str | None, words: str) -> Compared
 
 
 def _comparison(folder: Path, pair: dict[str, Any]) -> Compared:
-    found = [Finding(one["what"], one["joint"], one["sigma"], one["size"], one["meaning"]) for one in pair["findings"]]
+    found = [{key: one[key] for key in ("what", "joint", "sigma", "size", "meaning")} for one in pair["findings"]]
     errors = pair["torque_error_percent"]
     both = None if errors is None else (float(errors["reference"]["whole"]), float(errors["own"]["whole"]))
     return Compared(folder, tuple(found), both)
