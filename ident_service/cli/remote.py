@@ -9,7 +9,7 @@ import argparse
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -337,29 +337,61 @@ def _wait_for_job(
     client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
 ) -> Answer:
     """Wait for the end of a job and renew its lease; on Ctrl-C cancel it, if this command began it."""
-    stopping, cancelled, phase = StopOnSignal(), False, ""
+    stopping = StopOnSignal()
     with stopping:
-        while job["state"] in LIVE:
-            if stopping.requested() and not cancelled:
-                cancelled = True
-                if not ours:
-                    break
+        return job_answer(client, follow(client, arguments, job, stopping.requested, moves=moves, ours=ours))
+
+
+def follow(
+    client: IdentClient,
+    arguments: argparse.Namespace,
+    job: dict[str, Any],
+    over: Callable[[], bool],
+    *,
+    moves: bool,
+    ours: bool = True,
+    every: float = _LOOK,
+) -> dict[str, Any]:
+    """Tell the phases of a job until it has ended, and renew its lease.
+
+    Args:
+        client: of the daemon.
+        arguments: of the verb.
+        job: as the daemon answered it.
+        over: asked in each turn; once true, the lease is renewed no more, and the job is cancelled.
+        moves: whether it has a lease.
+        ours: whether this command began the job; another one is left alone, and no longer waited for.
+        every: s between turns; the job itself is looked at less often.
+
+    Returns:
+        The job as it was last.
+    """
+    looked, phase, cancelled = time.monotonic(), "", False
+    while job["state"] in LIVE:
+        if not cancelled and over():
+            cancelled = True
+            if not ours:
+                break
+            with suppress(UsageError):  # it has ended meanwhile, as the next look will tell
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
-            elif moves and not cancelled:
-                renew(client, job["id"])
-            time.sleep(_LOOK)
-            job, held = client.get(f"/api/v1/jobs/{job['id']}"), job["held"]
-            if job["held"] and not held:
-                for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
-                    tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
-            known = job["progress"] or {}
-            state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
-            said = known.get("phase", state)
-            step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
-            if said != phase:
-                phase = said
-                tell(arguments, phase)
-    return job_answer(client, job)
+        elif moves and not cancelled:
+            renew(client, job["id"])
+        time.sleep(every)
+        if time.monotonic() - looked < _LOOK:
+            continue
+        looked, held = time.monotonic(), job["held"]
+        job = client.get(f"/api/v1/jobs/{job['id']}")
+        if job["held"] and not held:
+            for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
+                tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
+        known = job["progress"] or {}
+        state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
+        said = known.get("phase", state)
+        step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
+        if said != phase:
+            phase = said
+            tell(arguments, phase)
+    return job
 
 
 def renew(client: IdentClient, job: str) -> None:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,16 +16,15 @@ from typing import TYPE_CHECKING, Any
 from ident_service.cli.motion_commands import SLOW, HeldKey, require_held, require_no_target, require_terminal
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.remote import (
-    LIVE,
     RemoteVerb,
     carrying,
     confirmation,
+    follow,
     job,
     job_answer,
     job_verb,
     motion_id,
     motion_of,
-    renew,
     run_job,
     telling_of_arm,
     typed_name,
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
 
 _API = "/api/v1"
 _RENEW = 0.05  # s between looks at the key, each of which renews the lease; a rehearsal's lasts 0.25 s
-_LOOK = 0.4  # s between looks at the job
 _MOST_FILE = 8 * 2**20  # bytes of all files that a daemon takes
 
 
@@ -129,35 +126,7 @@ def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: i
         tell(arguments, f"job {made['id']}")
         over = stopping.requested if key is None else lambda: stopping.requested() or key.released()
         with telling_of_arm(arguments.arm, made["id"]):
-            return job_answer(client, keep_rehearsal_lease(client, arguments, made, over))
-
-
-def keep_rehearsal_lease(
-    client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], over: Callable[[], bool]
-) -> dict[str, Any]:
-    """Renew the lease of a rehearsal until `over` says that it is not to go on, then have it stopped.
-
-    Returns:
-        The job, when it has ended.
-    """
-    looked, phase, cancelled = time.monotonic(), "", False
-    while job["state"] in LIVE:
-        if not cancelled and over():
-            cancelled = True
-            try:
-                client.post(f"{_API}/jobs/{job['id']}/cancel")
-            except UsageError:  # the job has ended meanwhile, as the next poll will tell
-                looked = 0.0
-        elif not cancelled:
-            renew(client, job["id"])
-        time.sleep(_RENEW)
-        if time.monotonic() - looked > _LOOK:
-            looked, job = time.monotonic(), client.get(f"{_API}/jobs/{job['id']}")
-            said = (job["progress"] or {}).get("phase", job["state"])
-            if said != phase:
-                phase = said
-                tell(arguments, phase)
-    return job
+            return job_answer(client, follow(client, arguments, made, over, moves=True, every=_RENEW))
 
 
 VERBS: dict[str, RemoteVerb] = {
