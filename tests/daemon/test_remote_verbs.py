@@ -317,7 +317,7 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
                 if line in ("approaching", "exciting"):
                     hands.let_go()
 
-            monkeypatch.setattr("ident_service.cli.remote_watching.tell", told)
+            monkeypatch.setattr("ident_service.cli.remote.tell", told)
             assert main(rehearse) == 1
         job = client.get("/api/v1/jobs?most=1")[0]
         assert (job["kind"], job["state"], job["detail"]) == ("rehearse", "cancelled", "cancelled by owner")
