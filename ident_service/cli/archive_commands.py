@@ -13,11 +13,14 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import Parser, VerbList, count
 from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 from ident_service.errors import IdentError, InUse, UsageError
+
+if TYPE_CHECKING:
+    from ident_service.registry.database import Database
 
 _LONGEST_NAME = 80
 _LINE = 80  # columns of a list
@@ -47,6 +50,16 @@ def terminal_user(arguments: argparse.Namespace) -> str:
     if not name or len(name) > _LONGEST_NAME:
         raise UsageError(f"--by needs a name of 1 to {_LONGEST_NAME} characters")
     return f"terminal:{name}"
+
+
+@contextmanager
+def registry(arguments: argparse.Namespace) -> Iterator[tuple[Database, Path]]:
+    """Open the registry of the state folder that a verb works on, and return the folder with it."""
+    from ident_service.registry.database import Database
+
+    state = writable_state_folder(arguments)
+    with Database(state) as db:
+        yield db, state
 
 
 def write_audit_entry(arguments: argparse.Namespace, what: str, about: str, **detail: Any) -> None:
@@ -181,11 +194,9 @@ def _add_lists(verbs: VerbList) -> None:
 
 def _arms(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.arms import arm_names, know_shipped
-    from ident_service.registry.database import Database
     from ident_service.registry.state_folder import known_arms
 
-    state = writable_state_folder(arguments)
-    with Database(state) as db:
+    with registry(arguments) as (db, state):
         know_shipped(db)
         rows = [{key: row[key] for key in ("name", "source", "description")} for row in arm_names(db)]
     named = {row["name"] for row in rows}
@@ -194,11 +205,9 @@ def _arms(arguments: argparse.Namespace) -> Answer:
 
 
 def _runs(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.database import Database
     from ident_service.registry.runs import rebuild_runs, runs
 
-    state = writable_state_folder(arguments)
-    with Database(state) as db:
+    with registry(arguments) as (db, state):
         unreadable = rebuild_runs(db, state)
         rows = [{key: row[key] for key in _RUN_KEYS} for row in runs(db, arguments.arm, most=arguments.most)]
     text = "".join(f"not listed: {line}\n" for line in unreadable)
@@ -206,10 +215,9 @@ def _runs(arguments: argparse.Namespace) -> Answer:
 
 
 def _motions(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.database import Database
     from ident_service.registry.motions import motions
 
-    with Database(writable_state_folder(arguments)) as db:
+    with registry(arguments) as (db, _):
         rows = [dict(row) for row in motions(db, arguments.arm, most=arguments.most)]
     return DONE, motions_text(rows), {"motions": rows}
 
@@ -233,56 +241,40 @@ def motions_text(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.acceptance import CURRENT, PARAMETERS, accept
-    from ident_service.registry.database import Database
-    from ident_service.registry.state_folder import arm_folder
+    from ident_service.operations.acceptance import accept, current_file
 
-    state = writable_state_folder(arguments)
-    with Database(state) as db:
+    with registry(arguments) as (db, state):
         act = accept(db, state, arguments.run.resolve(), arguments.note, terminal_user(arguments))
-    path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
+    path = current_file(state, act.arm)
     return DONE, f"{act.arm}: acceptance {act.number}; current: {path}\n", {**asdict(act), "current": str(path)}
 
 
 def _rollback(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.acceptance import CURRENT, PARAMETERS, rollback
-    from ident_service.registry.database import Database
-    from ident_service.registry.state_folder import arm_folder
+    from ident_service.operations.acceptance import current_file, rollback
 
-    state = writable_state_folder(arguments)
-    with Database(state) as db:
+    with registry(arguments) as (db, state):
         act = rollback(db, state, arguments.arm, arguments.note, terminal_user(arguments), arguments.to)
-    path = arm_folder(state, act.arm) / CURRENT / PARAMETERS
+    path = current_file(state, act.arm)
     text = f"{act.arm}: acceptance {act.number} is the set of {act.origin} ({act.run}); current: {path}\n"
     return DONE, text, {**asdict(act), "current": str(path)}
 
 
 def _import(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.run_archive import import_run
-    from ident_service.registry.database import Database
     from ident_service.registry.runs import RUNS
 
-    state = writable_state_folder(arguments)
-    with Database(state) as db:
+    with registry(arguments) as (db, state):
         row = import_run(db, state, arguments.run, terminal_user(arguments))
     folder = state / RUNS / row["id"]
-    return (
-        DONE,
-        f"{row['id']}: every file matches its manifest\nfiles: {folder}\n",
-        {
-            **row,
-            "folder": str(folder),
-        },
-    )
+    text = f"{row['id']}: every file matches its manifest\nfiles: {folder}\n"
+    return DONE, text, {**row, "folder": str(folder)}
 
 
 def _prune(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.run_archive import prunable_recordings, prune
-    from ident_service.registry.database import Database
     from ident_service.registry.runs import rebuild_runs
 
-    state = writable_state_folder(arguments)
-    with Database(state) as db:
+    with registry(arguments) as (db, state):
         untold = rebuild_runs(db, state)
         gone = (
             prune(db, state, arguments.keep, terminal_user(arguments))
@@ -300,11 +292,10 @@ def _prune(arguments: argparse.Namespace) -> Answer:
 
 def _delete(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations import deletion
-    from ident_service.registry.database import Database
 
-    kind, state = arguments.kind, writable_state_folder(arguments)
+    kind = arguments.kind
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
-    with Database(state) as db, deleted_with_anyway(kind, arguments.name):
+    with registry(arguments) as (db, state), deleted_with_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
     document = {"deleted": arguments.name, "dependents": [asdict(one) for one in found]}
     return DONE, deleted_text(document), document

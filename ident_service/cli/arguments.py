@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from ident_service.cli.output import USAGE, Answer, styled
 from ident_service.errors import UsageError
@@ -16,6 +18,7 @@ from ident_service.errors import UsageError
 FEASIBLE_SETS = ("pseudo_inertia", "inertia")
 _WIDEST = 100  # columns of help, on a terminal however wide
 _EXAMPLES = "examples:\n"
+N = TypeVar("N", int, float)
 
 # Verbs and nouns in the order of use, as `ident --help` lists them; a test keeps it complete.
 HELP_GROUPS: dict[str, tuple[str, ...]] = {
@@ -212,7 +215,7 @@ class VerbList:
     def add(
         self,
         name: str,
-        run: Callable[[argparse.Namespace], Answer],
+        run: Callable[[argparse.Namespace], Answer] | None,
         text: str,
         *,
         more: str = "",
@@ -225,7 +228,7 @@ class VerbList:
 
         Args:
             name: the word.
-            run: answers it.
+            run: answers it; None for a noun that another verb must follow.
             text: one short line of help.
             more: further sentences of its own help.
             examples: arguments after the verb; one string each, as typed.
@@ -237,18 +240,15 @@ class VerbList:
             Its parser, to add arguments to.
         """
         word = word or f"{self.prefix}{name}"
-        parser = self._parser(name, text, hidden)
-        _describe(parser, word, text, more, [f"{word} {one}".rstrip() for one in examples])
-        _answer(parser, word, run)
+        if not hidden:
+            self.parser.shown[name] = text
+        parser = self.commands.add_parser(name) if hidden else self.commands.add_parser(name, help=text)
+        _describe(parser, word, text, more, examples)
+        if run is not None:
+            _answer(parser, word, run)
         if former is not None:
             self.alias(former, parser)
         return parser
-
-    def _parser(self, name: str, text: str, hidden: bool) -> Parser:
-        if hidden:
-            return self.commands.add_parser(name)
-        self.parser.shown[name] = text
-        return self.commands.add_parser(name, help=text)
 
     def alias(self, name: str, parser: Parser) -> None:
         """Let a former name stand for a verb; it is understood, and shown nowhere."""
@@ -276,23 +276,18 @@ class VerbList:
             former: its earlier name.
             hidden: leave it out of the list of verbs.
         """
-        word = f"{self.prefix}{name}"
-        parser = self._parser(name, text, hidden)
-        _describe(parser, word, text, more, [f"{word} {one}".rstrip() for one in examples])
-        if run is not None:
-            _answer(parser, word, run)
-        if former is not None:
-            self.alias(former, parser)
+        parser = self.add(name, run, text, more=more, examples=examples, former=former, hidden=hidden)
         verbs = parser.add_subparsers(required=run is None, metavar="VERB", action=_Verbs, parser_class=Parser)
-        return VerbList(verbs, parser, f"{word} ")
+        return VerbList(verbs, parser, f"{self.prefix}{name} ")
 
 
 def _describe(parser: Parser, word: str, text: str, more: str, examples: Sequence[str]) -> None:
     sentence = f"{text[:1].upper()}{text[1:]}."
     parser.description = f"{sentence} {more}" if more else sentence
-    if examples:
-        parser.epilog = _EXAMPLES + "\n".join(f"  ident {one}" for one in examples)
-    parser.set_defaults(examples=tuple(examples))
+    words = tuple(f"{word} {one}".rstrip() for one in examples)
+    if words:
+        parser.epilog = _EXAMPLES + "\n".join(f"  ident {one}" for one in words)
+    parser.set_defaults(examples=words)
 
 
 def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answer]) -> None:
@@ -310,6 +305,11 @@ def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answe
         "--state", metavar="DIR", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)"
     )
     parser.set_defaults(verb=run, word=word, words=parser, json=False, server=None)
+
+
+def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable[[str], Any] = str) -> None:
+    """Add an option that may be given several times; its value is a list."""
+    sub.add_argument(option, action="append", default=[], type=read, metavar=metavar, help=text)
 
 
 def columns_files(given: Sequence[str]) -> tuple[Path | None, dict[Path, Path]]:
@@ -361,94 +361,43 @@ def payload_files_of(given: Sequence[str]) -> dict[Path, Path]:
     return found
 
 
-def seed(text: str) -> int:
-    """Parse a whole number, 0 or more."""
+def _number(refusal: str, accepts: Callable[[float], bool], read: Callable[[str], N]) -> Callable[[str], N]:
+    """Return a parser of numbers that argparse calls.
+
+    Args:
+        refusal: message about text that is none, or that is not accepted.
+        accepts: whether a number is in range; false for what is no number (NaN).
+        read: converts the text; raises ValueError.
+    """
+
+    def parse(text: str) -> N:
+        with suppress(ValueError):
+            if accepts(value := read(text)):
+                return value
+        raise argparse.ArgumentTypeError(refusal)
+
+    return parse
+
+
+def _digits(text: str) -> int:
     if not text.isdigit():
-        raise argparse.ArgumentTypeError("a seed is a whole number, 0 or more")
+        raise ValueError(text)
     return int(text)
 
 
-def replicates(text: str) -> int:
-    """Parse a number of bootstrap replicates: 0, or at least the 2 that a spread needs."""
-    if not text.isdigit() or int(text) == 1:
-        raise argparse.ArgumentTypeError("a number of replicates is 0, or 2 and more")
-    return int(text)
-
-
-def weight(text: str) -> float:
-    """Parse a finite number, 0 or more."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError("a weight is a number, 0 or more")
-    return value
-
-
-def count(text: str) -> int:
-    """Parse a whole number, 1 or more."""
-    if not text.isdigit() or int(text) == 0:
-        raise argparse.ArgumentTypeError("a whole number, 1 or more, is needed")
-    return int(text)
-
-
-def workers(text: str) -> int:
-    """Parse a number of processes, from 1 to 64."""
-    if not text.isdigit() or not 1 <= int(text) <= 64:
-        raise argparse.ArgumentTypeError("a number of processes is from 1 to 64")
-    return int(text)
-
-
-def frequency(text: str) -> float:
-    """Parse a finite number above 0 [Hz]."""
-    return _positive(text, "a frequency is a number of Hz above 0")
-
-
-def seconds(text: str) -> float:
-    """Parse a finite number above 0 [s]."""
-    return _positive(text, "a number of seconds above 0 is needed")
-
-
-def hours(text: str) -> float:
-    """Parse a finite number above 0 [h]."""
-    return _positive(text, "a number of hours above 0 is needed")
-
-
-def share(text: str) -> float:
-    """Parse a number from 0 to below 1."""
-    value = weight(text)
-    if not value < 1.0:
-        raise argparse.ArgumentTypeError("a share is a number from 0 to below 1")
-    return value
-
-
-def speed(text: str) -> float:
-    """Parse a number above 0 and at most 1."""
-    value = _positive(text, "a speed is a share above 0 and at most 1")
-    if value > 1.0:
-        raise argparse.ArgumentTypeError("a speed is a share above 0 and at most 1")
-    return value
-
-
-def _positive(text: str, otherwise: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(otherwise)
-    return value
+seed = _number("a seed is a whole number, 0 or more", lambda value: value >= 0, _digits)
+replicates = _number("a number of replicates is 0, or 2 and more", lambda value: value != 1, _digits)
+count = _number("a whole number, 1 or more, is needed", lambda value: value >= 1, _digits)
+workers = _number("a number of processes is from 1 to 64", lambda value: 1 <= value <= 64, _digits)
+weight = _number("a weight is a number, 0 or more", lambda value: 0.0 <= value < math.inf, float)
+frequency = _number("a frequency is a number of Hz above 0", lambda value: 0.0 < value < math.inf, float)
+seconds = _number("a number of seconds above 0 is needed", lambda value: 0.0 < value < math.inf, float)
+hours = _number("a number of hours above 0 is needed", lambda value: 0.0 < value < math.inf, float)
+share = _number("a share is a number from 0 to below 1", lambda value: 0.0 <= value < 1.0, float)
+speed = _number("a speed is a share above 0 and at most 1", lambda value: 0.0 < value <= 1.0, float)
+_delay = _number("a delay is a number of seconds below 1, 'estimate' or 'choose'", lambda value: abs(value) < 1, float)
 
 
 def delay(text: str) -> float | str:
     """Parse a delay [s] of less than 1 s in magnitude, or `estimate` or `choose`."""
-    if text in ("estimate", "choose"):
-        return text
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) < 1.0:
-        raise argparse.ArgumentTypeError("a delay is a number of seconds below 1, 'estimate' or 'choose'")
-    return value
+    return text if text in ("estimate", "choose") else _delay(text)

@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.completion import SHELLS, install_completion
-from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
+from ident_service.cli.output import DONE, Answer, print_to_person, state_folder
 
 _PORT = 8470
 
@@ -99,25 +99,20 @@ def _serve(arguments: argparse.Namespace) -> Answer:
 
 
 def _add(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.database import Database
     from ident_service.registry.tokens import add_token
 
-    with Database(writable_state_folder(arguments)) as db:
+    with registry(arguments) as (db, _):
         secret = add_token(db, arguments.name, arguments.role, terminal_user(arguments))
     return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.database import Database
     from ident_service.registry.tokens import tokens
 
-    with Database(writable_state_folder(arguments)) as db:
+    with registry(arguments) as (db, _):
         rows = tokens(db)
-    return (
-        DONE,
-        "".join(map(token_line, rows)) or "no tokens yet; `ident serve` makes the first\n",
-        {"tokens": [dict(r) for r in rows]},
-    )
+    text = "".join(map(token_line, rows)) or "no tokens yet; `ident serve` makes the first\n"
+    return DONE, text, {"tokens": [dict(row) for row in rows]}
 
 
 def token_line(row: Mapping[str, Any]) -> str:
@@ -127,10 +122,9 @@ def token_line(row: Mapping[str, Any]) -> str:
 
 
 def _revoke(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.database import Database
     from ident_service.registry.tokens import revoke_token
 
-    with Database(writable_state_folder(arguments)) as db:
+    with registry(arguments) as (db, _):
         revoke_token(db, arguments.name, terminal_user(arguments))
     return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
 

@@ -19,6 +19,7 @@ from ident_service.cli.arguments import (
     delay,
     did_you_mean,
     payload_files_of,
+    repeatable,
     replicates,
     seed,
     weight,
@@ -67,28 +68,11 @@ def _add_commission(verbs: VerbList) -> None:
         "recordings", nargs="+", type=Path, metavar="RECORDING", help="MCAP or CSV; FILE@41:60 reads 41 s to 60 s of it"
     )
     sub.add_argument("--arm", required=True, metavar="ARM", help="description file, or the name of a shipped one")
-    sub.add_argument(
-        "--validate",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="RECORDING",
-        help="validate on this recording; may be repeated",
-    )
-    sub.add_argument(
-        "--columns",
-        action="append",
-        default=[],
-        metavar="[RECORDING=]FILE",
-        help="YAML file with column names and units, for all recordings or one; may be repeated",
-    )
-    sub.add_argument(
-        "--payload",
-        action="append",
-        default=[],
-        metavar="RECORDING=FILE",
-        help="YAML file with mass and center_of_mass of the known load in a recording; may be repeated",
-    )
+    repeatable(sub, "--validate", "RECORDING", "validate on this recording; may be repeated", Path)
+    columns = "YAML file with column names and units, for all recordings or one; may be repeated"
+    repeatable(sub, "--columns", "[RECORDING=]FILE", columns)
+    payload = "YAML file with mass and center_of_mass of the known load in a recording; may be repeated"
+    repeatable(sub, "--payload", "RECORDING=FILE", payload)
     sub.add_argument(
         "--torque-constants",
         action="store_true",
@@ -712,10 +696,7 @@ def _add_results(verbs: VerbList) -> None:
         examples=("result", "result --save result.rrd"),
     )
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `run`, `simulate` or `identify`")
-    sub.add_argument(
-        *("--recording",), type=Path, action="append", default=[], metavar="FILE",
-        help="besides those in the folder; may be repeated",
-    )  # fmt: skip
+    repeatable(sub, "--recording", "FILE", "besides those in the folder; may be repeated", Path)
     sub.add_argument("--urdf", type=Path, metavar="FILE", help="draw its meshes, which stand beside it")
     sub.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a file for Rerun instead of opening it")
 

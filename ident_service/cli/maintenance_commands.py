@@ -48,11 +48,12 @@ def add(verbs: VerbList) -> None:
     sub.add_argument("arm", nargs="?", metavar="NAME", help="of the arm; default: all")
     for name, verb, text in (
         ("remove", _remove, "remove a schedule"),
-        ("enable", _enable, "enable a schedule"),
-        ("disable", _disable, "disable a schedule"),
+        ("enable", _enabled, "enable a schedule"),
+        ("disable", _enabled, "disable a schedule"),
     ):
         sub = group.add(name, verb, text, examples=("2", "2 --by Ann"))
         sub.add_argument("number", type=count, metavar="NUMBER")
+        sub.set_defaults(enabled=name == "enable")
         add_by(sub)
     sub = verbs.add(
         "maintenance",
@@ -137,11 +138,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = schedules(db, arguments.arm)
-    return (
-        DONE,
-        "".join(map(schedule_line, rows)) or "nothing is scheduled\n",
-        {"schedules": [_shown(row) for row in rows]},
-    )
+    return DONE, schedules_text(rows), {"schedules": [_shown(row) for row in rows]}
 
 
 def _remove(arguments: argparse.Namespace) -> Answer:
@@ -152,19 +149,11 @@ def _remove(arguments: argparse.Namespace) -> Answer:
     return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
 
 
-def _enable(arguments: argparse.Namespace) -> Answer:
-    return _enabled(arguments, enabled=True)
-
-
-def _disable(arguments: argparse.Namespace) -> Answer:
-    return _enabled(arguments, enabled=False)
-
-
-def _enabled(arguments: argparse.Namespace, *, enabled: bool) -> Answer:
+def _enabled(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import enable_schedule
 
     with registry(arguments) as db:
-        row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=enabled)
+        row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=arguments.enabled)
     return DONE, schedule_line(row), _shown(row)
 
 
@@ -186,7 +175,7 @@ def _due(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = _with_accepted(state_folder(arguments), pending(db, arguments.arm))
-    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
+    return DONE, dues_text(rows), {"due": rows}
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -225,12 +214,22 @@ def schedule_line(row: Row) -> str:
     return f"{row['id']:>4}  {row['arm']:<16} {when}{coming}{'' if row['enabled'] else ', disabled'}\n"
 
 
+def schedules_text(rows: Sequence[Row]) -> str:
+    """Format schedules as lines for a person."""
+    return "".join(map(schedule_line, rows)) or "nothing is scheduled\n"
+
+
 def due_line(row: Row) -> str:
     """Format one re-identification that is due as a line for a person; it needs an `accepted` set to compare with."""
     line = f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}"
     if row["accepted"]:
         return f"{line}; `ident reidentify {row['arm']}`\n"
     return f"{line}; nothing of it has been accepted to compare with: run, identify and accept it first\n"
+
+
+def dues_text(rows: Sequence[Row]) -> str:
+    """Format re-identifications that are due as lines for a person."""
+    return "".join(map(due_line, rows)) or "nothing is due\n"
 
 
 def _with_accepted(state: Path, rows: Sequence[Row]) -> list[dict[str, Any]]:

@@ -17,6 +17,7 @@ import tty
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
-from ident_service.cli.progress import ask, step_of
+from ident_service.cli.progress import ask, step_of, typed
 from ident_service.errors import DriverError, IdentError, MotionRefused, UsageError
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ def run_and_report(
         until: accuracy target at which the run is finished early.
 
     Raises:
-        As `service.run.run_motion`; MotionRefused without a ticket.
+        IdentError: as `run_motion`; MotionRefused without a ticket.
     """
     from ident_service.excitation.motion_file import Excitation
     from ident_service.motion.command_channel import LEASE_SECONDS
@@ -293,6 +294,18 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     return sys.stdin.fileno()
 
 
+def require_held(arguments: argparse.Namespace, arm: str, key: HeldKey, stopping: StopOnSignal) -> None:
+    """Ask a person to hold the key, and wait until it is held.
+
+    Raises:
+        MotionRefused: it was not.
+    """
+    tell(arguments, f"{arm}: hold the space bar: the arm begins to move some seconds later")
+    tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
+    if not key.wait(stopping.requested):
+        raise MotionRefused("the space bar was not held; nothing has moved")
+
+
 def _target_text(until: dict[str, Any]) -> str:
     """Format whether the accuracy target of a run was reached, and which parameters missed it."""
     if (missed := until["missed"]) is None:
@@ -304,11 +317,8 @@ def _target_text(until: dict[str, Any]) -> str:
         for one in missed
     ]
     head = f"target of {until['share']:.2%}: missed by {len(missed)} parameters (deviation over the larger of size and"
-    return "\n".join([f"{head} reference)", *lines[:_MOST_MISSED], *_and_more(len(lines))]) + "\n"
-
-
-def _and_more(count: int) -> list[str]:
-    return [f"  and {count - _MOST_MISSED} more, in --json"] if count > _MOST_MISSED else []
+    more = [f"  and {len(lines) - _MOST_MISSED} more, in --json"] if len(lines) > _MOST_MISSED else []
+    return "\n".join([f"{head} reference)", *lines[:_MOST_MISSED], *more]) + "\n"
 
 
 def _punctuality_text(lateness: dict[str, Any]) -> str:
@@ -488,18 +498,13 @@ def _check(arguments: argparse.Namespace) -> Answer:
     from ident_service.motion.command_channel import ControlFile, InterruptibleArm
     from ident_service.motion.last_position import PositionFile
     from ident_service.motion.realtime import temporary_privileges
-    from ident_service.motion.ticket import Verdict
-    from ident_service.operations.arm_checks import ticket_document, ticket_text, write_ticket
+    from ident_service.motion.ticket import Verdict, ticket_values
+    from ident_service.operations.arm_checks import ticket_text, write_ticket
     from ident_service.preflight.preflight import preflight
     from ident_service.recordings.files import require_writable
     from ident_service.registry.state_folder import arm_folder, control_path, fault_file, ticket_path
 
     config = described_arm(arguments)
-
-    def confirm(question: str) -> str:
-        if arguments.confirm is not None:
-            return str(arguments.confirm)
-        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
 
     if arguments.scale:
         return _scale(arguments, config)
@@ -530,7 +535,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
                 stoppable,
                 model,
                 motion,
-                confirm=confirm,
+                confirm=partial(typed, arguments),
                 tell=lambda check: step(*_PREFLIGHT.get(check.code, ("checking", None))),
                 rate_seconds=seconds,
                 closed=closed,
@@ -540,7 +545,7 @@ def _check(arguments: argparse.Namespace) -> Answer:
             positions.keep(arm)
     write_ticket(path, ticket)
     code = DONE if ticket.verdict is Verdict.PASSED else VERDICT_NO
-    return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_document(ticket)}
+    return code, ticket_text(ticket) + f"ticket: {path}\n", {"path": str(path), "ticket": ticket_values(ticket)}
 
 
 def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
@@ -624,10 +629,7 @@ def _hold_to_run(arguments: argparse.Namespace, share_of_speed: float) -> Answer
     sentence = f"{motion.name} motion of {motion.duration / share_of_speed:g} s while the space bar is held"
     stopping = StopOnSignal()
     with stopping, HeldKey(terminal) as key:
-        tell(arguments, f"{config.name}: hold the space bar: the arm begins to move some seconds later")
-        tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
-        if not key.wait(stopping.requested):
-            raise MotionRefused("the space bar was not held; nothing has moved")
+        require_held(arguments, config.name, key, stopping)
         return run_and_report(
             arguments,
             config,
@@ -685,7 +687,8 @@ _ASKED = {
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
-    from ident_service.motion.command_channel import ControlFile, in_use
+    from ident_service.motion.command_channel import in_use
+    from ident_service.operations.moving_arms import ask_process
 
     os.umask(0o077)
     name, path = _control(arguments)
@@ -696,14 +699,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
         )
         if not held:
             return _release_drives(arguments)
-    with ControlFile.reach(path) as controls:
-        if arguments.asks == "supported":
-            controls.confirm_support()
-        else:
-            if arguments.asks == "finish":
-                controls.request_finish()
-            controls.request_pause(arguments.asks == "pause")
-        pid = controls.pid
+    pid = ask_process(path, arguments.asks)
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
     document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
     return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document
@@ -715,11 +711,7 @@ def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> No
     Raises:
         UsageError: another word, or nobody to ask.
     """
-    typed = arguments.confirm
-    if typed is None and sys.stdin.isatty() and not arguments.json:
-        question = f"{name} {follows}. If it is supported and nobody is under it, type its name: "
-        typed = ask(arguments, question).strip()
-    if typed != name:
+    if typed(arguments, f"{name} {follows}. If it is supported and nobody is under it, type its name:") != name:
         raise UsageError(f"confirm that the arm is supported by its name: --confirm {name}; nothing has changed")
 
 

@@ -8,10 +8,23 @@ import os
 import select
 import sys
 from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.arguments import Parser, VerbList, count, frequency, seconds, seed, share, weight, workers
+from ident_service.cli.arguments import (
+    Parser,
+    VerbList,
+    count,
+    frequency,
+    repeatable,
+    seconds,
+    seed,
+    share,
+    weight,
+    workers,
+)
 from ident_service.cli.motion_commands import add_dry_run, dry_run
 from ident_service.cli.next_command import command
 from ident_service.cli.output import (
@@ -24,7 +37,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
-from ident_service.cli.progress import ask, step_of
+from ident_service.cli.progress import step_of, typed
 from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
@@ -100,14 +113,7 @@ def _add_prior_data_options(sub: Parser) -> None:
         "--model", type=Path, metavar="FILE", help="parameters.json to predict torques with, instead of the prior"
     )
     sub.add_argument("--noise", type=Path, metavar="FILE", help="parameters.json whose residuals are the noise")
-    sub.add_argument(
-        "--after",
-        action="append",
-        default=[],
-        type=Path,
-        metavar="RECORDING",
-        help="add to the information of this recording, or of FILE@41:60",
-    )
+    repeatable(sub, "--after", "RECORDING", "add to the information of this recording, or of FILE@41:60", Path)
 
 
 def _knowledge(arguments: argparse.Namespace) -> PriorData:
@@ -148,7 +154,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
     unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
     if unfinished:
         sys.stderr.write(f"ident: {unfinished}\n")
-    taught = bool(np.isfinite(seen.deviations).any())
+    teaches = bool(np.isfinite(seen.deviations).any())
     binding = "".join(f"  {line}\n" for line in designed.binding)
     binding = f"limits that restrict the motion\n{binding}\n" if binding else ""
     text = preview_text(seen) + f"\n{binding}files: {folder}\n" + "".join(f"  {name}\n" for name in FILES)
@@ -161,7 +167,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
     document |= preview_document(seen)
     document["binding"] = list(designed.binding)
     document["warnings"] = [*([unfinished] if unfinished else []), *seen.warnings]
-    return (VERDICT_NO if seen.objections or not taught else DONE), text, document
+    return (VERDICT_NO if seen.objections or not teaches else DONE), text, document
 
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
@@ -375,10 +381,7 @@ def _bus_report(arguments: argparse.Namespace) -> Answer:
 
 def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
     """Require that a person has typed the arm's name; raises UsageError."""
-    typed = arguments.confirm
-    if typed is None and sys.stdin.isatty() and not arguments.json:
-        typed = ask(arguments, f"{name}: {what}. Type the arm's name to go on: ").strip()
-    if typed != name:
+    if typed(arguments, f"{name}: {what}. Type the arm's name to go on:") != name:
         raise UsageError(f"{what}: that is confirmed by the arm's name, typed: --confirm {name}; nothing was written")
 
 
@@ -416,8 +419,6 @@ def _store(arguments: argparse.Namespace) -> Answer:
 def _driver_test(arguments: argparse.Namespace) -> Answer:
     if arguments.dry_run:
         return dry_run(arguments)
-    from dataclasses import asdict
-
     from ident_service.config.load import load_arm
     from ident_service.motion.arm_factory import Outcome, contract_text, try_driver
     from ident_service.motion.command_channel import ControlFile
@@ -425,13 +426,8 @@ def _driver_test(arguments: argparse.Namespace) -> Answer:
 
     config = load_arm(arguments.arm)
 
-    def confirm(question: str) -> str:
-        if arguments.confirm is not None:
-            return str(arguments.confirm)
-        return ask(arguments, question) if sys.stdin.isatty() and not arguments.json else ""
-
     with ControlFile.take(control_path(writable_state_folder(arguments), config.name), None):
-        found = try_driver(config, confirm)
+        found = try_driver(config, partial(typed, arguments))
     broken = any(one.outcome is Outcome.BROKEN for one in found)
     document = {"arm": config.name, "kept": not broken, "promises": [asdict(one) for one in found]}
     return VERDICT_NO if broken else DONE, contract_text(config.name, found), document
@@ -587,13 +583,8 @@ def _add_emulate(verbs: VerbList) -> None:
         examples=("wam7_canopen --seconds 60", "wam7_canopen --fault 'drive_fault joint=j2 at=1'"),
     )
     sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
-    sub.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="FAULT",
-        help="'KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]', counted from the first SYNC; repeatable",
-    )
+    form = "'KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]', counted from the first SYNC; repeatable"
+    repeatable(sub, "--fault", "FAULT", form)
     sub.add_argument(
         "--eds",
         nargs="+",
@@ -630,16 +621,7 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
         f"emulated for {done.seconds:.1f} s: {done.heard} frames heard, {done.sent} sent, "
         f"{done.unsent} not taken; the arm is {rest}\n"
     )
-    document = {
-        "arm": config.name,
-        "seconds": done.seconds,
-        "heard": done.heard,
-        "sent": done.sent,
-        "unsent": done.unsent,
-        "states": list(done.states),
-        "at_rest": done.at_rest,
-    }
-    return DONE, text, document
+    return DONE, text, {"arm": config.name, **asdict(done)}
 
 
 def _lines() -> Callable[[], str | None]:

@@ -206,3 +206,12 @@ def ask(arguments: argparse.Namespace, question: str) -> str:
         return input(question)
     with bar.hidden():
         return input(question)
+
+
+def typed(arguments: argparse.Namespace, question: str) -> str:
+    """Return what `--confirm` says, or else what a person at the terminal types; empty where nobody can be asked."""
+    if arguments.confirm is not None:
+        return str(arguments.confirm)
+    if arguments.json or not sys.stdin.isatty():
+        return ""
+    return ask(arguments, f"{question.rstrip()} ").strip()

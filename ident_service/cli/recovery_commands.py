@@ -6,7 +6,6 @@ Each step runs in this process the verb that the daemon runs as a job; `service/
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -31,7 +30,7 @@ from ident_service.cli.output import (
     tell,
     writable_state_folder,
 )
-from ident_service.cli.progress import ask
+from ident_service.cli.progress import typed
 from ident_service.errors import ArmError, MotionRefused, PersonNeeded, UsageError
 
 if TYPE_CHECKING:
@@ -151,9 +150,7 @@ def _zero(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     def confirm(question: str) -> str:
         if lease is not None and lease.over():
             raise MotionRefused(f"{config.name}: home not set: {lease.reason}; nothing has changed")
-        if arguments.confirm is not None:
-            return str(arguments.confirm)
-        return ask(arguments, f"{question} ") if sys.stdin.isatty() and not arguments.json else ""
+        return typed(arguments, question)
 
     done = set_home(config, writable_state_folder(arguments), confirm)
     lines = [f"{done.arm}: home is set, until its drives lose power", *(f"  {words}" for words in done.drives)]

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,7 @@ from ident_service.cli.output import (
     tell,
     with_answer_lines,
 )
-from ident_service.cli.progress import ask, step_of
+from ident_service.cli.progress import step_of, typed
 from ident_service.cli.remote_recordings import file_of, recording, require_registered
 from ident_service.cli.remote_recordings import word_of_address as word_of_address
 from ident_service.errors import AccessRefused, ArmError, IdentError, UnknownId, UsageError
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 Verb = Callable[["IdentClient", argparse.Namespace], Answer]
+Reader = Callable[["IdentClient", argparse.Namespace], Any]
 Ended = Callable[["IdentClient", argparse.Namespace, Answer], Answer]
 RemoteVerb = tuple[Verb, frozenset[str]]  # and the arguments that are sent to a daemon; any other one is an error
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
@@ -106,13 +106,24 @@ def carrying(words: str, verb: Verb) -> RemoteVerb:
     return verb, frozenset(words.split())
 
 
-def plain_job(words: str, kind: str | None = None) -> RemoteVerb:
-    """Return a verb that is a job of exactly these arguments; its kind is the verb when None."""
+def job(
+    words: str, kind: str | None = None, *, more: str = "", ended: Ended = with_answer_lines, **fields: Reader
+) -> RemoteVerb:
+    """Return a verb that is a job with the arguments' values.
 
-    def make(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-        return {"kind": kind} | {name: getattr(arguments, name) for name in words.split()}
+    Args:
+        words: arguments that are fields of the job under their own names.
+        kind: of the job; the verb when None.
+        more: further arguments, which `fields` read.
+        ended: turns the job's answer into the verb's.
+        fields: reads the value of a field.
+    """
 
-    return carrying(words, job_verb(make))
+    def make(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+        plain = {name: getattr(arguments, name) for name in words.split()}
+        return {"kind": kind} | plain | {name: read(client, arguments) for name, read in fields.items()}
+
+    return carrying(f"{words} {more}", job_verb(make, ended))
 
 
 def _with_client(verb: Verb) -> Callable[[argparse.Namespace], Answer]:
@@ -174,16 +185,6 @@ def job_verb(
     return verb
 
 
-def _simulate(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    motion = motion_id(client, arguments.arm, arguments.motion)
-    return {
-        "arm": arguments.arm,
-        "motion": motion,
-        "seed": arguments.seed,
-        "feasible_set": arguments.feasible_set,
-    }
-
-
 def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     of_all, of_one = columns_files(arguments.columns)
     if lost := [path for path in of_one if not path.is_file()]:
@@ -202,30 +203,25 @@ def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, A
     }
 
 
-def _design(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    limit = arguments.search_time if arguments.search_time is not None or arguments.starts is not None else 60.0
-    return {
-        "arm": arguments.arm,
-        "seconds": limit,
-        "starts": arguments.starts,
-        "seed": arguments.seed,
-        "criterion": arguments.criterion,
-        "parameters": arguments.chosen,
-        "motion": arguments.motion,
-        "after": [recording(client, arguments, arguments.arm, path) for path in arguments.after],
-    }
+def _seconds(_: IdentClient, arguments: argparse.Namespace) -> float | None:
+    searched: float | None = arguments.search_time
+    return 60.0 if searched is None and arguments.starts is None else searched
 
 
-def _check(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    motion = motion_id(client, arguments.arm, arguments.motion)
-    return {"kind": "check", "arm": arguments.arm, "motion": motion, "home": arguments.home}
+def _after(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    return [recording(client, arguments, arguments.arm, path) for path in arguments.after]
+
+
+def motion_of(client: IdentClient, arguments: argparse.Namespace) -> str | None:
+    """Return the id of a verb's motion, as `motion_id`."""
+    return motion_id(client, arguments.arm, arguments.motion)
 
 
 def run_job(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     """Return the request of a run without a key; upload its motion first if it is a file."""
     return {
         "arm": arguments.arm,
-        "motion": motion_id(client, arguments.arm, arguments.motion),
+        "motion": motion_of(client, arguments),
         "speed": arguments.speed,
         "until": _until(arguments),
     }
@@ -271,7 +267,7 @@ def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    name = typed(arguments)
+    name = typed_name(arguments)
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
         raise UsageError(
@@ -309,10 +305,16 @@ def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 REMOTE: dict[str, RemoteVerb] = {
-    "simulate": carrying("arm feasible_set motion seed", job_verb(_simulate)),
+    "simulate": job("arm seed feasible_set", more="motion", motion=motion_of),
     "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
-    "design": carrying("after arm chosen criterion motion search_time seed starts", job_verb(_design)),
-    "preflight": carrying("arm confirm home motion", job_verb(_check)),
+    "design": job(
+        "arm starts seed criterion motion",
+        more="after chosen search_time",
+        seconds=_seconds,
+        parameters=lambda _, arguments: arguments.chosen,
+        after=_after,
+    ),
+    "preflight": job("arm home", "check", more="confirm motion", motion=motion_of),
     "home": carrying("arm confirm zero", job_verb(_home)),
     "set-home": carrying("arm confirm", job_verb(_home)),
     "stop": carrying("arm", _stop),
@@ -335,29 +337,61 @@ def _wait_for_job(
     client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], *, moves: bool, ours: bool = True
 ) -> Answer:
     """Wait for the end of a job and renew its lease; on Ctrl-C cancel it, if this command began it."""
-    stopping, cancelled, phase = StopOnSignal(), False, ""
+    stopping = StopOnSignal()
     with stopping:
-        while job["state"] in LIVE:
-            if stopping.requested() and not cancelled:
-                cancelled = True
-                if not ours:
-                    break
+        return job_answer(client, follow(client, arguments, job, stopping.requested, moves=moves, ours=ours))
+
+
+def follow(
+    client: IdentClient,
+    arguments: argparse.Namespace,
+    job: dict[str, Any],
+    over: Callable[[], bool],
+    *,
+    moves: bool,
+    ours: bool = True,
+    every: float = _LOOK,
+) -> dict[str, Any]:
+    """Tell the phases of a job until it has ended, and renew its lease.
+
+    Args:
+        client: of the daemon.
+        arguments: of the verb.
+        job: as the daemon answered it.
+        over: asked in each turn; once true, the lease is renewed no more, and the job is cancelled.
+        moves: whether it has a lease.
+        ours: whether this command began the job; another one is left alone, and no longer waited for.
+        every: s between turns; the job itself is looked at less often.
+
+    Returns:
+        The job as it was last.
+    """
+    looked, phase, cancelled = time.monotonic(), "", False
+    while job["state"] in LIVE:
+        if not cancelled and over():
+            cancelled = True
+            if not ours:
+                break
+            with suppress(UsageError):  # it has ended meanwhile, as the next look will tell
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
-            elif moves and not cancelled:
-                renew(client, job["id"])
-            time.sleep(_LOOK)
-            job, held = client.get(f"/api/v1/jobs/{job['id']}"), job["held"]
-            if job["held"] and not held:
-                for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
-                    tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
-            known = job["progress"] or {}
-            state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
-            said = known.get("phase", state)
-            step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
-            if said != phase:
-                phase = said
-                tell(arguments, phase)
-    return job_answer(client, job)
+        elif moves and not cancelled:
+            renew(client, job["id"])
+        time.sleep(every)
+        if time.monotonic() - looked < _LOOK:
+            continue
+        looked, held = time.monotonic(), job["held"]
+        job = client.get(f"/api/v1/jobs/{job['id']}")
+        if job["held"] and not held:
+            for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
+                tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
+        known = job["progress"] or {}
+        state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
+        said = known.get("phase", state)
+        step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
+        if said != phase:
+            phase = said
+            tell(arguments, phase)
+    return job
 
 
 def renew(client: IdentClient, job: str) -> None:
@@ -380,26 +414,23 @@ def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 
-def typed(arguments: argparse.Namespace) -> str:
+def typed_name(arguments: argparse.Namespace) -> str:
     """Return the arm's name as a person types it, now or as `--confirm`.
 
     Raises:
         UsageError: another word, or nobody to ask.
     """
-    name = arguments.confirm
-    if name is None and sys.stdin.isatty() and not arguments.json:
-        what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
-        what = "is lowered" if getattr(arguments, "word", "") == "supported" else what
-        question = f"{arguments.arm} {what} where you may not see it. Type its name to confirm: "
-        name = ask(arguments, question).strip()
+    what = "gets a new zero" if getattr(arguments, "zero", False) else "will move"
+    what = "is lowered" if arguments.word == "supported" else what
+    name = typed(arguments, f"{arguments.arm} {what} where you may not see it. Type its name to confirm:")
     if name != arguments.arm:
         raise UsageError(f"confirm by the arm's name: --confirm {arguments.arm}")
-    return str(name)
+    return name
 
 
 def confirmation(client: IdentClient, arguments: argparse.Namespace, name: str | None = None) -> dict[str, str]:
     """Return the confirmation of a motion: the arm's name as a person typed it, and a fresh challenge."""
-    name = typed(arguments) if name is None else name
+    name = typed_name(arguments) if name is None else name
     word = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/challenge")["challenge"]
     return {"name": name, "challenge": word}
 

@@ -87,11 +87,11 @@ def _text(path: Path) -> str:
 
 def _percent(arguments: argparse.Namespace, file: Path) -> Callable[[float], None]:
     """Return a callback that prints at each tenth how much of a file has been uploaded."""
-    told = [-1]
+    printed = [-1]
 
     def share(arrived: float) -> None:
-        if int(10 * arrived) > told[0]:
-            told[0] = int(10 * arrived)
+        if int(10 * arrived) > printed[0]:
+            printed[0] = int(10 * arrived)
             tell(arguments, f"{file.name}: {100.0 * arrived:.0f} % uploaded")
 
     return share

@@ -23,10 +23,10 @@ from ident_service.cli.archive_commands import (
 )
 from ident_service.cli.daemon_commands import token_line
 from ident_service.cli.identification_commands import accepted_name, fleet_lines
-from ident_service.cli.maintenance_commands import alarm_lines, due_line, schedule_line
+from ident_service.cli.maintenance_commands import alarm_lines, due_line, dues_text, schedule_line, schedules_text
 from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.recovery_commands import EXIT_CODES
-from ident_service.cli.remote import RemoteVerb, carrying, confirmation, job_verb, motion_id, word_of_address
+from ident_service.cli.remote import RemoteVerb, carrying, confirmation, job, job_verb, motion_of, word_of_address
 from ident_service.cli.remote_recordings import recording
 from ident_service.errors import ArmError, UsageError
 
@@ -38,26 +38,17 @@ _LOOK = 0.4  # s between looks, and between renewals of the lease
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,119}")  # a name that cannot lead out of the folder it is written into
 
 
-def _run(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"run": word_of_address(str(arguments.run))}
+def _run(_: IdentClient, arguments: argparse.Namespace) -> str:
+    return word_of_address(str(arguments.run))
 
 
-def _export(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {**_run(client, arguments), "formats": [name.strip() for name in arguments.format.split(",")]}
+def _run_of_file(_: IdentClient, arguments: argparse.Namespace) -> str:
+    """Return the run that a daemon has in the place of a parameter file."""
+    return word_of_address(str(arguments.file))
 
 
-def _figures(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {**_run(client, arguments), "format": arguments.format}
-
-
-def _of_file(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the request of a verb that takes a parameter file locally, and on a daemon the run that holds one."""
-    given = {name: getattr(arguments, name, None) for name in ("feasible_set", "arm", "metric")}
-    return {"run": word_of_address(str(arguments.file)), **given}
-
-
-def _correct(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"kind": "correct", **_of_file(client, arguments)}
+def _formats(_: IdentClient, arguments: argparse.Namespace) -> list[str]:
+    return [name.strip() for name in arguments.format.split(",")]
 
 
 def _compare(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -75,17 +66,9 @@ def _compare(client: IdentClient, arguments: argparse.Namespace) -> dict[str, An
     return {"run": word_of_address(str(run)), "other": word_of_address(str(other))}
 
 
-def _payload(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    run = _run(client, arguments)
-    arm = str(client.get(f"{_API}/runs/{run['run']}")["arm"])
-    recordings = [recording(client, arguments, arm, path) for path in arguments.recordings]
-    return {**run, "recordings": recordings, "refit_offsets": arguments.refit_offsets}
-
-
-def _fleet(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the request of a fleet, whose recordings are those that the daemon has of the arms named."""
-    asked = {"kind": "fleet", "arm": arguments.arm, "arms": arguments.patterns}
-    return {**asked, "settle_again": True if arguments.settle_again else None}
+def _with_payload(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    arm = str(client.get(f"{_API}/runs/{_run(client, arguments)}")["arm"])
+    return [recording(client, arguments, arm, path) for path in arguments.recordings]
 
 
 def _of_fleet(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
@@ -178,30 +161,25 @@ def _prune(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return DONE, pruned_text(found), found
 
 
-def _arms(client: IdentClient, _: argparse.Namespace) -> Answer:
-    rows = client.get(f"{_API}/arms")
-    return DONE, "".join(map(arm_line, rows)), {"arms": rows}
+def _list(
+    path: Callable[[argparse.Namespace], str], text: Callable[[list[dict[str, Any]]], str]
+) -> Callable[[IdentClient, argparse.Namespace], Answer]:
+    """Return a verb that prints what the daemon lists at an address."""
+
+    def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+        rows = client.get(f"{_API}/{path(arguments)}")
+        return DONE, text(rows), {str(arguments.word): rows}
+
+    return verb
 
 
-def _listed(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
+def _of_all(arguments: argparse.Namespace) -> str:
+    return str(arguments.word)
+
+
+def _newest(arguments: argparse.Namespace) -> str:
     arm = "" if arguments.arm is None else f"&arm={word_of_address(arguments.arm)}"
-    rows: list[dict[str, Any]] = client.get(f"{_API}/{arguments.word}?most={min(arguments.most, 500)}{arm}")
-    return rows
-
-
-def _runs(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = _listed(client, arguments)
-    return DONE, runs_text(rows), {"runs": rows}
-
-
-def _motions(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = _listed(client, arguments)
-    return DONE, motions_text(rows), {"motions": rows}
-
-
-def _tokens(client: IdentClient, _: argparse.Namespace) -> Answer:
-    rows = client.get(f"{_API}/tokens")
-    return DONE, "".join(map(token_line, rows)), {"tokens": rows}
+    return f"{arguments.word}?most={min(arguments.most, 500)}{arm}"
 
 
 def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -209,25 +187,14 @@ def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     return DONE, f"{arguments.name}: revoked\n", row
 
 
-def _of_arm(arguments: argparse.Namespace, path: str) -> str:
-    return f"{_API}/{path}" + (f"?arm={quote(arguments.arm, safe='')}" if arguments.arm is not None else "")
+def _of_arm(arguments: argparse.Namespace, path: str = "") -> str:
+    return (path or arguments.word) + (f"?arm={quote(arguments.arm, safe='')}" if arguments.arm is not None else "")
 
 
 def _add_schedule(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    body = {
-        "arm": arguments.arm,
-        "cron": arguments.cron,
-        "hours": arguments.hours,
-        "maintenance": arguments.maintenance,
-        "motion": arguments.motion,
-    }
+    body = {name: getattr(arguments, name) for name in ("arm", "cron", "hours", "maintenance", "motion")}
     row = client.post(f"{_API}/schedules", body)
     return DONE, schedule_line(row), row
-
-
-def _schedules(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = client.get(_of_arm(arguments, "schedules"))
-    return DONE, "".join(map(schedule_line, rows)) or "nothing is scheduled\n", {"schedules": rows}
 
 
 def _remove_schedule(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -253,11 +220,11 @@ def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 def _due(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     rows = _pending(client, arguments)
-    return DONE, "".join(map(due_line, rows)) or "nothing is due\n", {"due": rows}
+    return DONE, dues_text(rows), {"due": rows}
 
 
 def _pending(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    rows = client.get(_of_arm(arguments, "due"))
+    rows = client.get(f"{_API}/{_of_arm(arguments, 'due')}")
     arms = {row["arm"] for row in rows}
     accepted = {arm for arm in arms if client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")}
     return [{**row, "accepted": row["arm"] in accepted} for row in rows]
@@ -269,7 +236,7 @@ def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _alarms(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = client.get(_of_arm(arguments, "alarms"))
+    rows = client.get(f"{_API}/{_of_arm(arguments)}")
     return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": rows}
 
 
@@ -282,7 +249,7 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     """Begin a re-identification, renew its lease until it ends, and report it; Ctrl-C stops the arm."""
     body = {
         "arm": arguments.arm,
-        "motion": motion_id(client, arguments.arm, arguments.motion),
+        "motion": motion_of(client, arguments),
         "confirm": confirmation(client, arguments),
     }
     row: dict[str, Any] = client.post(f"{_API}/reidentifications", body)
@@ -307,26 +274,33 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 _DELETES = ("runs delete", "motions delete", "arms delete")
 # The audit trail has the token's name there, so that `--by` is not sent.
 VERBS: dict[str, RemoteVerb] = {
-    "report": carrying("out run", job_verb(_run, _reported)),
-    "export": carrying("format out run", job_verb(_export, _fetched)),
-    "fleet identify": carrying("arm out patterns settle_again", job_verb(_fleet, _of_fleet)),
-    "figures": carrying("format out run", job_verb(_figures, _fetched)),
-    "payload": carrying("out recordings refit_offsets run", job_verb(_payload, _fetched)),
+    "report": job("", more="out run", run=_run, ended=_reported),
+    "export": job("", more="format out run", run=_run, formats=_formats, ended=_fetched),
+    "fleet identify": job(
+        "arm",
+        "fleet",
+        more="out patterns settle_again",
+        arms=lambda _, arguments: arguments.patterns,
+        settle_again=lambda _, arguments: arguments.settle_again or None,
+        ended=_of_fleet,
+    ),
+    "figures": job("format", more="out run", run=_run, ended=_fetched),
+    "payload": job("refit_offsets", more="out recordings run", run=_run, recordings=_with_payload, ended=_fetched),
     "compare": carrying("others reference", job_verb(_compare)),
-    "verify": carrying("arm file", job_verb(_of_file)),
-    "feasible": carrying("arm feasible_set file", job_verb(_of_file)),
-    "project": carrying("arm feasible_set file metric out", job_verb(_correct, _corrected)),
+    "verify": job("arm", more="file", run=_run_of_file),
+    "feasible": job("arm feasible_set", more="file", run=_run_of_file),
+    "project": job("arm feasible_set metric", "correct", more="file out", run=_run_of_file, ended=_corrected),
     "accept": carrying("note run", _accept),
     "rollback": carrying("arm note to", _rollback),
     "prune": carrying("keep yes", _prune),
     **dict.fromkeys(_DELETES, carrying("anyway name", _delete)),
-    "arms": carrying("", _arms),
-    "runs": carrying("arm most", _runs),
-    "motions": carrying("arm most", _motions),
-    "tokens": carrying("", _tokens),
+    "arms": carrying("", _list(_of_all, lambda rows: "".join(map(arm_line, rows)))),
+    "runs": carrying("arm most", _list(_newest, runs_text)),
+    "motions": carrying("arm most", _list(_newest, motions_text)),
+    "tokens": carrying("", _list(_of_all, lambda rows: "".join(map(token_line, rows)))),
     "tokens revoke": carrying("name", _revoke),
     "schedules add": carrying("arm cron hours maintenance motion", _add_schedule),
-    "schedules": carrying("arm", _schedules),
+    "schedules": carrying("arm", _list(_of_arm, schedules_text)),
     "schedules remove": carrying("number", _remove_schedule),
     "schedules enable": carrying("number", _enabled(True)),
     "schedules disable": carrying("number", _enabled(False)),

@@ -8,37 +8,35 @@ from __future__ import annotations
 
 import argparse
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.motion_commands import RELEASED, SLOW, HeldKey, require_no_target, require_terminal
+from ident_service.cli.motion_commands import SLOW, HeldKey, require_held, require_no_target, require_terminal
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
 from ident_service.cli.remote import (
-    LIVE,
     RemoteVerb,
     carrying,
     confirmation,
+    follow,
+    job,
     job_answer,
     job_verb,
     motion_id,
-    plain_job,
-    renew,
+    motion_of,
     run_job,
     telling_of_arm,
-    typed,
+    typed_name,
     word_of_address,
 )
-from ident_service.errors import MotionRefused, UsageError
+from ident_service.errors import UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
 
 _API = "/api/v1"
 _RENEW = 0.05  # s between looks at the key, each of which renews the lease; a rehearsal's lasts 0.25 s
-_LOOK = 0.4  # s between looks at the job
 _MOST_FILE = 8 * 2**20  # bytes of all files that a daemon takes
 
 
@@ -50,10 +48,6 @@ def _recovery_answer(client: IdentClient, arguments: argparse.Namespace, answer:
     """The commands of the next steps are for the daemon, too."""
     code, text, document = with_answer_lines(client, arguments, answer)
     return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
-
-
-def _preview(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
-    return {"arm": arguments.arm, "motion": motion_id(client, arguments.arm, arguments.motion)}
 
 
 def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -119,61 +113,30 @@ def _rehearse(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: int | None) -> Answer:
-    name, motion = typed(arguments), motion_id(client, arguments.arm, arguments.motion)
+    name, motion = typed_name(arguments), motion_id(client, arguments.arm, arguments.motion)
     job = {"kind": "rehearse", "arm": arguments.arm, "speed": SLOW if arguments.speed is None else arguments.speed}
     job |= {} if motion is None else {"motion": motion}
     stopping = StopOnSignal()
     with stopping, nullcontext() if terminal is None else HeldKey(terminal) as key:
         if key is not None:
-            tell(arguments, f"{arguments.arm}: hold the space bar: the arm begins to move some seconds later")
-            tell(arguments, f"release it: the arm stops ({RELEASED:g} s without the key), and the run is over")
-            if not key.wait(stopping.requested):
-                raise MotionRefused("the space bar was not held; nothing has moved")
+            require_held(arguments, arguments.arm, key, stopping)
         # Asked for only now, so that the challenge is fresh however long it took until the key was held.
         body = {"job": job, "confirm": confirmation(client, arguments, name)}
         made = client.post(f"{_API}/jobs", body)
         tell(arguments, f"job {made['id']}")
         over = stopping.requested if key is None else lambda: stopping.requested() or key.released()
         with telling_of_arm(arguments.arm, made["id"]):
-            return job_answer(client, keep_rehearsal_lease(client, arguments, made, over))
-
-
-def keep_rehearsal_lease(
-    client: IdentClient, arguments: argparse.Namespace, job: dict[str, Any], over: Callable[[], bool]
-) -> dict[str, Any]:
-    """Renew the lease of a rehearsal until `over` says that it is not to go on, then have it stopped.
-
-    Returns:
-        The job, when it has ended.
-    """
-    looked, phase, cancelled = time.monotonic(), "", False
-    while job["state"] in LIVE:
-        if not cancelled and over():
-            cancelled = True
-            try:
-                client.post(f"{_API}/jobs/{job['id']}/cancel")
-            except UsageError:  # the job has ended meanwhile, as the next poll will tell
-                looked = 0.0
-        elif not cancelled:
-            renew(client, job["id"])
-        time.sleep(_RENEW)
-        if time.monotonic() - looked > _LOOK:
-            looked, job = time.monotonic(), client.get(f"{_API}/jobs/{job['id']}")
-            said = (job["progress"] or {}).get("phase", job["state"])
-            if said != phase:
-                phase = said
-                tell(arguments, phase)
-    return job
+            return job_answer(client, follow(client, arguments, made, over, moves=True, every=_RENEW))
 
 
 VERBS: dict[str, RemoteVerb] = {
-    "watch": plain_job("arm seconds"),
+    "watch": job("arm seconds"),
     "recover": carrying("arm confirm leave_limit", job_verb(_recover, _recovery_answer)),
-    "base-parameters": plain_job("arm", "base"),
-    "preview": carrying("arm motion", job_verb(_preview)),
-    "bus load": plain_job("arm rate", "bus_load"),
-    "bus scan": plain_job("arm", "bus_scan"),
-    "bus probe": plain_job("arm", "bus_probe"),
+    "base-parameters": job("arm", "base"),
+    "preview": job("arm", more="motion", motion=motion_of),
+    "bus load": job("arm rate", "bus_load"),
+    "bus scan": job("arm", "bus_scan"),
+    "bus probe": job("arm", "bus_probe"),
     "config check": carrying("file", _config_check),
     "run": carrying("arm chosen confirm hold_to_run motion speed until", _run),
     "rehearse": carrying("arm confirm motion no_key speed", _rehearse),

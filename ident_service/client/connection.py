@@ -14,35 +14,18 @@ from urllib.parse import urlsplit
 import httpx
 
 from ident_service import errors
-from ident_service.errors import (
-    AccessRefused,
-    ArmError,
-    ArmFault,
-    ConfigError,
-    Dependent,
-    DiskFull,
-    IdentError,
-    InUse,
-    InvalidRequest,
-    Problem,
-    RecordingError,
-    SolverError,
-    Unavailable,
-    UnknownId,
-    UsageError,
-)
 
 _PATIENCE = 30.0  # s for one answer
 _MOST = 64 * 2**20  # bytes of one answer
 NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
-_OF_HTTP: Final[dict[str, type[IdentError]]] = {
-    **dict.fromkeys(("Unauthorized", "Forbidden", "TooManyRequests", "WrongHost", "WrongOrigin"), AccessRefused),
-    **dict.fromkeys(("BadRequest", "MethodNotAllowed", "TooLarge"), InvalidRequest),
-    "NotFound": UnknownId,
-    **dict.fromkeys(("Busy", "ServiceUnavailable"), Unavailable),
-    "InsufficientStorage": DiskFull,
-    "InternalError": IdentError,
-    "Interrupted": IdentError,
+_OF_HTTP: Final[dict[str, type[errors.IdentError]]] = {
+    **dict.fromkeys(("Unauthorized", "Forbidden", "TooManyRequests", "WrongHost", "WrongOrigin"), errors.AccessRefused),
+    **dict.fromkeys(("BadRequest", "MethodNotAllowed", "TooLarge"), errors.InvalidRequest),
+    "NotFound": errors.UnknownId,
+    **dict.fromkeys(("Busy", "ServiceUnavailable"), errors.Unavailable),
+    "InsufficientStorage": errors.DiskFull,
+    "InternalError": errors.IdentError,
+    "Interrupted": errors.IdentError,
 }
 """What refuses a request before it reaches anything that has an error of its own, by the kind that it is told with."""
 _UNAUTHORIZED: Final = (
@@ -71,11 +54,11 @@ class Connection:
             parts = urlsplit(url)
             host, _ = parts.hostname or "", parts.port
         except ValueError as error:
-            raise UsageError(f"{url}: not an address: {error}") from None
+            raise errors.UsageError(f"{url}: not an address: {error}") from None
         if parts.scheme not in ("http", "https") or not host or parts.path.strip("/") or parts.query or parts.username:
-            raise UsageError(f"{url}: give scheme, host and port, such as https://robot.example:8470")
+            raise errors.UsageError(f"{url}: give scheme, host and port, such as https://robot.example:8470")
         if parts.scheme == "http" and host not in ("127.0.0.1", "::1", "localhost"):
-            raise UsageError(f"{url}: a token is sent to other machines over https only")
+            raise errors.UsageError(f"{url}: a token is sent to other machines over https only")
         self.url = url.rstrip("/")
         headers = {} if token is None else {"Authorization": f"Bearer {_plain(token, url)}"}
         secure = parts.scheme == "https"
@@ -86,7 +69,7 @@ class Connection:
                 base_url=self.url, headers=headers, timeout=patience, verify=verify, trust_env=False
             )
         except (ValueError, httpx.HTTPError, httpx.InvalidURL) as error:
-            raise UsageError(f"{url}: cannot be asked: {error}") from None
+            raise errors.UsageError(f"{url}: cannot be asked: {error}") from None
 
     def get(self, path: str) -> Any:
         """Send GET for a path and return the answer; raises as `ask`."""
@@ -140,7 +123,7 @@ class Connection:
         if status >= 400:
             self._document(status, content)
         if len(content) >= _MOST:
-            raise ArmError(f"{self.url}{path}: has {_MOST} bytes or more; fetch it by other means")
+            raise errors.ArmError(f"{self.url}{path}: has {_MOST} bytes or more; fetch it by other means")
         return content
 
     def close(self) -> None:
@@ -206,19 +189,19 @@ class Connection:
                     raise self._connection_error(error) from None
         raise AssertionError("the second try ends the loop")
 
-    def _connection_error(self, error: Exception) -> ArmError:
+    def _connection_error(self, error: Exception) -> errors.ArmError:
         # httpx has no class of its own for this.
         unknown = "CERTIFICATE_VERIFY_FAILED" in str(error)
         hint = "; SSL_CERT_FILE=FILE.pem names the authority that signed the daemon's certificate" if unknown else ""
         if isinstance(error, httpx.ConnectError) and "refused" in str(error):
             hint = "; nobody listens there: the daemon (`ident serve`) has ended, or listens elsewhere"
-        return ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}{hint}")
+        return errors.ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}{hint}")
 
     def _document(self, status: int, content: bytes) -> Any:
         try:
             document = json.loads(content) if content else None
         except ValueError:
-            raise ArmError(f"{self.url}: answered {status} with what is not JSON; is it the daemon?") from None
+            raise errors.ArmError(f"{self.url}: answered {status} with what is not JSON; is it the daemon?") from None
         if status >= 400:
             raise _error(self.url, status, document)
         return document
@@ -228,13 +211,17 @@ def _plain(token: str, url: str) -> str:
     """Return a token without white space around it; no message repeats it."""
     plain = token.strip()
     if not plain:
-        raise UsageError(f"{url}: the token is empty; give what `ident tokens add` has printed, or None for a stop")
+        raise errors.UsageError(
+            f"{url}: the token is empty; give what `ident tokens add` has printed, or None for a stop"
+        )
     if not plain.isascii() or not plain.isprintable() or " " in plain:
-        raise UsageError(f"{url}: the token has characters that no token has; give what `ident tokens add` has printed")
+        raise errors.UsageError(
+            f"{url}: the token has characters that no token has; give what `ident tokens add` has printed"
+        )
     return plain
 
 
-def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = ()) -> IdentError:
+def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = ()) -> errors.IdentError:
     """Return the error that a daemon, or the command of a job, tells of; `IdentError` itself for one without a name.
 
     Args:
@@ -242,26 +229,26 @@ def error_of(kind: str, message: str, dependents: Sequence[Mapping[str, Any]] = 
         message: its words.
         dependents: of `InUse`.
     """
-    if kind == InUse.__name__:
-        return InUse(message, [Dependent(**one) for one in dependents])
-    if kind == ConfigError.__name__:
-        return ConfigError(list(_problems(message)))
-    if kind == RecordingError.__name__:
+    if kind == errors.InUse.__name__:
+        return errors.InUse(message, [errors.Dependent(**one) for one in dependents])
+    if kind == errors.ConfigError.__name__:
+        return errors.ConfigError(list(_problems(message)))
+    if kind == errors.RecordingError.__name__:
         path, _, words = message.partition(": ")
-        return RecordingError(path, words)
-    if kind == ArmFault.__name__:
+        return errors.RecordingError(path, words)
+    if kind == errors.ArmFault.__name__:
         code, _, words = message.partition(": ")
-        return ArmFault(code, words)
-    if kind == SolverError.__name__:
+        return errors.ArmFault(code, words)
+    if kind == errors.SolverError.__name__:
         problem, _, status = message.partition(": the solver stopped with status ")
-        return SolverError(problem, status)
+        return errors.SolverError(problem, status)
     found = _OF_HTTP.get(kind) or getattr(errors, kind, None)
-    if not (isinstance(found, type) and issubclass(found, IdentError)):
-        found = IdentError
+    if not (isinstance(found, type) and issubclass(found, errors.IdentError)):
+        found = errors.IdentError
     return found(message)
 
 
-def _problems(message: str) -> Iterator[Problem]:
+def _problems(message: str) -> Iterator[errors.Problem]:
     """Read what `ConfigError` writes: a line for each mistake, the place first."""
     rest: list[str] = []
     for line in message.splitlines():
@@ -273,19 +260,19 @@ def _problems(message: str) -> Iterator[Problem]:
     yield from _problem(rest)
 
 
-def _problem(lines: Sequence[str]) -> Iterator[Problem]:
+def _problem(lines: Sequence[str]) -> Iterator[errors.Problem]:
     if found := _PLACE.fullmatch("\n".join(lines)):
-        yield Problem(Path(found["path"]), int(found["line"]), int(found["column"]), found["message"])
+        yield errors.Problem(Path(found["path"]), int(found["line"]), int(found["column"]), found["message"])
     elif lines:
-        yield Problem(Path("description"), 1, 1, "\n".join(lines))
+        yield errors.Problem(Path("description"), 1, 1, "\n".join(lines))
 
 
-def _error(url: str, status: int, document: Any) -> IdentError:
+def _error(url: str, status: int, document: Any) -> errors.IdentError:
     said = document.get("error", {}) if isinstance(document, dict) else {}
     kind, message = str(said.get("kind", "")), str(said.get("message", f"answered {status}"))
     if not kind:
-        return ArmError(f"{url}: answered {status}; is it the daemon?")
+        return errors.ArmError(f"{url}: answered {status}; is it the daemon?")
     if kind == "Unauthorized":
-        return AccessRefused(f"{url}: {_UNAUTHORIZED}")
+        return errors.AccessRefused(f"{url}: {_UNAUTHORIZED}")
     refused = kind in _OF_HTTP  # of which nothing says yet whose words they are
     return error_of(kind, f"{url}: {message}" if refused else message, said.get("dependents") or ())

@@ -414,7 +414,7 @@ _MOTION_DEPENDS_ON = (
 
 
 class ArmConfig(ExtendedSection):
-    """A whole arm as its YAML file describes it; the first thing that passes every door.
+    """A whole arm as its YAML file describes it.
 
     WARNING: with `unattended_motion: allowed` a scheduled re-identification, or one after maintenance, moves the arm
     with nobody there, at any hour and without any further word; preflight's question whether the arm is supported and

@@ -29,7 +29,6 @@ from ident_service.config.recording import Transmission
 from ident_service.config.simulation import SimulatedFault
 
 LOWER: Final = range(1, 5)  # nodes whose torques share the first frame; 5 to 7 share the second
-UPPER: Final = range(5, 8)
 MOST_COUNTS: Final = 8191  # of a torque slot of 14 bits, either way: -8192 has no opposite
 WARNING: Final = 0.9  # of a fault's limit, as libbarrett has it
 VELOCITY_UNIT: Final = 4096  # counts of VL1 and VL2 per m/s (Q4.12)

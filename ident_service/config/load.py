@@ -273,10 +273,7 @@ def load_recording_format(path: str | Path) -> RecordingFormat:
         UsageError: no such file.
         ConfigError: every mistake in it, each with file, line and column.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise UsageError(f"{path}: no such file; expected a YAML file that says how a recording is to be read")
-    return _validated(RecordingFormat, read_tree(path), path)
+    return _load_section(RecordingFormat, Path(path), "that says how a recording is to be read")
 
 
 def load_payload(path: str | Path) -> Payload:
@@ -286,10 +283,13 @@ def load_payload(path: str | Path) -> Payload:
         UsageError: no such file.
         ConfigError: every mistake in it, each with file, line and column.
     """
-    path = Path(path)
+    return _load_section(Payload, Path(path), "with mass and center_of_mass of a payload")
+
+
+def _load_section(model: type[_Described], path: Path, what: str) -> _Described:
     if not path.is_file():
-        raise UsageError(f"{path}: no such file; expected a YAML file with mass and center_of_mass of a payload")
-    return _validated(Payload, read_tree(path), path)
+        raise UsageError(f"{path}: no such file; expected a YAML file {what}")
+    return _validated(model, read_tree(path), path)
 
 
 def folder_of(arm: str | Path, where: KeyPath) -> Path:

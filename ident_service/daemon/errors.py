@@ -8,45 +8,29 @@ from dataclasses import asdict
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
 
+from ident_service import errors
 from ident_service.daemon.responses import FAILURE_SCHEMA
-from ident_service.errors import (
-    AlreadyThere,
-    ArmError,
-    ConfigError,
-    DiskFull,
-    IdentError,
-    InUse,
-    ModelError,
-    MotionRefused,
-    ParameterError,
-    RecordingError,
-    RegistryBusy,
-    Unavailable,
-    UnknownId,
-    UsageError,
-    plain_mistake,
-)
 from ident_service.registry.database import FILE, shortage
 
-_STATUS: Final[tuple[tuple[type[IdentError], int], ...]] = (
-    (UnknownId, 404),
-    (AlreadyThere, 409),
-    (InUse, 409),
-    (UsageError, 400),
-    (ConfigError, 422),
-    (ModelError, 422),
-    (ParameterError, 422),
-    (RecordingError, 422),
-    (MotionRefused, 409),
-    (DiskFull, 507),
-    (Unavailable, 503),
-    (ArmError, 409),
+_STATUS: Final[tuple[tuple[type[errors.IdentError], int], ...]] = (
+    (errors.UnknownId, 404),
+    (errors.AlreadyThere, 409),
+    (errors.InUse, 409),
+    (errors.UsageError, 400),
+    (errors.ConfigError, 422),
+    (errors.ModelError, 422),
+    (errors.ParameterError, 422),
+    (errors.RecordingError, 422),
+    (errors.MotionRefused, 409),
+    (errors.DiskFull, 507),
+    (errors.Unavailable, 503),
+    (errors.ArmError, 409),
 )
 _KINDS: Final = {413: "TooLarge"}  # whose phrase is another one in each version of Python
 _LOG = logging.getLogger("ident.http")
@@ -84,7 +68,14 @@ def operation_id(route: APIRoute) -> str:
     return route.name
 
 
-def status_of(error: IdentError) -> int:
+def api_router(tag: str, *statuses: int) -> APIRouter:
+    """Return a router of `/api/v1` whose routes may have these failure statuses besides those that any may have."""
+    return APIRouter(
+        prefix="/api/v1", tags=[tag], responses=failures(*statuses), generate_unique_id_function=operation_id
+    )
+
+
+def status_of(error: errors.IdentError) -> int:
     """Return the HTTP status for an error."""
     return next((status for kind, status in _STATUS if isinstance(error, kind)), 500)
 
@@ -102,21 +93,26 @@ def install_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(sqlite3.Error, _resources)
     app.add_exception_handler(OSError, _resources)
 
-    @app.exception_handler(IdentError)
-    async def _ident(request: Request, error: IdentError) -> JSONResponse:
+    @app.exception_handler(errors.IdentError)
+    async def _ident(request: Request, error: errors.IdentError) -> JSONResponse:
         for cause in (error, error.__context__):
-            if isinstance(cause, OSError | sqlite3.Error | Unavailable) and _short_of(request, cause) is not None:
+            if (
+                isinstance(cause, OSError | sqlite3.Error | errors.Unavailable)
+                and _short_of(request, cause) is not None
+            ):
                 return await _resources(request, cause)
         status = status_of(error)
         if status == HTTPStatus.INTERNAL_SERVER_ERROR:
             _LOG.error("an answer failed", exc_info=error)
-        more = {"dependents": [asdict(one) for one in error.dependents]} if isinstance(error, InUse) else {}
+        more = {"dependents": [asdict(one) for one in error.dependents]} if isinstance(error, errors.InUse) else {}
         hint = ANYWAY if more.get("dependents") else ""
         return _answer(status, type(error).__name__, f"{error}{hint}", more=more)
 
     @app.exception_handler(RequestValidationError)
     async def _invalid(_: Request, error: RequestValidationError) -> JSONResponse:
-        said = "; ".join(f"{'.'.join(map(str, one['loc']))}: {plain_mistake(one)}" for one in error.errors()[:10])
+        said = "; ".join(
+            f"{'.'.join(map(str, one['loc']))}: {errors.plain_mistake(one)}" for one in error.errors()[:10]
+        )
         return _answer(422, "InvalidRequest", said)
 
     @app.exception_handler(HTTPException)
@@ -133,11 +129,11 @@ def install_error_handlers(app: FastAPI) -> None:
 def _short_of(request: Request, error: Exception) -> tuple[int, str, str, dict[str, str]] | None:
     """Return the answer for a lack of a resource (locked registry, full disk); None for any other error."""
     found = error
-    if not isinstance(error, Unavailable):
+    if not isinstance(error, errors.Unavailable):
         found = shortage(request.app.state.service.state / FILE, error) or error
-    if isinstance(found, RegistryBusy):
+    if isinstance(found, errors.RegistryBusy):
         return 503, "RegistryBusy", "another process has locked the registry; try again", {"Retry-After": "2"}
-    if isinstance(found, DiskFull):
+    if isinstance(found, errors.DiskFull):
         return 507, "DiskFull", "the disk of the state folder is full; free space, then try again", {}
     return None
 

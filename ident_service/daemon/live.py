@@ -207,9 +207,9 @@ class LiveRun:
             samples = self._waiting.popleft()
             growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
         if growing.step() and (doubt := growing.doubt()) is not None:
-            told = _uncertainty_document(doubt, growing.base.expressions, growing.base.units)
+            document = _uncertainty_document(doubt, growing.base.expressions, growing.base.units)
             with self._lock:
-                self._publish("doubt", told)
+                self._publish("doubt", document)
 
 
 class LiveRuns:

@@ -42,7 +42,7 @@ async def live_events(service: Service, live: LiveRuns, row: Row) -> AsyncIterat
     run = None
     if row["kind"] in RECORDED and row["run"] is not None and row["state"] in rows.LIVE:
         run = live.run(row["id"], service.state / RUNS / str(row["run"]))
-    told, number, offset, silent, since = "", 0, 0, 0.0, _STATE
+    last, number, offset, silent, since = "", 0, 0, 0.0, _STATE
     while True:
         news = []
         if run is not None:
@@ -56,8 +56,8 @@ async def live_events(service: Service, live: LiveRuns, row: Row) -> AsyncIterat
             since = 0.0
             row = await run_in_threadpool(rows.known_job, service.db, row["id"])
             shown = await run_in_threadpool(_shown, service, row)
-            if shown != told:
-                told = shown
+            if shown != last:
+                last = shown
                 news.append(f"event: job\ndata: {shown}\n\n")
         for one in news:
             yield one

@@ -13,7 +13,7 @@ shares of the limit. They enter the objective as an augmented Lagrangian (Hesten
     f(x) + 1/2 sum (max(0, rho c(x) + lambda)^2 - lambda^2) / rho
 
 so that one sweep forwards and one backwards through the regressor give value and gradient, whatever the number of
-limits. What holds between the samples is proven afterwards (`limit_proof.py`, `limit_proof.py`).
+limits. What holds between the samples is proven afterwards (`limit_proof.py`).
 """
 
 from __future__ import annotations

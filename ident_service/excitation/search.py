@@ -102,7 +102,7 @@ def local_search(
         The best motion found.
 
     Raises:
-        Stopped: `check` raised Interrupted; with the best of what the rounds had come through until then.
+        InterruptedWithResult: `check` raised Interrupted; with the best of what the rounds had found until then.
     """
     if polish:
         return _polished(problem, x, safe, start, check)
@@ -142,7 +142,7 @@ def _polished(problem: Problem, x: Array, safe: Array, start: int, check: Callab
     """Improve a motion that is good already by SLSQP; the result is never worse than the start.
 
     Raises:
-        Stopped: as `climbed`.
+        InterruptedWithResult: as `local_search`.
     """
     best = best_feasible(problem, x, safe, start)
     peaks = problem.linear_peaks(x, _NEAR)
@@ -337,12 +337,12 @@ def search(
     """
     begun = budget.clock()
     run = _Run(task, safe, seed, budget, begun, tell, cancelled, earlier)
-    with _crew(task, safe, seed, budget, per_period, cancelled) as crew:
-        run.starts(crew)
-        run.polish(crew)
+    with _worker_pool(task, safe, seed, budget, per_period, cancelled) as workers:
+        run.starts(workers)
+        run.polish(workers)
         while run.has_time_for_starts():
-            run.starts(crew)
-            run.polish(crew)
+            run.starts(workers)
+            run.polish(workers)
     return run.found()
 
 
@@ -412,7 +412,7 @@ class _Run:
         seconds, starts = self._budget.seconds, self._budget.starts
         return seconds is not None and starts is None and not self._over(self._begun + seconds)
 
-    def starts(self, crew: _WorkerPool) -> None:
+    def starts(self, workers: _WorkerPool) -> None:
         """Run starts in a share of the time that is left, or as many as are asked for."""
         seconds, now = self._budget.seconds, self._budget.clock()
         until = None if seconds is None else now + _STARTS_SHARE * (self._begun + seconds - now)
@@ -422,33 +422,33 @@ class _Run:
             while len(running) < self._budget.workers and not self._over(until):
                 if last is not None and self._number >= last:
                     break
-                running.add(crew.submit(self._number, None, until))
+                running.add(workers.submit(self._number, None, until))
                 self._number += 1
             if not running or self._broken:
                 return
-            for candidate in self._finished_of(crew, running, "starts"):
+            for candidate in self._finished_of(workers, running, "starts"):
                 self._finished += 1
                 self._take(candidate)
 
-    def polish(self, crew: _WorkerPool) -> None:
+    def polish(self, workers: _WorkerPool) -> None:
         until = None if self._budget.seconds is None else self._begun + self._budget.seconds
         running: set[Future[Candidate]] = set()
         waiting = [one for one in self._best if one.start not in self._polished][:_POLISHED]
         self._polished |= {one.start for one in waiting}
         while (waiting or running) and not self._broken:
             while waiting and len(running) < self._budget.workers and not self._over(until):
-                running.add(crew.submit(waiting[0].start, waiting.pop(0), until))
+                running.add(workers.submit(waiting[0].start, waiting.pop(0), until))
             if not running or self._broken:
                 return
-            for candidate in self._finished_of(crew, running, "polish"):
+            for candidate in self._finished_of(workers, running, "polish"):
                 self._take(candidate)
 
     def _over(self, until: float | None) -> bool:
         return self._broken or self._cancelled() or (until is not None and self._budget.clock() >= until)
 
-    def _finished_of(self, crew: _WorkerPool, running: set[Future[Candidate]], phase: str) -> list[Candidate]:
+    def _finished_of(self, workers: _WorkerPool, running: set[Future[Candidate]], phase: str) -> list[Candidate]:
         if self._cancelled():
-            crew.interrupt()
+            workers.interrupt()
         done, _ = wait(running, timeout=_TICK, return_when=FIRST_COMPLETED)
         running -= done
         elapsed = self._budget.clock() - self._begun
@@ -480,7 +480,7 @@ class _Run:
 
 
 @contextmanager
-def _crew(
+def _worker_pool(
     task: Task, safe: Array, seed: int, budget: Budget, per_period: int, cancelled: Callable[[], bool]
 ) -> Iterator[_WorkerPool]:
     if budget.workers == 1:

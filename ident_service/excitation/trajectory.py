@@ -26,8 +26,29 @@ from ident_service.errors import ModelError
 from ident_service.model.chain import Array
 
 
+class _Sampled:
+    """Motion that is given by its derivatives of any order."""
+
+    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
+        """Return position, velocity, acceleration and jerk.
+
+        Args:
+            time: [s] since the motion begins, shape (samples,) or a single number; before and after a motion with
+                ramps it stands where it begins and ends, one without them goes on.
+
+        Returns:
+            Four arrays in SI units, shape (samples, joints), or (joints,) for a single time.
+        """
+        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
+        return position, velocity, acceleration, jerk
+
+    def derivatives(self, time: Array, highest: int) -> list[Array]:
+        """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
-class FourierSeries:
+class FourierSeries(_Sampled):
     """Periodic motion of all joints, a finite Fourier series.
 
     Attributes:
@@ -52,18 +73,6 @@ class FourierSeries:
     def period(self) -> float:
         """Return the length of one period [s]."""
         return 1.0 / self.base_frequency
-
-    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """Return position, velocity, acceleration and jerk.
-
-        Args:
-            time: [s], shape (samples,) or a single number.
-
-        Returns:
-            Four arrays in SI units, shape (samples, joints), or (joints,) for a single time.
-        """
-        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
-        return position, velocity, acceleration, jerk
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
         """Return position and its time derivatives up to the order `highest`, each of shape (samples, joints)."""
@@ -130,7 +139,7 @@ class Path(Protocol):
 
 
 @dataclass(frozen=True)
-class FourierPath:
+class FourierPath(_Sampled):
     """Fourier series that swells from rest about its middle, repeats, and dies down to rest.
 
         q(t) = q0 + w(t) s(t - ramp)
@@ -192,19 +201,6 @@ class FourierPath:
         in_ramp = self.ramp > 0.0 and (begin < self.ramp or end > self.duration - self.ramp)
         return float(max(highest, 1.0 / self.ramp) if in_ramp else highest)
 
-    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """Return position, velocity, acceleration and jerk.
-
-        Args:
-            time: [s] since the beginning of the first ramp, shape (samples,) or a single number; before and after a
-                motion with ramps it stands where it begins and ends, one without them goes on.
-
-        Returns:
-            Four arrays in SI units, shape (samples, joints), or (joints,) for a single time.
-        """
-        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
-        return position, velocity, acceleration, jerk
-
     def derivatives(self, time: Array, highest: int) -> list[Array]:
         """Return position and its time derivatives up to the order `highest`."""
         swing = self.series.derivatives(time - self.ramp, highest)
@@ -234,7 +230,7 @@ class FourierPath:
 
 
 @dataclass(frozen=True)
-class PosturePath:
+class PosturePath(_Sampled):
     """Straight segments in joint space from posture to posture, at rest at each.
 
     Attributes:
@@ -288,11 +284,6 @@ class PosturePath:
     def fastest(self, begin: float, end: float) -> float:
         """Return the reciprocal duration of the shortest segment [Hz]."""
         return float(1.0 / self.times.min())
-
-    def at(self, time: Array | float) -> tuple[Array, Array, Array, Array]:
-        """Return position, velocity, acceleration and jerk, as `FourierPath.at`."""
-        position, velocity, acceleration, jerk = self.derivatives(np.asarray(time, dtype=float), 3)
-        return position, velocity, acceleration, jerk
 
     def derivatives(self, time: Array, highest: int) -> list[Array]:
         """Return position and its time derivatives up to the order `highest`."""

@@ -220,39 +220,39 @@ def reported_fits(fits: ArmFits | tuple[str, ...]) -> tuple[ArmFit, ArmFit] | tu
 
 
 def population_of(
-    told: Mapping[str, tuple[ArmFit, ArmFit]], number: int, groups: Mapping[Group, Sequence[int]]
+    fits_of: Mapping[str, tuple[ArmFit, ArmFit]], number: int, groups: Mapping[Group, Sequence[int]]
 ) -> Population:
     """Return the common model of what `reported_fits` gives of the arms: of all recordings (0), or fewer (1)."""
-    return population({arm: fits[number] for arm, fits in told.items()}, groups)
+    return population({arm: fits[number] for arm, fits in fits_of.items()}, groups)
 
 
 @one_blas_thread()
 def errors_held_out(
-    fits: ArmFits, arm: str, told: Population, described: Described
+    fits: ArmFits, arm: str, common: Population, described: Described
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the torque errors on recordings held out [percent], alone and drawn to the other arms.
 
     Args:
         fits: of an arm with recordings held out.
         arm: its name.
-        told: common model of what is not held out.
+        common: model of what is not held out, of all arms.
         described: the arm.
 
     Returns:
         The two of `trained` and the two of `single`.
     """
-    held, prior = fits.held, told.other_arms(arm)
+    held, prior = fits.held, common.other_arms(arm)
     assert held is not None  # noqa: S101 - as said above
     several, single = (
-        error_on(held, pooled_fit(one, prior, told.scale), described) for one in (fits.trained, fits.single)
+        error_on(held, pooled_fit(one, prior, common.scale), described) for one in (fits.trained, fits.single)
     )
     return (fits.alone[0], several), (fits.alone[1], single)
 
 
 def _stored_name(kind: str, described: Described, *more: Any) -> str:
     """Return the name in the store of what follows from factors, the description and this version."""
-    told = json.dumps([__version__, described.description, more])
-    return f"{KEPT}/{hashlib.sha256(told.encode()).hexdigest()}.{kind}"
+    content = json.dumps([__version__, described.description, more])
+    return f"{KEPT}/{hashlib.sha256(content.encode()).hexdigest()}.{kind}"
 
 
 def stored_fit(

@@ -314,9 +314,9 @@ def _drawn_to_group(own: Array, variances: Array, expected: Array, share: Array,
     size = (share @ own) @ member
     # Arms that would show a variance of the usual size: 1 for one that knows the parameter, 0 where it does not.
     shown = size * expected
-    told = np.sum(shown / np.maximum(1.0 + shown - variances * expected, 1e-3), axis=0) + np.finfo(float).eps
-    of_group = (share @ (told * own) / (share @ told)) @ member
-    return np.asarray((told * own + _GROUP_ARMS * of_group) / (told + _GROUP_ARMS))
+    weight = np.sum(shown / np.maximum(1.0 + shown - variances * expected, 1e-3), axis=0) + np.finfo(float).eps
+    of_group = (share @ (weight * own) / (share @ weight)) @ member
+    return np.asarray((weight * own + _GROUP_ARMS * of_group) / (weight + _GROUP_ARMS))
 
 
 def pooled_fit(alone: ArmFit, prior: tuple[Array, Array, Array], scale: Array) -> LeastSquares:

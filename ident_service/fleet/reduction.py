@@ -222,8 +222,8 @@ def _require_workers(client: Client, address: str, tell: Tell) -> None:
         raise Unavailable(f"{address}: the scheduler has no worker; `dask worker {address}` starts one") from None
     versions = client.get_versions(packages=["ident_service", *_ALIKE])
     own = versions["client"]["packages"]
-    for worker, told in versions["workers"].items():
-        theirs = told["packages"]
+    for worker, found in versions["workers"].items():
+        theirs = found["packages"]
         if theirs.get("ident_service") != __version__:
             has = theirs.get("ident_service") or "no version"
             raise UsageError(

@@ -363,8 +363,8 @@ def shown_of(arm: str, reduced: Reduced, compared: Compared, common: Array) -> A
     for one in reduced.arms[arm]:
         row, when = one.row, _when(one.at)[:16].replace("T", " ")
         rows.append((one.name, when, row.seconds, row.rate, row.error, "; ".join(row.warnings)))
-    told = rows if len(rows) <= _ALL_LISTED else [one for one in rows if one[-1]]
-    return ArmShown(arm, told, arm_trends(arm, reduced, compared, common))
+    listed = rows if len(rows) <= _ALL_LISTED else [one for one in rows if one[-1]]
+    return ArmShown(arm, listed, arm_trends(arm, reduced, compared, common))
 
 
 def _trends(result: FleetResult) -> list[dict[str, Any]]:
@@ -396,7 +396,7 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
         for one in recordings
     ]
     # Of many recordings those that have something to tell; the table has all.
-    told = [one for one in qualities if one["words"]] if len(qualities) > _ALL_LISTED else qualities
+    listed = [one for one in qualities if one["words"]] if len(qualities) > _ALL_LISTED else qualities
     return (
         environment()
         .get_template("fleet.html")
@@ -404,7 +404,7 @@ def fleet_page(result: FleetResult, request: FleetRequest) -> str:
             document=document,
             style=files("ident_service.results.report").joinpath("report.css").read_text(encoding="utf-8"),
             trends=_trends(result),
-            qualities=told,
+            qualities=listed,
             recordings=len(qualities),
             patterns=request.patterns,
             table=TABLE,

@@ -214,12 +214,8 @@ def _first_independent(H: Array) -> tuple[NDArray[np.intp], Array, Array]:
     K_d += np.linalg.solve(r, q.T @ (H[:, dependent] - H_b @ K_d))
     K_d /= norms[base][:, None]
     K_d[:, norms[dependent] <= _RANK_TOLERANCE * norms.max()] = 0.0
-    return base, independence, _round_digits(K_d)
-
-
-def _round_digits(values: Array) -> Array:
-    """Round to decimals that people can read: rounding noise of the least squares becomes zero, geometry stays."""
-    return np.round(values, _DECIMALS) + 0.0
+    # To decimals that people can read: rounding noise of the least squares becomes zero, geometry stays.
+    return base, independence, np.asarray(np.round(K_d, _DECIMALS) + 0.0)
 
 
 def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) -> BaseParameters:

@@ -23,8 +23,9 @@ from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.collision import scene
+from ident_service.model.newton_euler import Vector, rotate, to_vector, turned
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace
-from ident_service.model.symbolic import Differentiable, ExpressionGraph, Symbol, Value
+from ident_service.model.symbolic import Differentiable, ExpressionGraph, Symbol
 
 _BISECTIONS = 36
 _TOUCH = 1e-9  # m; what comes nearer to a box may as well be inside it
@@ -171,9 +172,6 @@ def _box_gradient(points: Array, half: Array) -> tuple[Array, Array]:
     return np.where(within, deepest, length), direction * np.sign(points)
 
 
-_Vector = list[Value]
-
-
 class CapsuleModel:
     """Pairs of `CollisionModel`, in the same order, with distances for whole blocks of postures at once.
 
@@ -202,7 +200,7 @@ class CapsuleModel:
         tape = ExpressionGraph()
         q = [tape.input() for _ in range(self.joints)]
         frames = _frames(tape, around.chain, q)
-        ends: list[list[_Vector]] = [
+        ends: list[list[Vector]] = [
             [_placed(frames, around.bodies[index].joint, point) for point in (capsule.start, capsule.end)]
             for index, capsule in zip(round_bodies, capsules, strict=True)
         ]
@@ -399,52 +397,32 @@ class _BoxPairs(_Family):
         return np.asarray(distance - self._radius)
 
 
-def _frames(tape: ExpressionGraph, chain: Chain, q: Sequence[Symbol]) -> list[tuple[list[_Vector], _Vector]]:
+def _frames(tape: ExpressionGraph, chain: Chain, q: Sequence[Symbol]) -> list[tuple[list[Vector], Vector]]:
     """Return rotation (rows) and origin of every joint frame in the base frame."""
-    frames: list[tuple[list[_Vector], _Vector]] = []
+    frames: list[tuple[list[Vector], Vector]] = []
     for k in range(chain.joints):
         parent = chain.parents[k]
-        rotation: list[_Vector] = [list(map(float, row)) for row in np.eye(3)]
-        origin: _Vector = [0.0, 0.0, 0.0]
+        rotation: list[Vector] = [list(map(float, row)) for row in np.eye(3)]
+        origin: Vector = [0.0, 0.0, 0.0]
         if parent != WORLD:
             rotation, origin = frames[parent]
         rest = chain.rotation[k]
         if chain.revolute[k]:
-            local = _turned(rest, chain.axes[k], tape.apply("cos", q[k]), tape.apply("sin", q[k]))
-            offset: _Vector = [float(x) for x in chain.translation[k]]
+            columns = turned(rest, chain.axes[k], tape.apply("cos", q[k]), tape.apply("sin", q[k]))
+            offset = to_vector(chain.translation[k])
         else:
-            local = [[float(x) for x in row] for row in rest]
+            columns = [to_vector(column) for column in rest.T]
             axis = rest @ chain.axes[k]
             offset = [float(x) + float(a) * q[k] for x, a in zip(chain.translation[k], axis, strict=True)]
-        columns = list(zip(*local, strict=True))
-        frames.append(
-            (
-                [[_dot(row, column) for column in columns] for row in rotation],
-                [o + _dot(row, offset) for o, row in zip(origin, rotation, strict=True)],
-            )
-        )
+        place = [o + way for o, way in zip(origin, rotate(rotation, offset), strict=True)]
+        frames.append(([rotate(columns, row) for row in rotation], place))
     return frames
 
 
-def _turned(rest: Array, axis: Array, cosine: Symbol, sine: Symbol) -> list[_Vector]:
-    """Return the rows of `rest` times the rotation about `axis` (Rodrigues' formula)."""
-    x, y, z = (float(component) for component in axis)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    still, with_sine, with_cosine = rest @ (np.eye(3) + K @ K), rest @ K, -(rest @ (K @ K))
-    return [
-        [float(still[i, j]) + (float(with_sine[i, j]) * sine + float(with_cosine[i, j]) * cosine) for j in range(3)]
-        for i in range(3)
-    ]
-
-
-def _placed(frames: Sequence[tuple[list[_Vector], _Vector]], joint: int, point: Array) -> _Vector:
+def _placed(frames: Sequence[tuple[list[Vector], Vector]], joint: int, point: Array) -> Vector:
     """Return a point of a joint's frame in the base frame."""
-    constant: _Vector = [float(component) for component in point]
+    constant = to_vector(point)
     if joint == WORLD:
         return constant
     rotation, origin = frames[joint]
-    return [o + _dot(row, constant) for o, row in zip(origin, rotation, strict=True)]
-
-
-def _dot(a: Sequence[Value], b: Sequence[Value]) -> Value:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return [o + way for o, way in zip(origin, rotate(rotation, constant), strict=True)]

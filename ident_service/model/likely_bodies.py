@@ -18,7 +18,7 @@ from ident_service.config.payload import constraints_with_payload
 from ident_service.model.arm_model import ArmModel, control_model, with_payload
 from ident_service.model.chain import Array
 from ident_service.model.mechanism import read_mechanism
-from ident_service.model.parameter_layout import INERTIAL
+from ident_service.model.parameter_layout import INERTIAL, body_parameters, from_pseudo_inertia, pseudo_inertia
 
 # Of industrial and research arms: castings, motors and gears fill about half of a link's outline with metal.
 _DENSITY = 1500.0  # kg/m^3
@@ -93,7 +93,7 @@ def likely_load(mass: float, center: Array) -> Array:
     """
     r = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
     L = mass * ((0.4 * r**2 + center @ center) * np.eye(3) - np.outer(center, center))
-    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(mass * center), mass])
+    return body_parameters(L, mass * center, mass)
 
 
 def with_file_bodies(model: ArmModel) -> ArmModel:
@@ -158,18 +158,16 @@ def _rod(rod: Capsule) -> Array:
     center = 0.5 * (start + end)
     axis = np.outer(along, along)
     second = m * (length**2 / 12.0 * axis + 0.25 * r**2 * (np.eye(3) - axis) + np.outer(center, center))
-    L = np.trace(second) * np.eye(3) - second
-    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(m * center), m])
+    return body_parameters(np.trace(second) * np.eye(3) - second, m * center, m)
 
 
 def _is_body(parameters: Array) -> bool:
     """Return whether inertial parameters are those of a real body: their pseudo-inertia is positive definite."""
-    xx, xy, xz, yy, yz, zz, *first, m = parameters
+    m = parameters[9]
     if not m > 0.0:
         return False
-    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    center = np.array(first) / m
-    spread = (0.5 * np.trace(L) * np.eye(3) - L) / m - np.outer(center, center)
+    center = parameters[6:9] / m
+    spread = pseudo_inertia(parameters)[:3, :3] / m - np.outer(center, center)
     size = float(np.linalg.norm(center)) + np.sqrt(max(float(np.trace(spread)), 0.0))
     return bool(np.linalg.eigvalsh(spread)[0] > 1e-8 * size**2)
 
@@ -181,14 +179,9 @@ def perturbed_body(parameters: Array, rng: np.random.Generator) -> Array:
         parameters: of a real body, shape (10,), see `INERTIAL`.
         rng: where the draw comes from.
     """
-    xx, xy, xz, yy, yz, zz, x, y, z, m = parameters
-    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    P = np.empty((4, 4))
-    P[:3, :3], P[:3, 3], P[3, :3], P[3, 3] = 0.5 * np.trace(L) * np.eye(3) - L, (x, y, z), (x, y, z), m
-    size = np.sqrt(np.trace(P[:3, :3]) / m)
+    P = pseudo_inertia(parameters)
+    size = np.sqrt(np.trace(P[:3, :3]) / P[3, 3])
     A = np.eye(4) + 0.05 * rng.uniform(-1.0, 1.0, size=(4, 4))
     A[:3, 3] *= size
     A[3, :3] = 0.0
-    P = A @ P @ A.T
-    L = np.trace(P[:3, :3]) * np.eye(3) - P[:3, :3]
-    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *P[:3, 3], P[3, 3]])
+    return from_pseudo_inertia(A @ P @ A.T)

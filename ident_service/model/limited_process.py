@@ -15,6 +15,16 @@ from typing import Any
 from ident_service.errors import ModelError
 
 
+def own_module(module: str, *words: str) -> tuple[list[str], dict[str, str]]:
+    """Return command and environment of an interpreter that runs one of our modules.
+
+    What this interpreter finds where, the other one finds there too, and never in the working directory first.
+    """
+    paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
+    environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
+    return [sys.executable, "-P", "-m", module, *words], environment
+
+
 def run_limited_process(module: str, path: Path, deadline: float, *more: str) -> dict[str, Any]:
     """Run a module on a file and return what it answers.
 
@@ -27,14 +37,14 @@ def run_limited_process(module: str, path: Path, deadline: float, *more: str) ->
     Raises:
         ModelError: it takes too long or breaks off; without the file's name.
     """
-    paths = os.pathsep.join(one or str(Path.cwd()) for one in sys.path)
+    command, environment = own_module(module, str(path), *more)
     try:
         done = subprocess.run(  # noqa: S603 - our own interpreter and module
-            [sys.executable, "-P", "-m", module, str(path), *more],
+            command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
+            env=environment,
             timeout=deadline,
             check=False,
         )

@@ -49,15 +49,50 @@ _REVOLUTE_UNITS = {
 _PRISMATIC_UNITS = {"Ia": "kg", "fv": "N s/m", "fc": "N", "fo": "N", "fs": "N", "fq": "N s^2/m^2", "fa": "N s/m"}
 
 
+def inertia_matrix(parameters: Array) -> Array:
+    """Return the inertia of a body about its frame's origin [kg m^2], shape (3, 3), of its parameters of eq. 13."""
+    xx, xy, xz, yy, yz, zz, *_ = parameters
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def body_parameters(inertia: Array, first: Array, mass: float) -> Array:
+    """Return the parameters of eq. 13 of a body, shape (10,).
+
+    Args:
+        inertia: about its frame's origin [kg m^2], shape (3, 3).
+        first: its mass times its centre of mass [kg m], shape (3,).
+        mass: its mass [kg].
+    """
+    return np.array([*inertia[np.triu_indices(3)], *first, mass])
+
+
+def pseudo_inertia(parameters: Array) -> Array:
+    """Return the second moments of a body's mass, shape (4, 4); positive definite for real bodies.
+
+    Args:
+        parameters: of eq. 13, shape (10,).
+    """
+    L, J = inertia_matrix(parameters), np.zeros((4, 4))
+    J[:3, :3] = 0.5 * np.trace(L) * np.eye(3) - L
+    J[:3, 3] = J[3, :3] = parameters[6:9]
+    J[3, 3] = parameters[9]
+    return J
+
+
+def from_pseudo_inertia(J: Array) -> Array:
+    """Return the parameters of eq. 13 of second moments of mass, shape (4, 4), the inverse of `pseudo_inertia`."""
+    return body_parameters(np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3], J[:3, 3], J[3, 3])
+
+
 def about_center(parameters: Array) -> tuple[float, Array, Array]:
     """Return mass [kg], centre of mass [m], (3,), and inertia about it [kg m^2], (3, 3), of a body.
 
     Args:
         parameters: of eq. 13, shape (10,), with a nonzero mass.
     """
-    xx, xy, xz, yy, yz, zz, *first, m = parameters
-    center = np.array(first) / m
-    about_origin = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    m = parameters[9]
+    center = parameters[6:9] / m
+    about_origin = inertia_matrix(parameters)
     return float(m), center, about_origin - m * (center @ center * np.eye(3) - np.outer(center, center))
 
 

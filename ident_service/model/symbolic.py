@@ -161,7 +161,7 @@ class Program:
         """Compute the outputs for arrays of inputs.
 
         Args:
-            inputs: arrays of one shape, in the order of `Tape.input` calls.
+            inputs: arrays of one shape, in the order of `ExpressionGraph.input` calls.
             output: arrays of that shape to write to, in the order of the outputs.
         """
         workspace = np.empty((self._slots, *inputs[0].shape))
@@ -433,7 +433,7 @@ def enclose(tape: ExpressionGraph, inputs: Sequence[TaylorModel], outputs: Seque
 
     Args:
         tape: what was recorded.
-        inputs: in the order of `Tape.input` calls, all of the same stretches.
+        inputs: in the order of `ExpressionGraph.input` calls, all of the same stretches.
         outputs: the values wanted.
     """
     chunks = []

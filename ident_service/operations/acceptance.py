@@ -20,18 +20,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Final
 
 from ident_service.errors import ParameterError, UsageError
 from ident_service.operations.drift_alarms import end_alarms
-from ident_service.registry.database import Database
+from ident_service.registry.database import LONGEST_NOTE, Database
 from ident_service.registry.database import note as audit
 from ident_service.registry.state_folder import arm_folder
 from ident_service.results.manifest import atomic_folder, file_sha256, write_atomically
 
 PARAMETERS, URDF, ARM = "parameters.json", "identified.urdf", "arm.json"
 ACCEPTED, CURRENT, ACT = "accepted", "current", "acceptance.json"
-LONGEST_NOTE: Final = 2000
 _LONGEST_NAME = 100
 
 
@@ -169,6 +167,11 @@ def accepted_set(state: Path, arm: str, number: int | None = None) -> tuple[Acce
     folder = _folder(state, arm, act.number)
     _require_as_accepted(folder, act)
     return act, folder
+
+
+def current_file(state: Path, arm: str) -> Path:
+    """Return the file with an arm's current parameters, there or not."""
+    return arm_folder(state, arm) / CURRENT / PARAMETERS
 
 
 def synchronise(db: Database, state: Path) -> None:

@@ -24,7 +24,7 @@ from ident_service.model.arm_model import arm_model
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import ControlFile
 from ident_service.motion.read_only_monitor import Watched
-from ident_service.motion.ticket import Check, Measure, Ticket, Verdict, ticket_values
+from ident_service.motion.ticket import Check, Measure, Ticket, Verdict
 from ident_service.registry.jobs import SAMPLES
 from ident_service.registry.state_folder import arm_folder, control_path
 from ident_service.results.manifest import write_atomically
@@ -60,11 +60,6 @@ def write_ticket(path: Path, ticket: Ticket) -> None:
         UsageError: the folder does not exist or cannot be written.
     """
     write_atomically(path, ticket.to_json() + "\n")
-
-
-def ticket_document(ticket: Ticket) -> dict[str, Any]:
-    """Return the ticket as JSON values, as in its file."""
-    return ticket_values(ticket)
 
 
 def ticket_text(ticket: Ticket) -> str:
@@ -146,8 +141,8 @@ class SampleLines:
         self._next_ns = at + _TOLD_NS
         known = zip(sample.position.tolist(), sample.valid.tolist(), strict=True)
         position = [[round(value, 6) if valid and isfinite(value) else None] for value, valid in known]
-        told = {"joints": list(described.joint_names), "time": [round(at * 1e-9, 3)], "position": position}
-        print(SAMPLES + json.dumps(told), file=sys.stderr, flush=True)
+        shown = {"joints": list(described.joint_names), "time": [round(at * 1e-9, 3)], "position": position}
+        print(SAMPLES + json.dumps(shown), file=sys.stderr, flush=True)
 
 
 def watch_document(seen: Watched) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final, Literal
 
-from ident_service.errors import Dependent, DriverError, InUse, UnknownId, UsageError
+from ident_service.errors import Dependent, DriverError, InUse, UsageError
 from ident_service.motion.command_channel import ControlFile
 from ident_service.operations.maintenance_schedule import remove_schedule
 from ident_service.registry.arms import DESCRIPTIONS, know_shipped
@@ -60,7 +60,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
 def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: bool = False) -> list[Dependent]:
     """Delete a motion, and the schedules that would run it; runs keep their copy of it. Arguments as `delete_run`."""
     row = known_motion(db, motion)
-    found = _of_motion(db, row)
+    found = [Dependent("schedule", str(one), "deleted") for one in _schedules_of(db, row)]
     _require_idle(db, f"the motion {motion}", _jobs_about(db, row["arm"], motion))
     _require_no_dependents(f"the motion {motion}", found, anyway=anyway)
     _delete_motion(db, state, row, who)
@@ -76,9 +76,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         UsageError: it is a shipped one.
         InUse: as above; or it is being moved, or has a fault that nobody has acknowledged.
     """
-    row = db.row("SELECT * FROM arms WHERE name = ?", arm)
-    if row is None:
-        raise UnknownId(f"no arm {arm!r} is known; see the list of arms")
+    row = db.known("arms", "arm", arm, "name")
     if row["source"] == "shipped":
         raise UsageError(f"{arm} comes with this software; it cannot be deleted")
     live = db.rows(f"SELECT id FROM jobs WHERE arm = ? AND state IN {LIVE}", arm)  # noqa: S608 - ours
@@ -134,10 +132,6 @@ def _of_run(db: Database, row: Row) -> list[Dependent]:
         *_numbered(db, "re-identification", again, run, "kept"),
         *_numbered(db, "alarm", "SELECT id FROM alarms WHERE run = ? AND closed IS NULL", run, "kept"),
     ]
-
-
-def _of_motion(db: Database, row: Row) -> list[Dependent]:
-    return [Dependent("schedule", str(one), "deleted") for one in _schedules_of(db, row)]
 
 
 def _schedules_of(db: Database, row: Row) -> list[int]:

@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import Any, Final
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.registry.database import Database, Row, note
+from ident_service.registry.database import LONGEST_NOTE, Database, Row, note
 
 FLEET: Final = "fleet.json"
 """File of a fleet's results that says which arms have changed."""
@@ -48,9 +48,6 @@ def verdict_of(document: Mapping[str, Any]) -> Verdict:
 def _finding(one: Mapping[str, Any]) -> str:
     size = f", {one['size']}" if one["size"] else ""
     return f"{one['what']} ({one['sigma']:.1f} sigma{size}): {one['meaning']}"
-
-
-LONGEST_NOTE: Final = 2000
 
 
 def raise_alarm(db: Database, arm: str, reidentification: str, run: str, what: str, now: float) -> None:

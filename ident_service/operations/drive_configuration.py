@@ -254,10 +254,10 @@ def _require_off(objects: Objects) -> None:
 
 
 def _require_same(file: TextFile, objects: Objects) -> None:
-    told = data_sheet(file.text).identity
+    sheet = data_sheet(file.text).identity
     for name, (entry, sub) in _IDENTITY.items():
-        if sub in told and (held := objects.read(entry)) != told[sub]:
-            raise DriverError(f"node {objects.node}: {name} is {held:08X}h, but {file.name} is for {told[sub]:08X}h")
+        if sub in sheet and (held := objects.read(entry)) != sheet[sub]:
+            raise DriverError(f"node {objects.node}: {name} is {held:08X}h, but {file.name} is for {sheet[sub]:08X}h")
 
 
 def _set_back(objects: Objects, changes: Sequence[Change]) -> list[str]:
@@ -314,8 +314,8 @@ def store_or_restore(
             try:
                 objects.write(Write(entry, _SAVE if store else _LOAD))
             except DriverError as error:
-                told = f"; done in nodes {', '.join(map(str, done))}" if done else "; no drive has done it"
-                raise DriverError(f"{error}{told}") from None
+                ending = f"; done in nodes {', '.join(map(str, done))}" if done else "; no drive has done it"
+                raise DriverError(f"{error}{ending}") from None
             done.append(objects.node)
     return tuple(done)
 

@@ -10,7 +10,7 @@ import json
 import platform
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from hashlib import sha256
@@ -161,10 +161,7 @@ def _ids(line: Line) -> str:
 def _bus_document(bus: BusLoad) -> dict[str, Any]:
     return {
         "number": bus.number,
-        "interface": bus.bus.interface,
-        "channel": bus.bus.channel,
-        "bitrate": bus.bus.bitrate,
-        "data_bitrate": bus.bus.data_bitrate,
+        **bus.bus.model_dump(exclude={"options"}),
         "fits": bus.fits,
         "highest_rate": bus.highest_rate,
         "cycle_us": _values(bus.cycle, 1e6),
@@ -333,30 +330,16 @@ def scan_document(config: ArmConfig, found: Scan) -> dict[str, Any]:
 
 
 def _node_document(line: ScannedNode) -> dict[str, Any]:
-    said = None
+    document = asdict(line) | {"match": line.match.name.lower()}
     if (node := line.found) is not None:
-        said = {
-            "nmt": node.nmt,
-            "answers": node.answers,
-            "device_type": node.device_type,
-            "identity": node.identity,
-            "name": node.name,
-            "firmware": node.firmware,
+        said = {key: value for key, value in document["found"].items() if key not in ("bus", "node", "status")}
+        document["found"] = said | {
             "status_word": node.status,
             "state": None if node.status is None else str(state_of(node.status)),
-            "error_register": node.error_register,
             "last_error": _error(node.last_error),
             "history": [_error(entry & 0xFFFF) for entry in node.history],
-            "unread": node.unread,
         }
-    return {
-        "bus": line.bus,
-        "node": line.node,
-        "drive": line.drive,
-        "match": line.match.name.lower(),
-        "why": line.why,
-        "found": said,
-    }
+    return document
 
 
 def _error(code: int | None) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ from typing import Final
 from cronsim import CronSim, CronSimError
 
 from ident_service.errors import UnknownId, UsageError
-from ident_service.registry.database import Database, Row, note
+from ident_service.registry.database import LONGEST_NOTE, Database, Row, note
 from ident_service.registry.motions import known_motion
 from ident_service.registry.runs import operating_seconds
 
@@ -68,7 +68,6 @@ def parse_cron(text: str) -> Cron:
 
 MAINTENANCE: Final = "maintenance"
 LONGEST_WHAT: Final = 200
-LONGEST_NOTE: Final = 2000
 MOST_SCHEDULES: Final = 100  # of an arm
 LATE: Final = 600.0  # s after which a due re-identification does not begin without a person any more
 _HOUR = 3600.0

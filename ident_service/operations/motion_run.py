@@ -20,7 +20,6 @@ import select
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -47,6 +46,7 @@ from ident_service.excitation.trajectory import FourierPath
 from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import base_parameters
+from ident_service.model.limited_process import own_module
 from ident_service.model.urdf import urdf_text
 from ident_service.motion.arm_factory import make_arm
 from ident_service.motion.command_channel import LEASE_SECONDS, ControlFile
@@ -150,9 +150,7 @@ def supervise_motion_process(
     Raises:
         KeyboardInterrupt: it came before the arm was taken, or the motion process did not end after it.
     """
-    paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-    environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, "-P", "-m", "ident_service.motion.process"]
+    command, environment = own_module("ident_service.motion.process")
     # A session of its own, so that signals to this process group do not reach it.
     with subprocess.Popen(  # noqa: S603 - our own interpreter and module
         command,
@@ -215,7 +213,7 @@ class _Watch:
     def hear(self, until: float = float("inf")) -> bool:
         """Read the output and renew the lease until the process ends or `until` [s]; return whether it ended."""
         stdout = self._process.stdout
-        assert stdout is not None  # noqa: S101 - asked for by `watched`
+        assert stdout is not None  # noqa: S101 - asked for
         while time.monotonic() < until:
             if self._controls is not None:
                 self._controls.renew()
@@ -335,13 +333,13 @@ class TargetMonitor:
 
     def __enter__(self) -> Self:
         """Start the process that follows the recording."""
-        paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "ident_service.operations.target_process"],
+        command, environment = own_module("ident_service.operations.target_process")
+        self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+            command,
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            env={**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"},
+            env=environment,
             start_new_session=True,
         )
         assert self._process.stdin is not None  # noqa: S101 - asked for
@@ -431,7 +429,7 @@ def run_motion(
         UsageError: the run folder exists or cannot be made, the state folder cannot be written, or the target is none;
             nothing has moved.
         MotionRefused: nothing has moved; a fault that nobody has acknowledged is a reason too.
-        ArmFault: a fault stopped the motion, the first of those that stay latched until `FaultFile.acknowledge`.
+        ArmFault: a fault stopped the motion, the first of those that stay latched until `FaultStore.acknowledge`.
         DriverError: the arm cannot be had.
         RecordingError: the recording failed, which has stopped the arm.
     """

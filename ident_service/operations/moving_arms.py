@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Literal
 
 from ident_service.errors import UsageError
 from ident_service.motion.command_channel import ControlFile, controlling_pid
@@ -21,24 +22,33 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
     return _reach(state, arm, ControlFile.stop_all)
 
 
-def pause_arm(state: Path, arm: str, *, wanted: bool) -> bool:
-    """Pause an arm, or let it go on (`wanted` False); return whether a process moves it."""
-    return bool(_reach(state, arm, _command_of(lambda controls: controls.request_pause(wanted))))
+Asked = Literal["pause", "resume", "finish", "supported"]
 
 
-def finish_arm(state: Path, arm: str) -> bool:
-    """End a run early by its regular end, out of a pause too; return whether a process moves the arm."""
+def ask_process(path: Path, asked: Asked) -> int:
+    """Ask the process that holds an arm's control file; return its id.
 
-    def ask(controls: ControlFile) -> None:
-        controls.request_finish()
-        controls.request_pause(False)
+    Args:
+        path: of the control file.
+        asked: pause, or go on; end a run early by its regular end, out of a pause too; or release an arm that is held
+            after a stop, since a person sees it supported.
 
-    return bool(_reach(state, arm, _command_of(ask)))
+    Raises:
+        UsageError: no process holds it.
+    """
+    with ControlFile.reach(path) as controls:
+        if asked == "supported":
+            controls.confirm_support()
+        else:
+            if asked == "finish":
+                controls.request_finish()
+            controls.request_pause(asked == "pause")
+        return controls.pid
 
 
-def confirm_support(state: Path, arm: str) -> bool:
-    """Release an arm held after a stop, since a person sees it supported; return whether one was held."""
-    return bool(_reach(state, arm, _command_of(ControlFile.confirm_support)))
+def ask_arm(state: Path, arm: str, asked: Asked) -> bool:
+    """Ask the process that moves or holds an arm, as `ask_process`; return whether there was one."""
+    return bool(_reach(state, arm, lambda path: ask_process(path, asked)))
 
 
 def held_arm(state: Path, arm: str) -> bool:
@@ -53,15 +63,6 @@ def held_arm(state: Path, arm: str) -> bool:
 def moving_arms(state: Path) -> list[str]:
     """Return the names of the arms that any process moves."""
     return _reach(state, None, controlling_pid)
-
-
-def _command_of(ask: Callable[[ControlFile], None]) -> Callable[[Path], int]:
-    def send(path: Path) -> int:
-        with ControlFile.reach(path) as controls:
-            ask(controls)
-            return controls.pid
-
-    return send
 
 
 def _reach(state: Path, arm: str | None, act: Callable[[Path], int | None]) -> list[str]:

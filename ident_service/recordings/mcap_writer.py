@@ -195,33 +195,30 @@ def encode_log(utc_ns: int, level: int, name: str, message: str) -> bytes:
     return builder.payload()
 
 
+def _until_values(joint_names: Sequence[str], frame_id: str, *counts: int) -> bytes:
+    """Encode a JointState from behind its stamp to its first values; `counts` of position, velocity and so on."""
+    builder = CdrBuilder()
+    builder.stamp(0)
+    builder.string(frame_id)
+    builder.uint32(len(joint_names))
+    for name in joint_names:
+        builder.string(name)
+    for count in counts:
+        builder.uint32(count)
+    builder.align(8)
+    return builder.body()[_STAMP.size :]
+
+
 class JointStateEncoder:
     """Encode sensor_msgs/msg/JointState of always the same joints and frame."""
 
     def __init__(self, joint_names: Sequence[str], frame_id: str = "") -> None:
         self._joints = len(joint_names)
-        builder = CdrBuilder()
-        builder.stamp(0)
-        builder.string(frame_id)
-        builder.uint32(self._joints)
-        for name in joint_names:
-            builder.string(name)
-        builder.uint32(self._joints)
-        builder.align(8)
-        self._until_position = builder.body()[_STAMP.size :]
+        self._until_position = _until_values(joint_names, frame_id, self._joints)
+        self._until_effort = _until_values(joint_names, frame_id, 0, 0, self._joints)
         # Behind 8-byte values a count needs four bytes more to the next ones; behind an empty sequence's count, none.
         self._count = struct.pack("<I", self._joints)
         self._count_aligned = struct.pack("<I4x", self._joints)
-        effort = CdrBuilder()
-        effort.stamp(0)
-        effort.string(frame_id)
-        effort.uint32(self._joints)
-        for name in joint_names:
-            effort.string(name)
-        for count in (0, 0, self._joints):
-            effort.uint32(count)
-        effort.align(8)
-        self._until_effort = effort.body()[_STAMP.size :]
 
     def encode_effort(self, utc_ns: int, effort: ArrayLike) -> bytes:
         """Encode one message without position and velocity.

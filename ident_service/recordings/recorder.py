@@ -26,6 +26,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from ident_service.errors import RecordingError
+from ident_service.model.limited_process import own_module
 from ident_service.recordings.cycle import Cycle
 from ident_service.recordings.mcap_writer import RecordingWriter
 from ident_service.recordings.recorder_main import IGNORED, RecorderReport
@@ -198,10 +199,7 @@ class RecorderProcess:
             raise RecordingError(self.path, self._error)
 
     def _start(self) -> None:
-        # What this interpreter finds where, the other one finds there too, and never in the working directory first.
-        paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-        environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
-        command = [sys.executable, "-P", "-m", "ident_service.recordings.recorder_main"]
+        command, environment = own_module("ident_service.recordings.recorder_main")
         made: list[int] = []
         # The mask is inherited, so that a Ctrl-C before the process ignores it does not end it.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, IGNORED)

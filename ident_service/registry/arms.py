@@ -83,9 +83,7 @@ def known_arm(db: Database, state: Path, name: str) -> KnownArm:
         UnknownId: there is none.
         ConfigError: its description has become unreadable.
     """
-    row = db.row("SELECT * FROM arms WHERE name = ?", name)
-    if row is None:
-        raise UnknownId(f"no arm {name!r} is known; see the list of arms")
+    row = db.known("arms", "arm", name, "name")
     path = description_path(state, row)
     try:
         config = load_arm(path)
@@ -182,8 +180,8 @@ def drawn_meshes(state: Path, config: ArmConfig) -> dict[str, Any]:
         text = (_description_folder(state, config.name, config.sha256) / _DRAWN / DRAWN_LIST).read_text("utf-8")
     except FileNotFoundError:
         return {"joints": {}, "notes": []}
-    told: dict[str, Any] = json.loads(text)
-    return told
+    document: dict[str, Any] = json.loads(text)
+    return document
 
 
 def mesh_file(state: Path, arm: str, sha256: str, joint: int) -> bytes:

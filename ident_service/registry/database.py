@@ -28,7 +28,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
-from ident_service.errors import DiskFull, IdentError, RegistryBusy, UsageError
+from ident_service.errors import DiskFull, IdentError, RegistryBusy, UnknownId, UsageError
 from ident_service.recordings.files import write_atomically
 from ident_service.registry.state_folder import give_to_owner, require_no_interrupted_restore
 
@@ -260,6 +260,7 @@ MIGRATIONS: Final[tuple[str, ...]] = (_FIRST, _MAINTENANCE, _SESSIONS, _KEYS, _D
 
 
 FILE: Final = "registry.sqlite"
+LONGEST_NOTE: Final = 2000  # characters, of a person's note or reason
 _BUSY = 10.0  # s to wait for another process that writes
 _IDLE = 2.0  # s
 Row = Mapping[str, Any]
@@ -416,6 +417,38 @@ class Database:
     def row(self, sql: str, *values: Any) -> Row | None:
         """Return the first row of a query, or None."""
         return next(iter(self.rows(sql, *values)), None)
+
+    def known(self, table: str, what: str, name: str, column: str = "id") -> Row:
+        """Return the row of this id, or of another unique column.
+
+        Raises:
+            UnknownId: there is none.
+        """
+        row = self.row(f"SELECT * FROM {table} WHERE {column} = ?", name)  # noqa: S608 - ours
+        if row is None:
+            raise UnknownId(f"no {what} {name!r} is known; see the list of {what}s")
+        return row
+
+    def newest(self, table: str, what: str, at: str, arm: str | None, before: str | None, most: int) -> list[Row]:
+        """Return rows, or those of an arm, the newest first.
+
+        Args:
+            table: of the rows.
+            what: they are, for the error.
+            at: column with their time.
+            arm: name; all arms when None.
+            before: id of the row before the first; the first of all when None.
+            most: rows.
+
+        Raises:
+            UnknownId: there is no row of that id.
+        """
+        last = None if before is None else self.known(table, what, before)[at]
+        return self.rows(
+            f"SELECT * FROM {table} WHERE (?1 IS NULL OR arm = ?1) "  # noqa: S608 - ours
+            f"AND (?2 IS NULL OR {at} < ?2 OR {at} = ?2 AND id > ?3) ORDER BY {at} DESC, id LIMIT ?4",
+            *(arm, last, before, most),
+        )
 
     def sound(self) -> bool:
         """Return whether SQLite finds nothing wrong in the whole file."""

@@ -18,7 +18,7 @@ import json
 import time
 from typing import Any, Final
 
-from ident_service.errors import AlreadyThere, UnknownId
+from ident_service.errors import AlreadyThere
 from ident_service.registry.database import Database, Row
 
 STATES: Final = ("queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted")
@@ -54,10 +54,7 @@ def known_job(db: Database, job: str) -> Row:
     Raises:
         UnknownId: there is none.
     """
-    row = db.row("SELECT * FROM jobs WHERE id = ?", job)
-    if row is None:
-        raise UnknownId(f"no job {job!r} is known; see the list of jobs")
-    return _read(row)
+    return _read(db.known("jobs", "job", job))
 
 
 def jobs(

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from ident_service.errors import UnknownId, UsageError
+from ident_service.errors import UsageError
 from ident_service.excitation.motion_file import excitation_from_json, read_excitation
 from ident_service.registry.database import Database, Row, note
 from ident_service.results.manifest import atomic_folder, file_sha256, write_atomically
@@ -69,20 +69,12 @@ def known_motion(db: Database, motion: str) -> Row:
     Raises:
         UnknownId: there is none.
     """
-    row = db.row("SELECT * FROM motions WHERE id = ?", motion)
-    if row is None:
-        raise UnknownId(f"no motion {motion!r} is known; see the list of motions")
-    return row
+    return db.known("motions", "motion", motion)
 
 
 def motions(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 500) -> list[Row]:
     """Return motions, or those of an arm, the newest first, from the one after the id `before`; as `known_motion`."""
-    at = None if before is None else known_motion(db, before)["added"]
-    return db.rows(
-        "SELECT * FROM motions WHERE (?1 IS NULL OR arm = ?1) AND (?2 IS NULL OR added < ?2 OR added = ?2 AND id > ?3) "
-        "ORDER BY added DESC, id LIMIT ?4",
-        *(arm, at, before, most),
-    )
+    return db.newest("motions", "motion", "added", arm, before, most)
 
 
 def motion_path(db: Database, state: Path, motion: str) -> Path:

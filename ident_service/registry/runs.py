@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from ident_service.errors import IdentError, ParameterError, UnknownId, UsageError
 from ident_service.motion.ending import ENDED
-from ident_service.registry.database import Database, Row, note
+from ident_service.registry.database import LONGEST_NOTE, Database, Row, note
 from ident_service.results.manifest import MANIFEST, file_sha256, named_files, verified_files
 
 RUNS, REPORTS, EXPORTS = "runs", "reports", "exports"
@@ -86,7 +86,7 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
     """Enter every run folder that the registry does not know; return the folders that cannot be read, and why."""
     known = {row["id"] for row in db.rows("SELECT id FROM runs")}
     busy = {row["run"] for row in db.rows("SELECT run FROM jobs WHERE state = 'running' AND run IS NOT NULL")}
-    told = []
+    unreadable = []
     place = state / RUNS
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         if folder.name.startswith(".") or folder.name in known | busy or folder.is_symlink():
@@ -94,8 +94,8 @@ def rebuild_runs(db: Database, state: Path) -> list[str]:
         try:
             index_run(db, state, folder.name)
         except (IdentError, OSError) as error:
-            told.append(f"{folder.name}: {error}")
-    return told
+            unreadable.append(f"{folder.name}: {error}")
+    return unreadable
 
 
 def known_run(db: Database, run: str) -> Row:
@@ -104,20 +104,12 @@ def known_run(db: Database, run: str) -> Row:
     Raises:
         UnknownId: there is none.
     """
-    row = db.row("SELECT * FROM runs WHERE id = ?", run)
-    if row is None:
-        raise UnknownId(f"no run {run!r} is known; see the list of runs")
-    return row
+    return db.known("runs", "run", run)
 
 
 def runs(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
     """Return runs, or those of an arm, the newest first, from the one after the id `before`; raises as `known_run`."""
-    at = None if before is None else known_run(db, before)["created"]
-    return db.rows(
-        "SELECT * FROM runs WHERE (?1 IS NULL OR arm = ?1) "
-        "AND (?2 IS NULL OR created < ?2 OR created = ?2 AND id > ?3) ORDER BY created DESC, id LIMIT ?4",
-        *(arm, at, before, most),
-    )
+    return db.newest("runs", "run", "created", arm, before, most)
 
 
 def recordings(db: Database, run: str) -> list[Row]:
@@ -154,7 +146,6 @@ def parameter_set(db: Database, run: str) -> Row | None:
     return db.row("SELECT * FROM parameter_sets WHERE run = ?", run)
 
 
-LONGEST_NOTE: Final = 2000
 MOST_TAGS: Final = 16
 _TAG = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:+-]{0,39}")
 
@@ -198,6 +189,12 @@ def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
     """Return the labels of a run, or of all: per run its `tags`, `note`, and `who` gave them `at` what time."""
     found = db.rows("SELECT * FROM run_labels WHERE ?1 IS NULL OR run = ?1", run)
     return {row["run"]: {**row, "tags": json.loads(row["tags"])} for row in found}
+
+
+def shown_labels(found: Mapping[str, Row], run: str) -> dict[str, Any]:
+    """Return `tags` and `note` of a run from what `run_labels` found; none where nobody gave it any."""
+    row = found.get(run, {"tags": [], "note": ""})
+    return {"tags": row["tags"], "note": row["note"]}
 
 
 def run_folder(db: Database, state: Path, run: str) -> Path:

@@ -192,7 +192,7 @@ def hashes(folder: Path) -> dict[str, str]:
 
 # Endings of files of identifications and payloads; never of recordings, which are made once.
 _MADE = (".json", ".urdf", ".txt", ".html", ".py", ".dat-s")
-_TOLD = 3
+_NAMED = 3
 
 
 def require_replaceable(folder: Path) -> None:
@@ -207,9 +207,9 @@ def require_replaceable(folder: Path) -> None:
         raise UsageError(f"{folder}: is a file, not a folder")
     if not (others := _others(folder)):
         return
-    told = ", ".join(others[:_TOLD]) + (f" and {len(others) - _TOLD} more" if len(others) > _TOLD else "")
+    names = ", ".join(others[:_NAMED]) + (f" and {len(others) - _NAMED} more" if len(others) > _NAMED else "")
     raise UsageError(
-        f"{folder}: holds files that are not of an earlier result: {told}; give a folder that does not exist, or move "
+        f"{folder}: holds files that are not of an earlier result: {names}; give a folder that does not exist, or move "
         "them elsewhere"
     )
 

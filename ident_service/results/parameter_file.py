@@ -89,8 +89,8 @@ def require_schema(content: Any, name: str, where: object, what: str) -> None:
         return
     found = validator.iter_errors(_first(content, [_VALUES]))
     mistakes = sorted(((_place(one.instance_path), one.message) for one in found), key=lambda mistake: mistake[0])
-    told = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
-    raise ParameterError(f"{where}: not {what}: {told or f'something is wrong beyond its first {_ENTRIES} entries'}")
+    listed = "; ".join(f"{place}: {message[:200]}" for place, message in mistakes[:_MOST])
+    raise ParameterError(f"{where}: not {what}: {listed or f'something is wrong beyond its first {_ENTRIES} entries'}")
 
 
 def _first(value: Any, room: list[int]) -> Any:

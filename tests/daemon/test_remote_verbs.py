@@ -25,7 +25,7 @@ from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 from ident_service.cli import main, parser
 from ident_service.cli.arguments import LOCAL_ONLY, Parser
 from ident_service.cli.output import lines_of
-from ident_service.cli.remote import table
+from ident_service.cli.remote import follow, table
 from ident_service.client import IdentClient
 from ident_service.errors import ArmError
 from ident_service.registry.state_folder import fault_file
@@ -199,7 +199,7 @@ def test_verbs_are_done_by_a_daemon(
     state: Path, commissioned: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = RUN.replace("0101", "0102")
-    with served(state, commissioned) as (_, server):
+    with served(state, commissioned) as (client, server):
 
         def done(*words: object, code: int = 0) -> dict[str, Any]:
             capsys.readouterr()
@@ -255,6 +255,11 @@ def test_verbs_are_done_by_a_daemon(
         assert main(["base", "quick", *server]) == 0
         said = capsys.readouterr().out
         assert "base_parameters:\n  expressions: " in said
+
+        # Ctrl-C in the moment in which a job ends: there is nothing left to cancel, and that is no error.
+        ended = client.get("/api/v1/jobs?most=1")[0]
+        words = argparse.Namespace(json=True)
+        assert follow(client, words, ended | {"state": "running"}, lambda: True, moves=False)["state"] == "done"
 
 
 @pytest.mark.parametrize(
@@ -312,7 +317,7 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
                 if line in ("approaching", "exciting"):
                     hands.let_go()
 
-            monkeypatch.setattr("ident_service.cli.remote_watching.tell", told)
+            monkeypatch.setattr("ident_service.cli.remote.tell", told)
             assert main(rehearse) == 1
         job = client.get("/api/v1/jobs?most=1")[0]
         assert (job["kind"], job["state"], job["detail"]) == ("rehearse", "cancelled", "cancelled by owner")

@@ -31,8 +31,9 @@ from ident_service.motion.ticket import (
     skipped,
     subject_of,
     ticket_from_json,
+    ticket_values,
 )
-from ident_service.operations.arm_checks import ticket_document, ticket_text, write_ticket
+from ident_service.operations.arm_checks import ticket_text, write_ticket
 
 NOW_NS = 1_700_000_000 * 10**9
 MODEL = arm_model(flight_config())
@@ -140,11 +141,11 @@ def test_a_ticket_is_kept_to_the_last_bit(tmp_path: Path) -> None:
     write_ticket(path, made)
     assert read_ticket(path) == made
     assert list(tmp_path.iterdir()) == [path]
-    assert json.loads(path.read_text(encoding="utf-8")) == ticket_document(made)
+    assert json.loads(path.read_text(encoding="utf-8")) == ticket_values(made)
 
 
 def changed(change: Callable[[dict[str, Any]], None]) -> str:
-    content = ticket_document(ticket())
+    content = ticket_values(ticket())
     change(content)
     return json.dumps(content)
 

@@ -14,12 +14,12 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Protocol
 
 from ident_service.errors import UsageError
+from ident_service.model.limited_process import own_module
 
 ANSWER, LOG, PROCESS = "answer.json", "log", "process"
 RENEW: Final = b"\n"
@@ -55,12 +55,11 @@ class SubprocessJob:
 
     def __init__(self, words: tuple[str, ...], folder: Path) -> None:
         """Start `ident WORDS` with its files in `folder`."""
-        paths = os.pathsep.join(path or str(Path.cwd()) for path in sys.path)
-        environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "1"}
+        command, environment = own_module("ident_service", *words)
         environment.pop("NOTIFY_SOCKET", None)  # the service manager watches the service, not this process
         with (folder / ANSWER).open("xb") as answer, (folder / LOG).open("xb") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and command
-                [sys.executable, "-P", "-m", "ident_service", *words],
+                command,
                 stdin=subprocess.PIPE,
                 stdout=answer,
                 stderr=log,

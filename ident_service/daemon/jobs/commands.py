@@ -6,41 +6,10 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias
 
 from ident_service.config.load import arm_from_json
-from ident_service.daemon.jobs.requests import (
-    MOVES,
-    AnyJobRequest,
-    Base,
-    BusLoad,
-    BusProbe,
-    BusScan,
-    Check,
-    Compare,
-    ConfigCheck,
-    Correct,
-    Design,
-    Export,
-    Feasible,
-    Figures,
-    Fleet,
-    Home,
-    Identify,
-    Judge,
-    LeaveLimit,
-    Payload,
-    Preview,
-    RecordingReference,
-    Recover,
-    Rehearse,
-    Report,
-    Run,
-    Simulate,
-    Verify,
-    Watch,
-    Zero,
-)
+from ident_service.daemon.jobs import requests as asked
 from ident_service.errors import UsageError
 from ident_service.motion.command_channel import HOLD_TO_RUN_SECONDS, LEASE_SECONDS
 from ident_service.operations.acceptance import ARM, PARAMETERS, accepted_set
@@ -63,19 +32,20 @@ from ident_service.registry.runs import (
 JOBS = "jobs"
 _MOST_OF_FLEET: Final = 10_000  # recordings; more would be too many words for a command
 _OF_RUN: Final = r"/runs/[^-/]+-(?P<arm>[^/]+)-[0-9a-f]{6}/"  # the folder of a run, see `new_id`
-_WITHOUT_FOLDER = (
-    Check,
-    Watch,
-    Recover,
-    Base,
-    Preview,
-    Zero,
-    BusLoad,
-    BusScan,
-    BusProbe,
-    ConfigCheck,
-)  # that make no folder
-_OF_A_RUN = (Report, Export, Verify, Compare, Feasible, Correct, Figures, Payload)
+_WITHOUT_FOLDER: Final = frozenset(  # kinds that make no folder
+    ("check", "watch", "recover", "base", "preview", "zero", "bus_load", "bus_scan", "bus_probe", "config_check")
+)
+READS_BUS: Final = frozenset({"watch", "recover", "bus_scan", "bus_probe"})
+_OfARun: TypeAlias = (
+    asked.Report
+    | asked.Export
+    | asked.Verify
+    | asked.Compare
+    | asked.Feasible
+    | asked.Correct
+    | asked.Figures
+    | asked.Payload
+)
 _VERBS: Final = {
     "leave_limit": ("recover",),
     "zero": ("home",),
@@ -111,23 +81,23 @@ class Command:
     waits: bool = True
 
 
-def command(db: Database, state: Path, request: AnyJobRequest) -> Command:
+def command(db: Database, state: Path, request: asked.AnyJobRequest) -> Command:
     """Return the command that carries out a request.
 
     Raises:
         UsageError: it names what is not known.
         ConfigError: the arm's description has mistakes.
     """
-    if isinstance(request, _OF_A_RUN):
+    if isinstance(request, _OfARun):
         return _about_a_run(db, state, request)
-    if isinstance(request, Judge):
+    if isinstance(request, asked.Judge):
         return _judgement(db, state, request)
     arm = known_arm(db, state, request.arm)
-    made = None if isinstance(request, _WITHOUT_FOLDER) else new_id(arm.name)
+    made = None if request.kind in _WITHOUT_FOLDER else new_id(arm.name)
     words = [*_VERBS.get(request.kind, (request.kind,)), *_words(db, state, request, arm)]
     if made is not None:
         words += ["--out", str(state / FOLDERS.get(request.kind, RUNS) / made)]
-    moves = request.kind in MOVES
+    moves = request.kind in asked.MOVES
     if moves:
         words.append("--lease-from-stdin")
     return Command(
@@ -135,9 +105,9 @@ def command(db: Database, state: Path, request: AnyJobRequest) -> Command:
         arm.name,
         moves,
         made,
-        resources(arm.config) if moves or isinstance(request, Watch | Recover | BusScan | BusProbe) else (),
-        HOLD_TO_RUN_SECONDS if isinstance(request, Rehearse) else LEASE_SECONDS,
-        waits=not isinstance(request, Zero),
+        resources(arm.config) if moves or request.kind in READS_BUS else (),
+        HOLD_TO_RUN_SECONDS if isinstance(request, asked.Rehearse) else LEASE_SECONDS,
+        waits=not isinstance(request, asked.Zero),
     )
 
 
@@ -158,11 +128,11 @@ def accepted_description(state: Path, arm: str, number: int) -> Path:
     return path
 
 
-def _words(db: Database, state: Path, request: AnyJobRequest, arm: KnownArm) -> list[str]:
+def _words(db: Database, state: Path, request: asked.AnyJobRequest, arm: KnownArm) -> list[str]:
     path = str(arm.path)
-    if isinstance(request, Design):
+    if isinstance(request, asked.Design):
         return [path, *_design(db, state, request)]
-    if isinstance(request, Identify):
+    if isinstance(request, asked.Identify):
         recordings = _recordings(db, state, request.recordings)
         judged = [f"--validate={one}" for one in _recordings(db, state, request.validate_on)]
         judged += _columns(db, state, (*request.recordings, *request.validate_on))
@@ -170,31 +140,29 @@ def _words(db: Database, state: Path, request: AnyJobRequest, arm: KnownArm) -> 
         if request.as_accepted is not None:
             path = str(accepted_description(state, arm.name, request.as_accepted))
         return [*recordings, "--arm", path, *judged, *_given_options(chosen)]
-    if isinstance(request, Simulate):
+    if isinstance(request, asked.Simulate):
         motion = [] if request.motion is None else [f"--motion={motion_path(db, state, request.motion)}"]
         return [path, *motion, *_given_options({"seed": request.seed, "feasible-set": request.feasible_set})]
-    if isinstance(request, Home | Base | Recover | BusScan | BusProbe | ConfigCheck):
-        return [path]
-    if isinstance(request, Fleet):
+    if isinstance(request, asked.Fleet):
         return _fleet(db, state, request, path)
-    if isinstance(request, BusLoad):
+    if isinstance(request, asked.BusLoad):
         return [path, *_given_options({"rate": request.rate})]
-    if isinstance(request, Zero):
+    if isinstance(request, asked.Zero):
         return [path, "--zero", "--confirm", arm.name]
-    if isinstance(request, LeaveLimit):
+    if isinstance(request, asked.LeaveLimit):
         return [path, "--leave-limit"]
-    if isinstance(request, Watch):
+    if isinstance(request, asked.Watch):
         return [path, f"--seconds={request.seconds!r}", "--tell-samples"]
-    if isinstance(request, Check | Run | Rehearse | Preview):
+    if isinstance(request, asked.Check | asked.Run | asked.Rehearse | asked.Preview):
         motion = [] if request.motion is None else [str(motion_path(db, state, request.motion))]
-        if isinstance(request, Check):
+        if isinstance(request, asked.Check):
             return [path, *motion, *(["--home"] if request.home else []), "--confirm", arm.name]
-        speed = [] if isinstance(request, Preview) else [f"--speed={request.speed!r}"]
-        return [path, *motion, *speed, *(_until(request) if isinstance(request, Run) else [])]
-    raise AssertionError(request)
+        speed = [] if isinstance(request, asked.Preview) else [f"--speed={request.speed!r}"]
+        return [path, *motion, *speed, *(_until(request) if isinstance(request, asked.Run) else [])]
+    return [path]
 
 
-def _fleet(db: Database, state: Path, request: Fleet, described: str) -> list[str]:
+def _fleet(db: Database, state: Path, request: asked.Fleet, described: str) -> list[str]:
     found = recordings_of(db, request.arms)
     if not found:
         raise UsageError(f"{', '.join(request.arms)}: the registry has no recording of such arms; see the list of runs")
@@ -214,13 +182,13 @@ def _fleet(db: Database, state: Path, request: Fleet, described: str) -> list[st
     return [*files, f"--arm={described}", f"--names={_OF_RUN}", f"--store={state / 'fleet' / 'store'}", *again]
 
 
-def _until(request: Run) -> list[str]:
+def _until(request: asked.Run) -> list[str]:
     if request.until is None:
         return []
     return [f"--until={request.until.share!r}", *(f"--parameter={one}" for one in request.until.parameters)]
 
 
-def _design(db: Database, state: Path, request: Design) -> list[str]:
+def _design(db: Database, state: Path, request: asked.Design) -> list[str]:
     if request.seconds is None and request.starts is None:
         raise UsageError("a search ends: give seconds, or starts, or both")
     after = [f"--after={path}" for path in _as_described(db, state, request.after)]
@@ -234,40 +202,36 @@ def _design(db: Database, state: Path, request: Design) -> list[str]:
     return [*after, *parameters, *_given_options({**chosen, "motion": request.motion})]
 
 
-def _about_a_run(
-    db: Database,
-    state: Path,
-    request: Report | Export | Verify | Compare | Feasible | Correct | Figures | Payload,
-) -> Command:
+def _about_a_run(db: Database, state: Path, request: _OfARun) -> Command:
     folder, arm = run_folder(db, state, request.run), str(known_run(db, request.run)["arm"])
     made = new_id(arm) if request.kind in DOWNLOADABLE_KINDS else None
-    place = state / (REPORTS if isinstance(request, Report) else EXPORTS)
-    if isinstance(request, Verify):
+    place = state / (REPORTS if isinstance(request, asked.Report) else EXPORTS)
+    if isinstance(request, asked.Verify):
         described = None if request.arm is None else str(known_arm(db, state, request.arm).path)
         words = ["verify", str(run_file(db, state, request.run, PARAMETERS)), *_given_options({"arm": described})]
-    elif isinstance(request, Compare):
+    elif isinstance(request, asked.Compare):
         words = ["compare", str(folder), str(run_folder(db, state, request.other))]
-    elif isinstance(request, Feasible | Correct):
+    elif isinstance(request, asked.Feasible | asked.Correct):
         conditions = None if request.arm is None else str(known_arm(db, state, request.arm).path)
         words = [request.kind, str(run_file(db, state, request.run, PARAMETERS))]
         words += _given_options({"feasible-set": request.feasible_set, "arm": conditions})
-        if isinstance(request, Correct):
+        if isinstance(request, asked.Correct):
             words += [f"--metric={request.metric}", "--out", str(place / str(made) / PARAMETERS)]
-    elif isinstance(request, Report):
+    elif isinstance(request, asked.Report):
         words = ["report", str(folder), "--out", str(place / f"{request.run}.html")]
-    elif isinstance(request, Payload):
+    elif isinstance(request, asked.Payload):
         words = ["payload", str(folder), *_as_described(db, state, request.recordings), "--out", str(place / str(made))]
         words += ["--refit-offsets"] if request.refit_offsets else []
     else:
-        formats = request.format if isinstance(request, Figures) else ",".join(request.formats)
+        formats = request.format if isinstance(request, asked.Figures) else ",".join(request.formats)
         words = [request.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
-    if made is not None or isinstance(request, Report):
+    if made is not None or isinstance(request, asked.Report):
         # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
-        (place / str(made) if isinstance(request, Correct) else place).mkdir(parents=True, exist_ok=True)
+        (place / str(made) if isinstance(request, asked.Correct) else place).mkdir(parents=True, exist_ok=True)
     return Command((*words, *_common_options(state)), arm, False, made or request.run, (), LEASE_SECONDS)
 
 
-def _judgement(db: Database, state: Path, request: Judge) -> Command:
+def _judgement(db: Database, state: Path, request: asked.Judge) -> Command:
     run = known_run(db, request.run)
     if run["arm"] != request.arm:
         raise UsageError(f"the run {request.run} is about the arm {run['arm']}, not {request.arm}")
@@ -276,15 +240,15 @@ def _judgement(db: Database, state: Path, request: Judge) -> Command:
     return Command((*words, *_common_options(state)), request.arm, False, request.run, (), LEASE_SECONDS)
 
 
-def _recordings(db: Database, state: Path, references: Sequence[RecordingReference]) -> list[str]:
+def _recordings(db: Database, state: Path, references: Sequence[asked.RecordingReference]) -> list[str]:
     return [f"{_recording(db, state, one)}{range_words(one)}" for one in references]
 
 
-def _recording(db: Database, state: Path, one: RecordingReference) -> Path:
+def _recording(db: Database, state: Path, one: asked.RecordingReference) -> Path:
     return run_file(db, state, one.run, one.name or recording_name(db, one.run))
 
 
-def _as_described(db: Database, state: Path, references: Sequence[RecordingReference]) -> list[str]:
+def _as_described(db: Database, state: Path, references: Sequence[asked.RecordingReference]) -> list[str]:
     """Return paths as `_recordings` does, for commands that take no columns file.
 
     Raises:
@@ -298,13 +262,13 @@ def _as_described(db: Database, state: Path, references: Sequence[RecordingRefer
     return _recordings(db, state, references)
 
 
-def _columns(db: Database, state: Path, references: Sequence[RecordingReference]) -> list[str]:
+def _columns(db: Database, state: Path, references: Sequence[asked.RecordingReference]) -> list[str]:
     """Return `--columns` options for the uploaded recordings that came with a columns file."""
     files = {_recording(db, state, one): run_folder(db, state, one.run) / COLUMNS for one in references}
     return [f"--columns={recording}={columns}" for recording, columns in files.items() if columns.is_file()]
 
 
-def range_words(one: RecordingReference) -> str:
+def range_words(one: asked.RecordingReference) -> str:
     """Format a recording's range as the command line has it; empty for a whole recording."""
     if one.start is None and one.end is None:
         return ""

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, SubprocessJob, UnitChild
-from ident_service.daemon.jobs.commands import JOBS, Command, command
+from ident_service.daemon.jobs.commands import JOBS, READS_BUS, Command, command
 from ident_service.daemon.jobs.outcome import (
     Orphan,
     explain_interrupted,
@@ -44,7 +44,7 @@ from ident_service.daemon.jobs.requests import AnyJobRequest
 from ident_service.daemon.metrics import Metrics
 from ident_service.errors import DiskFull, IdentError, MotionRefused, UsageError
 from ident_service.motion.command_channel import stop_requested_ns
-from ident_service.operations.moving_arms import confirm_support, finish_arm, moving_arms, pause_arm, stop_arms
+from ident_service.operations.moving_arms import Asked, ask_arm, moving_arms, stop_arms
 from ident_service.registry import jobs as rows
 from ident_service.registry.database import FILE, AuditQueue, Database, Row, note, shortage
 from ident_service.registry.motions import new_id
@@ -510,22 +510,10 @@ class Engine:
             self.audit.note(by, "stop", arm or "all arms", reached=reached, jobs=ended)
         return {"arms": reached, "jobs": ended}
 
-    def pause(self, arm: str, by: str, *, wanted: bool) -> bool:
-        """Pause an arm, or let it go on (`wanted` False); return whether a process moves it."""
-        reached = pause_arm(self.state, arm, wanted=wanted)
-        self.audit.note(by, "pause" if wanted else "resume", arm, reached=[arm] if reached else [])
-        return reached
-
-    def finish(self, arm: str, by: str) -> bool:
-        """End a run early by its regular end, out of a pause too; return whether a process moves the arm."""
-        reached = finish_arm(self.state, arm)
-        self.audit.note(by, "finish", arm, reached=[arm] if reached else [])
-        return reached
-
-    def confirm_support(self, arm: str, by: str) -> bool:
-        """Pass on a person's confirmation that an arm held after a stop is supported; return whether one was held."""
-        reached = confirm_support(self.state, arm)
-        self.audit.note(by, "supported", arm, reached=[arm] if reached else [])
+    def ask(self, arm: str, asked: Asked, by: str) -> bool:
+        """Ask the process that moves or holds an arm (`moving_arms.ask_process`); return whether there was one."""
+        reached = ask_arm(self.state, arm, asked)
+        self.audit.note(by, asked, arm, reached=[arm] if reached else [])
         return reached
 
     def progress(self, row: Row) -> Progress | None:
@@ -575,7 +563,7 @@ class Engine:
 
     def _resources(self, row: Row) -> frozenset[str]:
         """Return what the process of a job has for itself."""
-        if not row["motion"] and row["kind"] not in ("watch", "recover", "bus_scan", "bus_probe"):
+        if not row["motion"] and row["kind"] not in READS_BUS:
             return frozenset()
         known = self.db.row("SELECT resources FROM arms WHERE name = ?", row["arm"])
         return frozenset((f"arm {row['arm']}", *(json.loads(known["resources"]) if known else ())))

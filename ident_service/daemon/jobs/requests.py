@@ -15,13 +15,13 @@ Seed = Annotated[int, Field(ge=0, lt=2**31)]
 FeasibleSet = Literal["pseudo_inertia", "inertia", "none"]
 
 
-class BaseJobRequest(BaseModel):
-    """Request that refuses unknown keys."""
+class RequestBody(BaseModel):
+    """Body of a request, which refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class RecordingReference(BaseJobRequest):
+class RecordingReference(RequestBody):
     """Recording, named by its run; whole, or from `start` to `end` [s].
 
     `name` is that of the file in the run's manifest; left out, it is the run's only recording, or `run.mcap`.
@@ -33,7 +33,7 @@ class RecordingReference(BaseJobRequest):
     end: Second | None = None
 
 
-class Design(BaseJobRequest):
+class Design(RequestBody):
     """Search for a motion; options left out are as the arm's description says."""
 
     kind: Literal["design"]
@@ -47,7 +47,7 @@ class Design(BaseJobRequest):
     after: Annotated[tuple[RecordingReference, ...], Field(max_length=16)] = ()
 
 
-class Check(BaseJobRequest):
+class Check(RequestBody):
     """Do the preflight for a motion, the description's own without one, or for the motion home."""
 
     kind: Literal["check"]
@@ -62,7 +62,7 @@ class Check(BaseJobRequest):
         return self
 
 
-class Rehearse(BaseJobRequest):
+class Rehearse(RequestBody):
     """Run the motion slowly, while the lease is renewed as fast as a held key repeats."""
 
     kind: Literal["rehearse"]
@@ -71,14 +71,14 @@ class Rehearse(BaseJobRequest):
     speed: Speed = 0.2
 
 
-class Until(BaseJobRequest):
+class Until(RequestBody):
     """Accuracy at which a run ends early: standard deviations of at most this share of their parameters."""
 
     share: Annotated[float, Field(gt=0, lt=1)]
     parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
 
 
-class Run(BaseJobRequest):
+class Run(RequestBody):
     """Move the arm along a motion and record it."""
 
     kind: Literal["run"]
@@ -88,35 +88,35 @@ class Run(BaseJobRequest):
     until: Until | None = None
 
 
-class Home(BaseJobRequest):
+class Home(RequestBody):
     """Move the arm to its home position, slowly."""
 
     kind: Literal["home"]
     arm: ArmName
 
 
-class Zero(BaseJobRequest):
+class Zero(RequestBody):
     """Set the encoders' zero: a person confirms that the arm stands at home; nothing moves, and it never waits."""
 
     kind: Literal["zero"]
     arm: ArmName
 
 
-class LeaveLimit(BaseJobRequest):
+class LeaveLimit(RequestBody):
     """Move an arm that stands outside its position limits back inside, slowly."""
 
     kind: Literal["leave_limit"]
     arm: ArmName
 
 
-class Recover(BaseJobRequest):
+class Recover(RequestBody):
     """Report after a fault or a stop what prevents motion, and what to do; nothing moves."""
 
     kind: Literal["recover"]
     arm: ArmName
 
 
-class Watch(BaseJobRequest):
+class Watch(RequestBody):
     """Read the arm's positions and drive status without torque and without changing its state."""
 
     kind: Literal["watch"]
@@ -124,7 +124,7 @@ class Watch(BaseJobRequest):
     seconds: Annotated[float, Field(gt=0, le=600)] = 2.0
 
 
-class BusLoad(BaseJobRequest):
+class BusLoad(RequestBody):
     """Compute the load of every frame on the arm's buses, and whether all of them fit."""
 
     kind: Literal["bus_load"]
@@ -132,35 +132,35 @@ class BusLoad(BaseJobRequest):
     rate: Annotated[float, Field(gt=0, le=1e6)] | None = None
 
 
-class BusScan(BaseJobRequest):
+class BusScan(RequestBody):
     """List the nodes on the arm's buses; reads only."""
 
     kind: Literal["bus_scan"]
     arm: ArmName
 
 
-class BusProbe(BaseJobRequest):
+class BusProbe(RequestBody):
     """Read the capabilities of the arm's drives, and what they lack; reads only."""
 
     kind: Literal["bus_probe"]
     arm: ArmName
 
 
-class ConfigCheck(BaseJobRequest):
+class ConfigCheck(RequestBody):
     """Check the arm's description: bus budget, and whether its gains are stable."""
 
     kind: Literal["config_check"]
     arm: ArmName
 
 
-class Base(BaseJobRequest):
+class Base(RequestBody):
     """List the base parameters and their expressions."""
 
     kind: Literal["base"]
     arm: ArmName
 
 
-class Preview(BaseJobRequest):
+class Preview(RequestBody):
     """Predict the demands of a motion on the arm, and the accuracy that it will give."""
 
     kind: Literal["preview"]
@@ -168,7 +168,7 @@ class Preview(BaseJobRequest):
     motion: Id | None = None
 
 
-class Identify(BaseJobRequest):
+class Identify(RequestBody):
     """Identify parameters from recordings."""
 
     kind: Literal["identify"]
@@ -182,7 +182,7 @@ class Identify(BaseJobRequest):
     """Number of an acceptance whose stored description is used instead of today's, for comparison with its set."""
 
 
-class Simulate(BaseJobRequest):
+class Simulate(RequestBody):
     """Commission a simulated arm, and score the result against the known truth."""
 
     kind: Literal["simulate"]
@@ -192,14 +192,14 @@ class Simulate(BaseJobRequest):
     feasible_set: FeasibleSet | None = None
 
 
-class Report(BaseJobRequest):
+class Report(RequestBody):
     """Write the report of a run as one page."""
 
     kind: Literal["report"]
     run: Id
 
 
-class Export(BaseJobRequest):
+class Export(RequestBody):
     """Write the parameters of a run for other tools."""
 
     kind: Literal["export"]
@@ -207,7 +207,7 @@ class Export(BaseJobRequest):
     formats: Annotated[tuple[Literal["urdf", "mjcf", "sdf", "json", "csv", "c"], ...], Field(min_length=1)] = ("urdf",)
 
 
-class Verify(BaseJobRequest):
+class Verify(RequestBody):
     """Check the certificate in a run's parameters against its own conditions, or those of an arm's description."""
 
     kind: Literal["verify"]
@@ -215,7 +215,7 @@ class Verify(BaseJobRequest):
     arm: ArmName | None = None
 
 
-class Feasible(BaseJobRequest):
+class Feasible(RequestBody):
     """Check whether a real body could have a run's parameters; `arm` adds the conditions of its description."""
 
     kind: Literal["feasible"]
@@ -224,7 +224,7 @@ class Feasible(BaseJobRequest):
     arm: ArmName | None = None
 
 
-class Correct(BaseJobRequest):
+class Correct(RequestBody):
     """Find the feasible parameters nearest to a run's, as a file of their own; the run is unchanged."""
 
     kind: Literal["correct"]
@@ -234,7 +234,7 @@ class Correct(BaseJobRequest):
     arm: ArmName | None = None
 
 
-class Figures(BaseJobRequest):
+class Figures(RequestBody):
     """Write the drawings of a run's report as files."""
 
     kind: Literal["figures"]
@@ -242,7 +242,7 @@ class Figures(BaseJobRequest):
     format: Literal["svg", "png"] = "svg"
 
 
-class Payload(BaseJobRequest):
+class Payload(RequestBody):
     """Identify the payload that the arm of a run carries in recordings of other runs."""
 
     kind: Literal["payload"]
@@ -251,7 +251,7 @@ class Payload(BaseJobRequest):
     refit_offsets: bool = False
 
 
-class Compare(BaseJobRequest):
+class Compare(RequestBody):
     """Compare two runs: what changed, and by how many standard deviations."""
 
     kind: Literal["compare"]
@@ -259,7 +259,7 @@ class Compare(BaseJobRequest):
     other: Id
 
 
-class Judge(BaseJobRequest):
+class Judge(RequestBody):
     """Compare a run's parameters with those of an acceptance of its arm; the comparison is stored in the run."""
 
     kind: Literal["judge"]
@@ -271,7 +271,7 @@ class Judge(BaseJobRequest):
 ArmPattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9*?_.\-\[\]]{1,64}$")]
 
 
-class Fleet(BaseJobRequest):
+class Fleet(RequestBody):
     """Identify arms of one kind together, from every recording that the registry has of them.
 
     `arm` describes each of them; `arms` are their names, or patterns of names such as `cell*`.

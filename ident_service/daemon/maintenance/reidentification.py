@@ -25,7 +25,7 @@ from ident_service.daemon.jobs.commands import JOBS, accepted_description
 from ident_service.daemon.jobs.outcome import is_end_unobserved, process_output
 from ident_service.daemon.jobs.queue import Engine
 from ident_service.daemon.jobs.requests import AnyJobRequest, Check, Identify, Judge, RecordingReference, Run
-from ident_service.errors import IdentError, MotionRefused, UnknownId, UsageError
+from ident_service.errors import IdentError, MotionRefused, UsageError
 from ident_service.operations.acceptance import ARM, accepted_set
 from ident_service.operations.drift_alarms import Verdict, raise_alarm, verdict_of
 from ident_service.operations.maintenance_schedule import close_dues
@@ -64,10 +64,7 @@ def known_reidentification(db: Database, name: str) -> Row:
     Raises:
         UnknownId: there is none.
     """
-    row = db.row("SELECT * FROM reidentifications WHERE id = ?", name)
-    if row is None:
-        raise UnknownId(f"no re-identification {name!r} is known; their list names them")
-    return row
+    return db.known("reidentifications", "re-identification", name)
 
 
 def reidentifications(db: Database, arm: str | None = None, *, before: str | None = None, most: int = 100) -> list[Row]:
@@ -76,12 +73,7 @@ def reidentifications(db: Database, arm: str | None = None, *, before: str | Non
     Raises:
         UnknownId: there is none of that id.
     """
-    at = None if before is None else known_reidentification(db, before)["begun"]
-    return db.rows(
-        "SELECT * FROM reidentifications WHERE (?1 IS NULL OR arm = ?1) "
-        "AND (?2 IS NULL OR begun < ?2 OR begun = ?2 AND id > ?3) ORDER BY begun DESC, id LIMIT ?4",
-        *(arm, at, before, most),
-    )
+    return db.newest("reidentifications", "re-identification", "begun", arm, before, most)
 
 
 def conclude(db: Database, row: Row, verdict: Verdict, now: float) -> None:

@@ -12,12 +12,13 @@ from typing import Annotated, Literal
 
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.responses import PlainTextResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ident_service import __version__
 from ident_service.daemon.authentication import SESSION_SECONDS, Throttled
 from ident_service.daemon.dependencies import COOKIE, Cookie, Operator, Serving, Viewer, address_of, throttled, unknown
 from ident_service.daemon.errors import failures, operation_id
+from ident_service.daemon.jobs.requests import RequestBody
 from ident_service.daemon.responses import PAGES, AuditLine, BeforeNumber, HealthAnswer, Most, Page, WhoAnswer
 from ident_service.errors import IdentError
 from ident_service.operations.drift_alarms import alarms
@@ -31,10 +32,9 @@ AUDIT_SECONDS = 1.0  # s that a reader of the trail waits for queued lines
 TokenName = Annotated[str, Path(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
 
 
-class Login(BaseModel):
+class Login(RequestBody):
     """Token to be exchanged for a session of the page."""
 
-    model_config = ConfigDict(extra="forbid")
     token: Annotated[str, Field(min_length=1, max_length=200)]
 
 

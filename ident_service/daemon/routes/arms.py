@@ -11,62 +11,42 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ident_service.config.load import load_arm
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_BYTES
+from ident_service.daemon import responses as answers
 from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
-from ident_service.daemon.jobs.requests import ArmName, FileName, Id
-from ident_service.daemon.responses import (
-    PAGES,
-    AcceptanceAnswer,
-    AddedArmAnswer,
-    Anyway,
-    ArmAnswer,
-    ArmLine,
-    AskedAnswer,
-    BeforeId,
-    ChallengeAnswer,
-    DeletionAnswer,
-    FaultAnswer,
-    Most,
-    MotionAnswer,
-    Page,
-    deletion_answer,
-)
+from ident_service.daemon.errors import api_router, failures
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.errors import MotionRefused, UsageError
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.command_channel import controlling_pid
 from ident_service.operations import deletion
-from ident_service.operations.acceptance import LONGEST_NOTE, accept, acceptances, rollback
+from ident_service.operations.acceptance import accept, acceptances, rollback
 from ident_service.operations.description_process import describe_apart, draw_apart, judge_apart
+from ident_service.operations.moving_arms import Asked
 from ident_service.registry import arms as known
 from ident_service.registry import motions
-from ident_service.registry.database import note
+from ident_service.registry.database import LONGEST_NOTE, note
 from ident_service.registry.runs import run_folder
 from ident_service.registry.state_folder import control_path, fault_file
 
-router = APIRouter(prefix="/api/v1", tags=["arms"], responses=failures(404), generate_unique_id_function=operation_id)
+router = api_router("arms", 404)
 Text = Annotated[str, Field(max_length=known.MOST_BYTES)]
 Note = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
 
 
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class Description(_Body):
+class Description(RequestBody):
     """Description of an arm as YAML, and the files that it names, by name."""
 
     description: Annotated[str, Field(max_length=MOST_BYTES)]
-    files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}
+    files: Annotated[dict[FileName, Text], Field(max_length=16)] = {}  # noqa: RUF012 - pydantic copies it
 
 
-class Support(_Body):
+class Support(RequestBody):
     """Confirmation that the arm is supported or home: its name, typed by a person who sees it."""
 
     confirm: Annotated[str, Field(max_length=200)]
@@ -80,24 +60,24 @@ class NewArm(Description):
     """
 
     replace: bool = False
-    meshes: Annotated[dict[FileName, str], Field(max_length=64)] = {}
+    meshes: Annotated[dict[FileName, str], Field(max_length=64)] = {}  # noqa: RUF012 - pydantic copies it
 
 
-class MotionUpload(_Body):
+class MotionUpload(RequestBody):
     """Motion for an arm: the content of a `motion.json`."""
 
     arm: ArmName
     motion: Annotated[str, Field(max_length=4 * 2**20)]
 
 
-class Acceptance(_Body):
+class Acceptance(RequestBody):
     """Decision of a person that the parameters of a run are the arm's."""
 
     run: Id
     note: Note
 
 
-class Rollback(_Body):
+class Rollback(RequestBody):
     """Decision of a person to return to an earlier set; the one before the current set if `to` is left out."""
 
     note: Note
@@ -127,10 +107,9 @@ class HomeJoint(BaseModel):
     unit: Literal["rad", "m"]
 
 
-class NewDescription(BaseModel):
+class NewDescription(RequestBody):
     """URDF of an arm, by name, with its meshes: each file's content in base 64. The arm gets `name`."""
 
-    model_config = ConfigDict(extra="forbid")
     name: ArmName
     urdf: FileName
     files: Annotated[dict[FileName, str], Field(min_length=1, max_length=64)]
@@ -148,13 +127,13 @@ class NewDescriptionAnswer(BaseModel):
 
 
 @router.get("/arms")
-def list_arms(service: Serving, _: Viewer) -> list[ArmLine]:
+def list_arms(service: Serving, _: Viewer) -> list[answers.ArmLine]:
     """List all arms by name."""
-    return [ArmLine(**row) for row in known.arm_names(service.db)]
+    return [answers.ArmLine(**row) for row in known.arm_names(service.db)]
 
 
 @router.post("/arms", status_code=201, responses=failures(409))
-def add_arm(service: Serving, who: Operator, body: NewArm) -> AddedArmAnswer:
+def add_arm(service: Serving, who: Operator, body: NewArm) -> answers.AddedArmAnswer:
     """Add an arm by its description; sending the same one again changes nothing.
 
     It may be one that can be identified and not moved; `objections` say why it cannot.
@@ -169,7 +148,7 @@ def add_arm(service: Serving, who: Operator, body: NewArm) -> AddedArmAnswer:
             judge=lambda path: judged.update(judge_apart(path)),
             draw=(lambda path, out: draw_apart(path, Path(place), out)) if body.meshes else None,
         )
-    return AddedArmAnswer(**_arm(service, added.name).model_dump(), objections=judged.get("objections"))
+    return answers.AddedArmAnswer(**_arm(service, added.name).model_dump(), objections=judged.get("objections"))
 
 
 def write_files(place: Path, files: dict[str, str]) -> None:
@@ -186,121 +165,131 @@ def write_files(place: Path, files: dict[str, str]) -> None:
 
 
 @router.get("/arms/{arm}")
-def get_arm(service: Serving, _: Viewer, arm: ArmName) -> ArmAnswer:
+def get_arm(service: Serving, _: Viewer, arm: ArmName) -> answers.ArmAnswer:
     """Show an arm: its description, who moves it, its faults, what was accepted."""
     return _arm(service, arm)
 
 
 @router.post("/arms/{arm}/challenge", status_code=201)
-def challenge(service: Serving, who: Operator, arm: ArmName) -> ChallengeAnswer:
+def challenge(service: Serving, who: Operator, arm: ArmName) -> answers.ChallengeAnswer:
     """Make a challenge, which with the typed name confirms one motion; a repeated request moves the arm once."""
     name = known.known_arm(service.db, service.state, arm).name
-    return ChallengeAnswer(
+    return answers.ChallengeAnswer(
         arm=name, challenge=service.authenticator.challenge(name, who.name), seconds=CHALLENGE_SECONDS
     )
 
 
 @router.get("/arms/{arm}/faults")
-def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[FaultAnswer]:
+def list_faults(service: Serving, _: Viewer, arm: ArmName) -> list[answers.FaultAnswer]:
     """List the faults of an arm that nobody has acknowledged, the earliest first."""
     return _arm(service, arm).faults
 
 
 @router.post("/arms/{arm}/faults/{code}/ack")
-def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> FaultAnswer:
+def acknowledge(service: Serving, who: Operator, arm: ArmName, code: Id) -> answers.FaultAnswer:
     """Acknowledge a fault by its name."""
     name = known.known_arm(service.db, service.state, arm).name
     file = fault_file(service.state, name)
     since = {one.code: one.since for one in file.remembered()}
     cause = file.acknowledge(code)
     note(service.db, who.name, "fault acknowledged", name, code=code, cause=cause)
-    return FaultAnswer(code=code, cause=cause, since=since[code])
+    return answers.FaultAnswer(code=code, cause=cause, since=since[code])
 
 
 @router.post("/arms/{arm}/pause")
-def pause(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+def pause(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
     """Pause the motion of an arm; it keeps its lease."""
-    return _pause(service, who.name, arm, wanted=True)
+    return _ask(service, who.name, arm, "pause")
 
 
 @router.post("/arms/{arm}/resume")
-def resume(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+def resume(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
     """Resume the motion of an arm."""
-    return _pause(service, who.name, arm, wanted=False)
+    return _ask(service, who.name, arm, "resume")
 
 
 @router.post("/arms/{arm}/finish")
-def finish(service: Serving, who: Operator, arm: ArmName) -> AskedAnswer:
+def finish(service: Serving, who: Operator, arm: ArmName) -> answers.AskedAnswer:
     """Finish a run early; the arm goes back to where it stood, and the run is done."""
-    name = known.known_arm(service.db, service.state, arm).name
-    return AskedAnswer(arm=name, asked="finish", reached=service.engine.finish(name, who.name))
+    return _ask(service, who.name, arm, "finish")
 
 
 @router.post("/arms/{arm}/supported")
-def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> AskedAnswer:
+def supported(service: Serving, who: Operator, arm: ArmName, body: Support) -> answers.AskedAnswer:
     """Confirm that the arm, which is held after a stop, is supported or home: it is then let down."""
     name = known.known_arm(service.db, service.state, arm).name
     if body.confirm != name:
         raise MotionRefused(f"confirm that {name} is supported by its name, typed by a person who sees it")
-    return AskedAnswer(arm=name, asked="supported", reached=service.engine.confirm_support(name, who.name))
+    return _ask(service, who.name, name, "supported")
 
 
 @router.get("/arms/{arm}/acceptances")
-def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[AcceptanceAnswer]:
+def list_acceptances(service: Serving, _: Viewer, arm: ArmName) -> list[answers.AcceptanceAnswer]:
     """List the accepted sets of an arm, the earliest first; the last one is current."""
     name = known.known_arm(service.db, service.state, arm).name
-    return [AcceptanceAnswer(**asdict(act)) for act in acceptances(service.state, name)]
+    return [answers.AcceptanceAnswer(**asdict(act)) for act in acceptances(service.state, name)]
 
 
 @router.post("/arms/{arm}/acceptances", status_code=201)
-def accept_run(service: Serving, who: Operator, arm: ArmName, body: Acceptance) -> AcceptanceAnswer:
+def accept_run(service: Serving, who: Operator, arm: ArmName, body: Acceptance) -> answers.AcceptanceAnswer:
     """Accept the parameters of a run of this arm."""
     name = known.known_arm(service.db, service.state, arm).name
     folder = run_folder(service.db, service.state, body.run)
     act = accept(service.db, service.state, folder, body.note, who.name, arm=name)
-    return AcceptanceAnswer(**asdict(act))
+    return answers.AcceptanceAnswer(**asdict(act))
 
 
 @router.post("/arms/{arm}/rollback", status_code=201)
-def roll_back(service: Serving, who: Operator, arm: ArmName, body: Rollback) -> AcceptanceAnswer:
+def roll_back(service: Serving, who: Operator, arm: ArmName, body: Rollback) -> answers.AcceptanceAnswer:
     """Make an earlier accepted set the current one again."""
     name = known.known_arm(service.db, service.state, arm).name
-    return AcceptanceAnswer(**asdict(rollback(service.db, service.state, name, body.note, who.name, body.to)))
+    return answers.AcceptanceAnswer(**asdict(rollback(service.db, service.state, name, body.note, who.name, body.to)))
 
 
-@router.get("/motions", responses=PAGES)
+@router.get("/motions", responses=answers.PAGES)
 def list_motions(
-    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 500
-) -> list[MotionAnswer]:
+    page: answers.Page,
+    service: Serving,
+    _: Viewer,
+    arm: ArmName | None = None,
+    before: answers.BeforeId = None,
+    most: answers.Most = 500,
+) -> list[answers.MotionAnswer]:
     """List motions, or those of an arm, the newest first."""
     found = page(most, lambda n: motions.motions(service.db, arm, before=before, most=n))
-    return [MotionAnswer(**row) for row in found]
+    return [answers.MotionAnswer(**row) for row in found]
 
 
 @router.post("/motions", status_code=201)
-def add_motion(service: Serving, who: Operator, body: MotionUpload) -> MotionAnswer:
+def add_motion(service: Serving, who: Operator, body: MotionUpload) -> answers.MotionAnswer:
     """Upload a motion that was designed elsewhere; preflight judges it like any other."""
     arm = known.known_arm(service.db, service.state, body.arm)
     joints = arm_model(arm.config).chain.joints
-    return MotionAnswer(**motions.add_motion(service.db, service.state, arm.name, body.motion, who.name, joints))
+    return answers.MotionAnswer(
+        **motions.add_motion(service.db, service.state, arm.name, body.motion, who.name, joints)
+    )
 
 
 @router.get("/motions/{motion}")
-def get_motion(service: Serving, _: Viewer, motion: Id) -> MotionAnswer:
+def get_motion(service: Serving, _: Viewer, motion: Id) -> answers.MotionAnswer:
     """Show a motion: its arm, duration and hash."""
-    return MotionAnswer(**motions.known_motion(service.db, motion))
+    return answers.MotionAnswer(**motions.known_motion(service.db, motion))
 
 
 @router.delete("/motions/{motion}", responses=failures(404, 409))
-def delete_motion(service: Serving, who: Operator, motion: Id, anyway: Anyway = False) -> DeletionAnswer:
+def delete_motion(
+    service: Serving, who: Operator, motion: Id, anyway: answers.Anyway = False
+) -> answers.DeletionAnswer:
     """Delete a motion; runs keep their copy of it."""
-    return deletion_answer(motion, deletion.delete_motion(service.db, service.state, motion, who.name, anyway=anyway))
+    return answers.deletion_answer(
+        motion, deletion.delete_motion(service.db, service.state, motion, who.name, anyway=anyway)
+    )
 
 
 @router.delete("/arms/{arm}", responses=failures(404, 409))
-def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: Anyway = False) -> DeletionAnswer:
+def delete_arm(service: Serving, who: Operator, arm: ArmName, anyway: answers.Anyway = False) -> answers.DeletionAnswer:
     """Delete an uploaded arm, and with it its motions, runs, schedules and acceptances."""
-    return deletion_answer(arm, deletion.delete_arm(service.db, service.state, arm, who.name, anyway=anyway))
+    return answers.deletion_answer(arm, deletion.delete_arm(service.db, service.state, arm, who.name, anyway=anyway))
 
 
 @router.post("/descriptions/new")
@@ -329,11 +318,11 @@ def get_home(service: Serving, _: Viewer, arm: ArmName) -> list[HomeJoint]:
     return [HomeJoint(**asdict(one)) for one in home_posture(known.known_arm(service.db, service.state, arm).config)]
 
 
-def _arm(service: Service, arm: str) -> ArmAnswer:
+def _arm(service: Service, arm: str) -> answers.ArmAnswer:
     found = known.known_arm(service.db, service.state, arm)
     acts = acceptances(service.state, found.name)
     config = found.config
-    return ArmAnswer(
+    return answers.ArmAnswer(
         name=found.name,
         source="shipped" if found.source == "shipped" else "uploaded",
         description=config.description,
@@ -343,12 +332,11 @@ def _arm(service: Service, arm: str) -> ArmAnswer:
         unattended_motion=config.unattended_motion,
         resources=list(known.resources(config)),
         moved_by=controlling_pid(control_path(service.state, found.name)),
-        faults=[FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],
-        accepted=AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
+        faults=[answers.FaultAnswer(**asdict(one)) for one in fault_file(service.state, found.name).remembered()],
+        accepted=answers.AcceptanceAnswer(**asdict(acts[-1])) if acts else None,
     )
 
 
-def _pause(service: Service, who: str, arm: str, *, wanted: bool) -> AskedAnswer:
+def _ask(service: Service, who: str, arm: str, asked: Asked) -> answers.AskedAnswer:
     name = known.known_arm(service.db, service.state, arm).name
-    reached = service.engine.pause(name, who, wanted=wanted)
-    return AskedAnswer(arm=name, asked="pause" if wanted else "resume", reached=reached)
+    return answers.AskedAnswer(arm=name, asked=asked, reached=service.engine.ask(name, asked, who))

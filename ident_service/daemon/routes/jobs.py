@@ -12,26 +12,17 @@ from dataclasses import asdict
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Header, HTTPException, Query, Response
+from fastapi import Header, HTTPException, Query, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from ident_service.daemon import responses as answers
 from ident_service.daemon.dependencies import LeaseKeeper, Near, Operator, Service, Serving, Viewer, WhileAuthorized
-from ident_service.daemon.errors import failures, operation_id
+from ident_service.daemon.errors import api_router, failures
 from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import held_until, is_end_unobserved, process_output
-from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id
-from ident_service.daemon.responses import (
-    PAGES,
-    BeforeNumber,
-    JobAnswer,
-    JobResult,
-    LeaseAnswer,
-    Most,
-    Page,
-    StopAnswer,
-)
+from ident_service.daemon.jobs.requests import MOVES, AnyJobRequest, ArmName, Id, RequestBody
 from ident_service.errors import MotionRefused, UnknownId, UsageError
 from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
@@ -40,9 +31,7 @@ from ident_service.registry.database import Row
 from ident_service.registry.state_folder import arm_folder
 from ident_service.registry.tokens import Access
 
-router = APIRouter(
-    prefix="/api/v1", tags=["jobs"], responses=failures(404, 409), generate_unique_id_function=operation_id
-)
+router = api_router("jobs", 404, 409)
 MOST_LOG: Final = 2**20
 NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 _EVENTS = 0.2  # s between looks at a job that is watched
@@ -73,18 +62,16 @@ Key = Annotated[
 State = Literal["queued", "running", "done", "refused", "failed", "faulted", "cancelled", "interrupted"]
 
 
-class Confirmation(BaseModel):
+class Confirmation(RequestBody):
     """Confirmation of one motion by a person: the arm's name, typed, and the challenge that was given for it."""
 
-    model_config = ConfigDict(extra="forbid")
     name: Annotated[str, Field(max_length=64)]
     challenge: Annotated[str, Field(max_length=64)]
 
 
-class JobRequest(BaseModel):
+class JobRequest(RequestBody):
     """Job to be done; one that may move an arm needs the confirmation, and its lease renewed from now on."""
 
-    model_config = ConfigDict(extra="forbid")
     job: AnyJobRequest
     confirm: Confirmation | None = None
 
@@ -112,7 +99,7 @@ def require_confirmed(service: Service, arm: str, confirm: Confirmation | None, 
 @router.post("/jobs", status_code=201, responses={201: {"headers": _REPLAYED}})
 def create_job(
     service: Serving, who: Operator, body: JobRequest, response: Response, idempotency_key: Key = None
-) -> JobAnswer:
+) -> answers.JobAnswer:
     """Begin or queue a job; a computation repeated with the same `Idempotency-Key` is the same job."""
     if idempotency_key is None:
         return begin_job(service, who, body)
@@ -134,7 +121,7 @@ def create_job(
     return job_answer_document(service, row)
 
 
-def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
+def begin_job(service: Service, who: Access, body: JobRequest) -> answers.JobAnswer:
     """Queue the job of a request to the API or of a page.
 
     Raises:
@@ -146,16 +133,16 @@ def begin_job(service: Service, who: Access, body: JobRequest) -> JobAnswer:
     return job_answer_document(service, service.engine.create(body.job, who.name))
 
 
-@router.get("/jobs", responses=PAGES)
+@router.get("/jobs", responses=answers.PAGES)
 def list_jobs(
-    page: Page,
+    page: answers.Page,
     service: Serving,
     _: Viewer,
     state: Annotated[list[State] | None, Query()] = None,
     arm: ArmName | None = None,
-    before: BeforeNumber = None,
-    most: Most = 100,
-) -> list[JobAnswer]:
+    before: answers.BeforeNumber = None,
+    most: answers.Most = 100,
+) -> list[answers.JobAnswer]:
     """List jobs, the newest first."""
     states = tuple(state or rows.STATES)
     found = page(most, lambda n: rows.jobs(service.db, states=states, arm=arm, before=before, most=n), "number")
@@ -163,7 +150,7 @@ def list_jobs(
 
 
 @router.get("/jobs/{job}")
-def get_job(service: Serving, _: Viewer, job: Id) -> JobAnswer:
+def get_job(service: Serving, _: Viewer, job: Id) -> answers.JobAnswer:
     """Show a job: its state, its progress, and why it ended."""
     return job_answer_document(service, rows.known_job(service.db, job))
 
@@ -176,11 +163,11 @@ def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
 
 
 @router.get("/jobs/{job}/result")
-def get_result(service: Serving, _: Viewer, job: Id) -> JobResult:
+def get_result(service: Serving, _: Viewer, job: Id) -> answers.JobResult:
     """Return what the command of a job answered."""
     row = rows.known_job(service.db, job)
     answer = process_output(service.state / JOBS / row["id"]).answer
-    return JobResult(job=row["id"], answer=_named(answer, service, row))
+    return answers.JobResult(job=row["id"], answer=_named(answer, service, row))
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
@@ -191,14 +178,14 @@ async def watch_job(service: Serving, _: Viewer, while_known: WhileAuthorized, j
 
 
 @router.post("/jobs/{job}/cancel")
-def cancel_job(service: Serving, who: Operator, job: Id) -> JobAnswer:
+def cancel_job(service: Serving, who: Operator, job: Id) -> answers.JobAnswer:
     """Cancel a job; a motion comes to a controlled stop, and the job then says what happened."""
     service.engine.cancel(job, who.name)
     return job_answer_document(service, rows.known_job(service.db, job))
 
 
 @router.post("/jobs/{job}/lease")
-async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswer:
+async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> answers.LeaseAnswer:
     """Renew the lease of a motion; only the caller who asked for the motion can."""
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
@@ -206,26 +193,26 @@ async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> LeaseAnswe
     if (seconds := service.engine.live.renew(job)) is None:
         row = await run_in_threadpool(rows.known_job, service.db, job)
         raise MotionRefused(f"the job {job} has no lease to renew: {row['state']}")
-    return LeaseAnswer(job=job, seconds=seconds)
+    return answers.LeaseAnswer(job=job, seconds=seconds)
 
 
 @router.post("/stop")
-async def stop_all(service: Serving, who: Near) -> StopAnswer:
+async def stop_all(service: Serving, who: Near) -> answers.StopAnswer:
     """Stop all arms, under control; needs no lease and no role; on the service's own machine no token either."""
     return await _stop(service, None, who)
 
 
 @router.post("/arms/{arm}/stop")
-async def stop_arm(service: Serving, who: Near, arm: ArmName) -> StopAnswer:
+async def stop_arm(service: Serving, who: Near, arm: ArmName) -> answers.StopAnswer:
     """Stop an arm, under control; as for all arms; it is no error if no process moves it, but 404 for no arm at all."""
     return await _stop(service, arm, who)
 
 
-async def _stop(service: Service, arm: str | None, who: str) -> StopAnswer:
+async def _stop(service: Service, arm: str | None, who: str) -> answers.StopAnswer:
     done = await asyncio.get_running_loop().run_in_executor(_STOPS, service.engine.stop, arm, who)
     if arm is not None and not any(done.values()) and not await _may_be_known(service, arm):
         raise UnknownId(f"no arm {arm!r} is known; nothing was stopped. POST /api/v1/stop stops all arms")
-    return StopAnswer(**done)
+    return answers.StopAnswer(**done)
 
 
 async def _may_be_known(service: Service, arm: str) -> bool:
@@ -241,10 +228,10 @@ async def _may_be_known(service: Service, arm: str) -> bool:
         return True
 
 
-def job_answer_document(service: Service, row: Row) -> JobAnswer:
+def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
     """Return a job as the API answers it, without its command's own text, which names paths of this machine."""
     found = service.engine.progress(row)
-    shown = {key: value for key, value in row.items() if key in JobAnswer.model_fields}
+    shown = {key: value for key, value in row.items() if key in answers.JobAnswer.model_fields}
     shown["detail"] = _named(row["detail"], service, row)
     progress = None if found is None else _named(asdict(found), service, row)
     moves = bool(row["motion"]) and (row["state"] == "running" or is_end_unobserved(row))
@@ -256,7 +243,7 @@ def job_answer_document(service: Service, row: Row) -> JobAnswer:
         shown["detail"] = f"waits for {before}"
         if other is not None and held_arm(service.state, str(other["arm"])):
             shown["detail"] += f", which holds {held_until(other['arm'])}"
-    return JobAnswer(**{**shown, "progress": progress, "held": held})
+    return answers.JobAnswer(**{**shown, "progress": progress, "held": held})
 
 
 def _named(value: Any, service: Service, row: Row) -> Any:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, HTTPException, Path
+from fastapi import HTTPException, Path
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ident_service.daemon.dependencies import LeaseKeeper, Operator, Service, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
-from ident_service.daemon.jobs.requests import ArmName, Id
+from ident_service.daemon.errors import api_router
+from ident_service.daemon.jobs.requests import ArmName, Id, RequestBody
 from ident_service.daemon.maintenance.reidentification import (
     ReidentificationRequest,
     known_reidentification,
@@ -24,7 +24,7 @@ from ident_service.motion.command_channel import LEASE_SECONDS
 from ident_service.operations import drift_alarms as raised
 from ident_service.operations import maintenance_schedule as planned
 from ident_service.registry.arms import known_arm
-from ident_service.registry.database import Row
+from ident_service.registry.database import LONGEST_NOTE, Row
 
 
 class ScheduleAnswer(BaseModel):
@@ -122,18 +122,12 @@ class AlarmAnswer(BaseModel):
     how: str
 
 
-router = APIRouter(
-    prefix="/api/v1", tags=["maintenance"], responses=failures(404, 409), generate_unique_id_function=operation_id
-)
+router = api_router("maintenance", 404, 409)
 Number = Annotated[int, Path(ge=1, lt=2**62)]
-Words = Annotated[str, Field(min_length=1, max_length=planned.LONGEST_NOTE)]
+Words = Annotated[str, Field(min_length=1, max_length=LONGEST_NOTE)]
 
 
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class NewSchedule(_Body):
+class NewSchedule(RequestBody):
     """Schedule of an arm's re-identification: exactly one of cron (UTC), operating hours, maintenance."""
 
     arm: ArmName
@@ -143,26 +137,26 @@ class NewSchedule(_Body):
     motion: Id | None = None
 
 
-class Enabled(_Body):
+class Enabled(RequestBody):
     """State of a schedule: enabled or disabled."""
 
     enabled: bool
 
 
-class Event(_Body):
+class Event(RequestBody):
     """Maintenance that was done."""
 
     what: Annotated[str, Field(min_length=1, max_length=planned.LONGEST_WHAT)]
-    note: Annotated[str, Field(max_length=planned.LONGEST_NOTE)] = ""
+    note: Annotated[str, Field(max_length=LONGEST_NOTE)] = ""
 
 
-class Remark(_Body):
+class Remark(RequestBody):
     """Decision of a person, with a reason."""
 
     note: Words
 
 
-class NewReidentification(_Body):
+class NewReidentification(RequestBody):
     """Request to re-identify an arm now; it moves twice, for the preflight and for the run."""
 
     arm: ArmName

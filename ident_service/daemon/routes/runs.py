@@ -7,35 +7,22 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
+from ident_service.daemon import responses as answers
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
-from ident_service.daemon.jobs.requests import ArmName, FileName, Id
-from ident_service.daemon.responses import (
-    PAGES,
-    Anyway,
-    BeforeId,
-    DeletionAnswer,
-    Most,
-    Page,
-    ParametersAnswer,
-    RecordingAnswer,
-    RunAnswer,
-    RunLine,
-    SeriesAnswer,
-    deletion_answer,
-)
+from ident_service.daemon.errors import api_router, failures
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.daemon.routes.jobs import without_paths
 from ident_service.errors import UnknownId
 from ident_service.operations import deletion, run_archive
 from ident_service.registry import runs
-from ident_service.registry.database import Row
+from ident_service.registry.database import LONGEST_NOTE
 from ident_service.registry.runs import REPORTS
 
-router = APIRouter(prefix="/api/v1", tags=["runs"], responses=failures(404), generate_unique_id_function=operation_id)
+router = api_router("runs", 404)
 _REPORT = "report.html"
 _BINARY: dict[int | str, dict[str, Any]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file."},
@@ -52,12 +39,11 @@ _PAGE: dict[int | str, dict[str, Any]] = {
 }
 
 
-class Labels(BaseModel):
+class Labels(RequestBody):
     """Tags and note of a run, by which it is found in lists."""
 
-    model_config = ConfigDict(extra="forbid")
-    tags: Annotated[list[Annotated[str, Field(max_length=40)]], Field(max_length=runs.MOST_TAGS)] = []
-    note: Annotated[str, Field(max_length=runs.LONGEST_NOTE)] = ""
+    tags: Annotated[tuple[Annotated[str, Field(max_length=40)], ...], Field(max_length=runs.MOST_TAGS)] = ()
+    note: Annotated[str, Field(max_length=LONGEST_NOTE)] = ""
 
 
 class ExportAnswer(BaseModel):
@@ -72,10 +58,9 @@ class ExportAnswer(BaseModel):
     files: dict[str, int]
 
 
-class Pruning(BaseModel):
+class Pruning(RequestBody):
     """Number of each arm's newest runs whose recordings are kept; nothing is deleted without `yes`."""
 
-    model_config = ConfigDict(extra="forbid")
     keep: Annotated[int, Field(ge=1, le=1_000_000)]
     yes: Annotated[bool, Field(strict=True)] = False
 
@@ -97,37 +82,42 @@ class PruningAnswer(BaseModel):
     left_alone: list[str]
 
 
-@router.get("/runs", responses=PAGES)
+@router.get("/runs", responses=answers.PAGES)
 def list_runs(
-    page: Page, service: Serving, _: Viewer, arm: ArmName | None = None, before: BeforeId = None, most: Most = 100
-) -> list[RunLine]:
+    page: answers.Page,
+    service: Serving,
+    _: Viewer,
+    arm: ArmName | None = None,
+    before: answers.BeforeId = None,
+    most: answers.Most = 100,
+) -> list[answers.RunLine]:
     """List runs, the newest first."""
     labels = runs.run_labels(service.db)
     found = page(most, lambda n: runs.runs(service.db, arm, before=before, most=n))
-    return [RunLine(**row, **_labelled(labels.get(row["id"]))) for row in found]
+    return [answers.RunLine(**row, **runs.shown_labels(labels, row["id"])) for row in found]
 
 
 @router.get("/runs/{run}")
-def get_run(service: Serving, _: Viewer, run: Id) -> RunAnswer:
+def get_run(service: Serving, _: Viewer, run: Id) -> answers.RunAnswer:
     """Show a run: its ending, files, recordings and parameters."""
     row, found = runs.known_run(service.db, run), runs.parameter_set(service.db, run)
-    return RunAnswer(
+    return answers.RunAnswer(
         **row,
-        **_labelled(runs.run_labels(service.db, row["id"]).get(row["id"])),
+        **runs.shown_labels(runs.run_labels(service.db, row["id"]), row["id"]),
         files=runs.run_files(service.db, service.state, run),
-        recordings=[RecordingAnswer(**one) for one in runs.recordings(service.db, run)],
-        parameters=None if found is None else ParametersAnswer(**found),
+        recordings=[answers.RecordingAnswer(**one) for one in runs.recordings(service.db, run)],
+        parameters=None if found is None else answers.ParametersAnswer(**found),
     )
 
 
 @router.post("/runs/{run}/labels")
-def label_run(service: Serving, who: Operator, run: Id, body: Labels) -> RunAnswer:
+def label_run(service: Serving, who: Operator, run: Id, body: Labels) -> answers.RunAnswer:
     """Give a run its tags and its note, in place of those that it had."""
     runs.label_run(service.db, run, body.tags, body.note, who.name)
     return get_run(service, who, run)
 
 
-@router.get("/runs/{run}/series", response_model=SeriesAnswer)
+@router.get("/runs/{run}/series", response_model=answers.SeriesAnswer)
 def get_series(service: Serving, _: Viewer, request: Request, run: Id, name: FileName | None = None) -> Response:
     """Show the recording of a run, thinned for display."""
     chosen = name or runs.recording_name(service.db, run)
@@ -155,9 +145,9 @@ def get_report(service: Serving, _: Viewer, run: Id) -> FileResponse:
 
 
 @router.delete("/runs/{run}", responses=failures(404, 409))
-def delete_run(service: Serving, who: Operator, run: Id, anyway: Anyway = False) -> DeletionAnswer:
+def delete_run(service: Serving, who: Operator, run: Id, anyway: answers.Anyway = False) -> answers.DeletionAnswer:
     """Delete a run with its recordings and its report."""
-    return deletion_answer(run, deletion.delete_run(service.db, service.state, run, who.name, anyway=anyway))
+    return answers.deletion_answer(run, deletion.delete_run(service.db, service.state, run, who.name, anyway=anyway))
 
 
 @router.post("/recordings/prune")
@@ -197,7 +187,3 @@ def get_exported_file(service: Serving, _: Viewer, export: Id, name: FileName) -
     """Download a file of an export; as something to be kept, never as a page."""
     path = runs.export_file(service.db, service.state, export, name)
     return FileResponse(path, media_type="application/octet-stream", filename=name)
-
-
-def _labelled(row: Row | None) -> dict[str, Any]:
-    return {} if row is None else {"tags": row["tags"], "note": row["note"]}

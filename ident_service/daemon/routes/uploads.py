@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Header, HTTPException, Request
+from fastapi import Header, HTTPException, Request
 from fastapi.concurrency import run_in_threadpool
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from starlette.requests import ClientDisconnect
 
 from ident_service.daemon import uploads
 from ident_service.daemon.dependencies import Operator, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
-from ident_service.daemon.jobs.requests import ArmName, FileName, Id
+from ident_service.daemon.errors import api_router, failures
+from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.errors import IdentError
 
-router = APIRouter(
-    prefix="/api/v1", tags=["uploads"], responses=failures(404), generate_unique_id_function=operation_id
-)
+router = api_router("uploads", 404)
 _PIECE: Final[dict[str, Any]] = {
     "requestBody": {
         "required": True,
@@ -27,13 +26,12 @@ _PIECE: Final[dict[str, Any]] = {
 Offset = Annotated[int, Header(ge=0, lt=2**62, description="of the piece's first byte in the recording")]
 
 
-class NewUpload(BaseModel):
+class NewUpload(RequestBody):
     """Recording that is to be uploaded.
 
     `columns` is YAML that says how a CSV is laid out (`docs/recordings.md`), where the arm's description does not.
     """
 
-    model_config = ConfigDict(extra="forbid")
     arm: ArmName
     name: FileName
     bytes: Annotated[int, Field(ge=1, le=uploads.MOST_BYTES)]
@@ -104,13 +102,4 @@ def delete_upload(service: Serving, _: Operator, upload: Id) -> None:
 
 
 def _answer(seen: uploads.Upload) -> UploadAnswer:
-    told = seen.announced
-    return UploadAnswer(
-        id=seen.id,
-        arm=told.arm,
-        name=told.name,
-        bytes=told.bytes,
-        sha256=told.sha256,
-        received=seen.received,
-        run=seen.run,
-    )
+    return UploadAnswer(**asdict(seen.announced), id=seen.id, received=seen.received, run=seen.run)

@@ -12,14 +12,14 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as PathParameter
+from fastapi import Query, Request, Response
 from pydantic import BaseModel
 
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import arm_from_json, load_recording_format
 from ident_service.daemon.dependencies import Service, Serving, Viewer
-from ident_service.daemon.errors import failures, operation_id
+from ident_service.daemon.errors import api_router
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id
 from ident_service.daemon.live import ARM
 from ident_service.errors import UnknownId, UsageError
@@ -27,9 +27,7 @@ from ident_service.registry import arms as known
 from ident_service.registry import motions, runs
 from ident_service.results.manifest import file_sha256
 
-router = APIRouter(
-    prefix="/api/v1", tags=["views"], responses=failures(404, 409), generate_unique_id_function=operation_id
-)
+router = api_router("views", 404, 409)
 _KEPT: Final = 16
 _MOST_BYTES: Final = 256 * 2**20  # of a recording: half a minute of reading
 OWN: Final = "own"

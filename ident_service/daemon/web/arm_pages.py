@@ -461,25 +461,28 @@ def roll_back(service: Serving, who: Operator, arm: ArmName, form: Form) -> Resp
 def pause(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Pause the motion of an arm, or resume it."""
     (arms.pause if form.get("wanted") == "pause" else arms.resume)(service, who, arm)
-    job, again = form.get("job", ""), form.get("again", "")
-    if again:
-        return see_other(f"/reidentifications/{known_reidentification(service.db, again)['id']}?attended=1")
-    return see_other(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+    return _back(service, arm, form)
 
 
 @router.post("/arms/{arm}/finish")
 def finish(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """End a run early by its regular end."""
     arms.finish(service, who, arm)
-    job = form.get("job", "")
-    return see_other(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
+    return _back(service, arm, form)
 
 
 @router.post("/arms/{arm}/supported")
 def supported(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Confirm, on a person's word, that an arm that is held is supported."""
     arms.supported(service, who, arm, arms.Support(confirm=form.get("name", "").strip()))
-    job = form.get("job", "")
+    return _back(service, arm, form)
+
+
+def _back(service: Service, arm: str, form: dict[str, str]) -> Response:
+    """Redirect to the page that a form came from: of a re-identification, of a job, or of the arm."""
+    job, again = form.get("job", ""), form.get("again", "")
+    if again:
+        return see_other(f"/reidentifications/{known_reidentification(service.db, again)['id']}?attended=1")
     return see_other(f"/jobs/{rows.known_job(service.db, job)['id']}?attended=1" if job else f"/arms/{arm}")
 
 
@@ -529,7 +532,14 @@ def _requested_job(arm: str, form: dict[str, str]) -> dict[str, Any]:
         raise UsageError(f"{kind}: a number is missing, or is none") from None
     asked["kind"] = kind
     if kind in ("report", "export"):
-        return {**asked, **({"formats": _formats(form)} if kind == "export" else {})}
+        return {
+            **asked,
+            **(
+                {"formats": [name.removeprefix("format-") for name in form if name.startswith("format-")]}
+                if kind == "export"
+                else {}
+            ),
+        }
     if "until" in asked:
         asked["until"] = {"share": asked["until"]}
     if kind == "identify":
@@ -550,10 +560,6 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "report": ("run",),
     "export": ("run",),
 }
-
-
-def _formats(form: dict[str, str]) -> list[str]:
-    return [name.removeprefix("format-") for name in form if name.startswith("format-")]
 
 
 def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str], problem: str) -> Response:

@@ -20,7 +20,7 @@ from ident_service.daemon.web.render import page
 from ident_service.errors import IdentError, UsageError
 from ident_service.operations import maintenance_schedule as planned
 from ident_service.registry import motions as known_motions
-from ident_service.registry.database import Row
+from ident_service.registry.database import LONGEST_NOTE, Row
 from ident_service.registry.runs import operating_seconds
 from ident_service.registry.tokens import Access
 
@@ -121,7 +121,7 @@ def _page(
         filled=form or {},
         problem="" if problem is None else words_of(problem),
         where=where,
-        longest={"what": planned.LONGEST_WHAT, "note": planned.LONGEST_NOTE},
+        longest={"what": planned.LONGEST_WHAT, "note": LONGEST_NOTE},
     )
 
 

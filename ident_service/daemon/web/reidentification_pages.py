@@ -32,7 +32,7 @@ from ident_service.registry import jobs as rows
 from ident_service.registry import motions as known_motions
 from ident_service.registry import runs
 from ident_service.registry.arms import known_arm
-from ident_service.registry.database import Database, Row, note
+from ident_service.registry.database import LONGEST_NOTE, Database, Row, note
 from ident_service.registry.tokens import Access
 from ident_service.results.manifest import file_sha256
 
@@ -71,36 +71,18 @@ class Step:
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One change that a comparison has found.
-
-    Attributes:
-        what: and of which joint or link.
-        joint: the one whose torque changes most for its size; may be empty.
-        sigma: size of the change in standard deviations.
-        size: how much, in words; may be empty.
-        meaning: what it may mean.
-    """
-
-    what: str
-    joint: str
-    sigma: float
-    size: str
-    meaning: str
-
-
-@dataclass(frozen=True)
 class Compared:
     """Comparison that a verdict was concluded from.
 
     Attributes:
         folder: of the run that keeps it.
-        findings: what has changed.
+        findings: what has changed: `what` and of which joint or link; `joint`, whose torque changes most for its size;
+            `sigma`, the change in standard deviations; `size`, in words; `meaning`. Joint and size may be empty.
         errors: torque error on the new recording with the accepted parameters and with its own [%]; None if unknown.
     """
 
     folder: Path
-    findings: tuple[Finding, ...]
+    findings: tuple[dict[str, Any], ...]
     errors: tuple[float, float] | None
 
 
@@ -146,7 +128,7 @@ def compared(db: Database, state: Path, run: str | None, words: str) -> Compared
 
 
 def _comparison(folder: Path, pair: dict[str, Any]) -> Compared:
-    found = [Finding(one["what"], one["joint"], one["sigma"], one["size"], one["meaning"]) for one in pair["findings"]]
+    found = [{key: one[key] for key in ("what", "joint", "sigma", "size", "meaning")} for one in pair["findings"]]
     errors = pair["torque_error_percent"]
     both = None if errors is None else (float(errors["reference"]["whole"]), float(errors["own"]["whole"]))
     return Compared(folder, tuple(found), both)
@@ -172,7 +154,6 @@ def _jobs(db: Database, row: Row) -> dict[str, str]:
 
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
-_LONGEST_NOTE = 2000
 _NOTED = "re-identification note"
 
 
@@ -186,8 +167,8 @@ def ask_confirmation(service: Serving, who: Operator, arm: ArmName, form: Form) 
 def begin(service: Serving, who: Operator, arm: ArmName, form: Form) -> Response:
     """Begin a re-identification that a person has confirmed; its page keeps the lease from then on."""
     remark = form.get("note", "").strip()
-    if len(remark) > _LONGEST_NOTE:
-        raise UsageError(f"a note has {_LONGEST_NOTE} characters at most; nothing has moved")
+    if len(remark) > LONGEST_NOTE:
+        raise UsageError(f"a note has {LONGEST_NOTE} characters at most; nothing has moved")
     body = {"arm": arm, "confirm": {"name": form.get("name", ""), "challenge": form.get("challenge", "")}}
     if form.get("motion"):
         body["motion"] = form["motion"]
@@ -273,7 +254,7 @@ def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str],
         motion=motion,
         against=against,
         note=form.get("note", ""),
-        longest=_LONGEST_NOTE,
+        longest=LONGEST_NOTE,
         steps=[(TITLES[key], WORDS[key]) for key in TITLES],
         problem=problem,
     )

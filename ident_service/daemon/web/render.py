@@ -88,8 +88,8 @@ def viewer_file() -> bytes:
 @lru_cache(maxsize=1)
 def viewer_version() -> str:
     """Return the part of the viewer's address that changes with its version."""
-    told = json.loads(_vendored().joinpath("rapidoc.json").read_text(encoding="utf-8"))
-    return f"{told['package']}-{told['version']}"
+    document = json.loads(_vendored().joinpath("rapidoc.json").read_text(encoding="utf-8"))
+    return f"{document['package']}-{document['version']}"
 
 
 def _vendored() -> Traversable:

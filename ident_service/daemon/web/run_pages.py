@@ -26,7 +26,7 @@ from ident_service.errors import IdentError, UsageError
 from ident_service.motion.ending import ENDED
 from ident_service.registry import runs as known
 from ident_service.registry.arms import known_arm
-from ident_service.registry.database import Row, audit_log
+from ident_service.registry.database import LONGEST_NOTE, Row, audit_log
 from ident_service.registry.runs import REPORTS
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
@@ -221,7 +221,7 @@ def list_runs(
     found = known.runs(service.db, arm or None, before=before, most=_RUNS + 1)
     more, found = len(found) > _RUNS, found[:_RUNS]
     earlier = found[-1]["id"] if more else None
-    shown = [{**row, **_labels(labels.get(row["id"]))} for row in found]
+    shown = [{**row, **known.shown_labels(labels, row["id"])} for row in found]
     kinds = sorted({row["kind"] for row in shown})
     tags = sorted({one for row in shown for one in row["tags"]})
     shown = [row for row in shown if _wanted(row, kind, tag, text)]
@@ -246,10 +246,6 @@ def list_runs(
         chosen=chosen,
         overlaid=_OVERLAID,
     )
-
-
-def _labels(row: Row | None) -> dict[str, Any]:
-    return {"tags": [], "note": ""} if row is None else {"tags": row["tags"], "note": row["note"]}
 
 
 def _wanted(row: Row, kind: str, tag: str, text: str) -> bool:
@@ -286,7 +282,7 @@ def show_run(service: Serving, who: Viewer, run: Id) -> Response:
         reported=_reported(service, answer.id),
         others=[row["run"] for row in sets],
         recorded=recorded,
-        longest=known.LONGEST_NOTE,
+        longest=LONGEST_NOTE,
     )
 
 

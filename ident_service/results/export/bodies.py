@@ -7,22 +7,7 @@ import numpy as np
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import Array
-from ident_service.model.parameter_layout import about_center
-
-
-def pseudo_inertia(parameters: Array) -> Array:
-    """Return the second moments of a body's mass, shape (4, 4); positive definite for real bodies.
-
-    Args:
-        parameters: of eq. 13, shape (10,).
-    """
-    xx, xy, xz, yy, yz, zz, x, y, z, m = parameters
-    L = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    J = np.zeros((4, 4))
-    J[:3, :3] = 0.5 * np.trace(L) * np.eye(3) - L
-    J[:3, 3] = J[3, :3] = x, y, z
-    J[3, 3] = m
-    return J
+from ident_service.model.parameter_layout import about_center, body_parameters, from_pseudo_inertia, pseudo_inertia
 
 
 def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
@@ -35,15 +20,13 @@ def moved(parameters: Array, rotation: Array, translation: Array) -> Array:
     """
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation
-    J = T @ pseudo_inertia(parameters) @ T.T  # second moments move as points do
-    L = np.trace(J[:3, :3]) * np.eye(3) - J[:3, :3]
-    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *J[:3, 3], J[3, 3]])
+    return from_pseudo_inertia(T @ pseudo_inertia(parameters) @ T.T)  # second moments move as points do
 
 
 def about_origin(mass: float, center: Array, inertia: Array) -> Array:
     """Return the ten parameters of a body, the inverse of `about_center`, shape (10,)."""
     L = inertia + mass * (center @ center * np.eye(3) - np.outer(center, center))
-    return np.array([L[0, 0], L[0, 1], L[0, 2], L[1, 1], L[1, 2], L[2, 2], *(mass * center), mass])
+    return body_parameters(L, mass * center, mass)
 
 
 def is_real(parameters: Array) -> bool:

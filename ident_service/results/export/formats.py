@@ -365,11 +365,7 @@ def arm_reach(model: ArmModel) -> float:
     for k, parent in enumerate(chain.parents):
         before = 0.0 if parent == WORLD else ways[parent] + np.linalg.norm(chain.translation[k])
         ways[k] = before + _travel(model, k)
-    return float(np.max(ways + _link_lengths(chain)))
-
-
-def _link_lengths(chain: Chain) -> Array:
-    return np.asarray(np.linalg.norm(chain.link_translation, axis=1))
+    return float(np.max(ways + np.linalg.norm(chain.link_translation, axis=1)))
 
 
 def _travel(model: ArmModel, k: int) -> float:
