@@ -173,6 +173,9 @@ class ForwardDynamics:
         inertia = self._terms["drive_inertia"]
         self._drive_matrix = chain.coupling.T @ (inertia[:, None] * chain.coupling)
         self._offset = chain.coupling.T @ self._terms["offset"]
+        from scipy.linalg.lapack import dposv  # loads for 0.2 s, and no process that moves an arm needs it
+
+        self._solve_upper = dposv
         # Left out where they are zero: a motion takes ten thousands of steps.
         self._couples = not np.array_equal(chain.coupling, np.eye(chain.joints))
         self._bends = any(self._terms[term].any() for term in ("stribeck", "quadratic", "viscous_asymmetry"))
@@ -209,8 +212,6 @@ class ForwardDynamics:
         Raises:
             ModelError: the mass matrix is not positive definite.
         """
-        from scipy.linalg.lapack import dposv  # loads for 0.2 s, and no process that moves an arm needs it
-
         force = torque - pin.nonLinearEffects(self._model, self._data, position, velocity) - self._offset
         # Of a mass matrix only the upper triangle is filled, and read by this solver.
         implicit = pin.crba(self._model, self._data, position) + self._drive_matrix
@@ -223,7 +224,7 @@ class ForwardDynamics:
             damping = self._secant(velocity)
             implicit.flat[:: len(velocity) + 1] += period * damping
             force -= damping * velocity
-        _, acceleration, status = dposv(implicit, force)
+        _, acceleration, status = self._solve_upper(implicit, force)
         if status != 0:
             raise ModelError("the mass matrix is not positive definite: no real body has these parameters")
         return np.asarray(velocity + period * acceleration)

@@ -103,7 +103,7 @@ class IdentificationResult:
         files: names of the files in the folder.
         warnings: what is wrong with the recordings, in words.
         objections: why the estimate must not be used; empty where nothing says so.
-        torque: it was identified from (`Opened.torque`).
+        torque: it was identified from (`OpenedRecordings.torque`).
     """
 
     estimate: Estimate

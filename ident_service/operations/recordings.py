@@ -80,14 +80,14 @@ def open_together(
     own delay. So measured ones are used where all recordings have them, and commanded ones otherwise.
 
     Args:
-        paths: as for `open_for`.
+        paths: as for `open_for_arm`.
         model: the arm, whose `identification.torque` may demand one of them.
         forms: how each file is laid out, where not as the description says.
         torque: that must be used, in place of the description's.
         payloads: known load of each recording that has one, beside that of the description.
 
     Raises:
-        UsageError, RecordingError: as `open_for`; a recording lacks the torque that is demanded.
+        UsageError, RecordingError: as `open_for_arm`; a recording lacks the torque that is demanded.
     """
     asked = torque or model.config.identification.torque
     found = [open_for_arm(path, model, forms.get(path), asked, payloads.get(path)) for path in paths]

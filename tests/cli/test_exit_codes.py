@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -154,3 +158,31 @@ def test_every_error_has_an_exit_code() -> None:
     heirs = {"UnknownId", "AlreadyThere", "InUse", "InvalidRequest", "AccessRefused"}
     assert bad == given | heirs
     assert set(codes.values()) == {1, 2, 3, 4, 5}
+
+
+_CAUGHT = """
+import json
+
+written = json.dumps
+
+
+def interrupted(*words, **more):
+    try:
+        exec("raise KeyboardInterrupt")
+    except KeyboardInterrupt:
+        pass
+    return written(*words, **more)
+
+
+json.dumps = interrupted
+"""
+
+
+def test_an_interrupt_that_was_caught_in_an_import_is_not_how_the_command_ends(tmp_path: Path) -> None:
+    """Modules that are loaded late run strings; Python would end by SIGINT although the command has its own answer."""
+    (tmp_path / "sitecustomize.py").write_text(_CAUGHT)
+    paths = os.pathsep.join((str(tmp_path), *(path or str(Path.cwd()) for path in sys.path)))
+    words = [sys.executable, "-m", "ident_service", "arms", "--json", "--state", str(tmp_path / "state")]
+    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["exit_code"] == 0
