@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import atexit
-import gc
 import importlib.util
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,15 +23,13 @@ from ident_service.cli.arguments import (
 )
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
 from ident_service.cli.progress import step_of
+from ident_service.cli.quick_imports import quick_imports
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
 
 if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
     from ident_service.estimation.plausibility import Objections
-
-
-_COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
 
 
 def _add_commission(verbs: VerbList) -> None:
@@ -170,32 +165,7 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     return _exit_code(document), "\n".join(lines), document
 
 
-@contextmanager
-def _quick_imports() -> Iterator[None]:
-    """Look for garbage hardly ever: modules make objects that stay, and looks at them are a twentieth of the time.
-
-    Scipy asks numpy for every name that it has. Two of its packages that nothing here uses take a twentieth, too: they
-    load where somebody does.
-    """
-    for name in ("f2py", "testing"):
-        module = f"numpy.{name}"
-        spec = None if module in sys.modules else importlib.util.find_spec(module)
-        if spec is None or spec.loader is None:
-            continue
-        spec.loader = importlib.util.LazyLoader(spec.loader)
-        sys.modules[module] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[module])
-        setattr(sys.modules["numpy"], name, sys.modules[module])
-    atexit.register(gc.freeze)  # nor when the process ends
-    usual = gc.get_threshold()
-    gc.set_threshold(_COLLECT_AFTER, *usual[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*usual)
-
-
-@_quick_imports()
+@quick_imports()
 def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.operations.identification import Request, identify_files
