@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import gc
-import importlib
 import os
 import sys
 from collections.abc import Iterator
@@ -20,24 +19,22 @@ from typing import Any
 _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
 _NO_PLUGINS = {"PYDANTIC_DISABLE_PLUGINS": "__all__"}  # pydantic reads what every installed package says to find them
 
-# Packages, and the modules of theirs that may load alone. Clarabel and estimates take LAPACK from the one, estimates
-# Student's t from the other; Clarabel asks for its modules by their whole names.
-_PARTLY = {"scipy.linalg": ("lapack", "blas"), "scipy.special": ("_ufuncs",)}
+_PARTLY = ("scipy.linalg", "scipy.special")  # Clarabel and estimates take LAPACK of the one, Student's t of the other
 
 
 class _Package(ModuleType):
-    """Package whose own program runs when a name is asked for that its few modules do not have."""
+    """Package whose modules load by their whole names, and whose own program runs when another name is asked for."""
 
     def __getattr__(self, name: str) -> Any:
-        """Return a module of the package or a name in one, or else load the package as usual."""
-        modules = _PARTLY[self.__name__]
-        if name in modules or (name.startswith("_") and find_spec(f"{self.__name__}.{name}")):
-            return importlib.import_module(f"{self.__name__}.{name}")
+        """Return a compiled function of scipy.special, or else load the package as usual."""
         if name.startswith("_") and name != "__all__":
+            # `from package import _module` then loads that module, alone.
             raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name, obj=self)
-        for module in modules:
-            if module.startswith("_") and name in vars(found := importlib.import_module(f"{self.__name__}.{module}")):
-                return vars(found)[name]
+        if self.__name__ == "scipy.special":
+            from scipy.special import _ufuncs
+
+            if name in vars(_ufuncs):
+                return vars(_ufuncs)[name]
         self.__class__ = ModuleType  # type: ignore[assignment]  # from here on as any other
         if self.__spec__ is not None and self.__spec__.loader is not None:
             self.__spec__.loader.exec_module(self)
