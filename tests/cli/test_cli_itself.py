@@ -205,7 +205,7 @@ def test_identification_loads_what_it_needs(quick: Commissioned, samples: Sample
 def test_packages_that_load_in_part_give_all_their_names_when_asked() -> None:
     program = (
         "import os, sys\n"
-        "from ident_service.cli.quick_imports import quick_imports\n"
+        "from ident_service.cli.identification_commands import quick_imports\n"
         "with quick_imports():\n"
         "    assert os.environ['PYDANTIC_DISABLE_PLUGINS']\n"
         "    from scipy.linalg.lapack import dtrtrs\n"
