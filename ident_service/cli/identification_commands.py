@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
     from ident_service.estimation.plausibility import Objections
 
-# Two packages of scipy load all of their modules, which was a tenth of the time of `ident identify`; it uses LAPACK and one
-# distribution of them.
+# Two packages of scipy load all of their modules, which took a tenth of the time of `ident identify`; of them it uses
+# LAPACK and one distribution.
 _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
 _NO_PLUGINS = {"PYDANTIC_DISABLE_PLUGINS": "__all__"}  # pydantic reads what every installed package says to find them
 
