@@ -21,6 +21,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import floor
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -150,7 +151,10 @@ def _byte_steps(state: int, byte: int) -> tuple[int, int]:
     return state, stuffed
 
 
-_STEPS = [[_byte_steps(state, byte) for byte in range(256)] for state in range(11)]
+@cache
+def _steps() -> list[list[tuple[int, int]]]:
+    """Return what each byte does in each state; made where it is asked for, as few that import this count bits."""
+    return [[_byte_steps(state, byte) for byte in range(256)] for state in range(11)]
 
 
 def _stuffed(value: int, count: int) -> int:
@@ -159,8 +163,9 @@ def _stuffed(value: int, count: int) -> int:
     for place in range(count - 1, count - 1 - rest, -1):
         state, more = _step(state, value >> place & 1)
         stuffed += more
+    steps = _steps()
     for byte in (value & (1 << 8 * whole) - 1).to_bytes(whole, "big"):
-        state, more = _STEPS[state][byte]
+        state, more = steps[state][byte]
         stuffed += more
     return stuffed
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
-import importlib.util
+import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.arguments import (
@@ -34,8 +36,12 @@ if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
     from ident_service.estimation.plausibility import Objections
 
-
+# Two packages of scipy load all of their modules, which took a tenth of the time of `ident identify`; of them it uses
+# LAPACK and one distribution.
 _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
+_NO_PLUGINS = {"PYDANTIC_DISABLE_PLUGINS": "__all__"}  # pydantic reads what every installed package says to find them
+
+_PARTLY = ("scipy.linalg", "scipy.special")  # Clarabel and estimates take LAPACK of the one, Student's t of the other
 
 
 def _add_commission(verbs: VerbList) -> None:
@@ -154,22 +160,40 @@ def _simulate(arguments: argparse.Namespace) -> Answer:
     return _exit_code(document), "\n".join(lines), document
 
 
-@contextmanager
-def _quick_imports() -> Iterator[None]:
-    """Look for garbage hardly ever: modules make objects that stay, and looks at them are a twentieth of the time.
+class _Package(ModuleType):
+    """Package whose modules load by their whole names, and whose own program runs when another name is asked for."""
 
-    Scipy asks numpy for every name that it has. Two of its packages that nothing here uses take a twentieth, too: they
-    load where somebody does.
+    def __getattr__(self, name: str) -> Any:
+        """Return a compiled function of scipy.special, or else load the package as usual."""
+        if name.startswith("_") and name != "__all__":
+            # `from package import _module` then loads that module, alone.
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}", name=name, obj=self)
+        if self.__name__ == "scipy.special":
+            from scipy.special import _ufuncs
+
+            if name in vars(_ufuncs):
+                return vars(_ufuncs)[name]
+        self.__class__ = ModuleType  # type: ignore[assignment]  # from here on as any other
+        if self.__spec__ is not None and self.__spec__.loader is not None:
+            self.__spec__.loader.exec_module(self)
+        return getattr(self, name)
+
+
+@contextmanager
+def quick_imports() -> Iterator[None]:
+    """Load parts of packages as they are asked for, and look for garbage hardly ever, while a command runs.
+
+    Modules make objects that stay, and looks at them are a twentieth of the time.
     """
-    for name in ("f2py", "testing"):
-        module = f"numpy.{name}"
-        spec = None if module in sys.modules else importlib.util.find_spec(module)
-        if spec is None or spec.loader is None:
-            continue
-        spec.loader = importlib.util.LazyLoader(spec.loader)
-        sys.modules[module] = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(sys.modules[module])
-        setattr(sys.modules["numpy"], name, sys.modules[module])
+    for name in _PARTLY:
+        if name not in sys.modules and (spec := find_spec(name)) is not None:
+            package = module_from_spec(spec)
+            package.__class__ = _Package
+            sys.modules[name] = package
+            parent, _, last = name.rpartition(".")
+            setattr(sys.modules[parent], last, package)
+    plugins = {name: os.environ.get(name) for name in _NO_PLUGINS}
+    os.environ.update(_NO_PLUGINS)
     atexit.register(gc.freeze)  # nor when the process ends
     usual = gc.get_threshold()
     gc.set_threshold(_COLLECT_AFTER, *usual[1:])
@@ -177,9 +201,14 @@ def _quick_imports() -> Iterator[None]:
         yield
     finally:
         gc.set_threshold(*usual)
+        for name, value in plugins.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
 
 
-@_quick_imports()
+@quick_imports()
 def _identify(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm
     from ident_service.operations.identification import Request, identify_files
@@ -319,7 +348,7 @@ def _fleet_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
-    missing = [name for name in ("distributed", "fsspec", "pyarrow") if importlib.util.find_spec(name) is None]
+    missing = [name for name in ("distributed", "fsspec", "pyarrow") if find_spec(name) is None]
     if missing:
         raise UsageError(f"{', '.join(missing)} is not installed; pip install 'ident-service[fleet]'")
     from ident_service.fleet.reduction import FleetRequest

@@ -26,7 +26,7 @@ from ident_service.model.chain import Array
 from ident_service.model.information import Information, information_of, sparsity
 from ident_service.model.regressor import joint_regressor
 from ident_service.model.zero_phase import low_pass
-from ident_service.recordings.cached_recording import payload_of
+from ident_service.recordings.cached_recording import memory_of, payload_of
 from ident_service.recordings.recording import Recording
 from ident_service.recordings.resampling import grid
 
@@ -36,6 +36,7 @@ _CHUNK = 4096  # samples whose regressor is computed at once
 _SLOWEST_SAMPLING = 0.2  # s; nobody samples an arm more slowly
 _DECAY = 28.0  # -ln(1e-12)
 _UNCOUPLED = 1e-12
+_KEPT_BYTES = 64 << 20  # of rows in a recording's memory; those of a minute of seven joints have 20 MB
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,15 @@ class Rows:
     position: Array
     velocity: Array
     moving: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _KeptRows:
+    """Rows in a recording's memory, with what they are of: identities compare while the objects live."""
+
+    model: ArmModel
+    base: BaseParameters
+    rows: tuple[Rows, ...]
 
 
 RowWeights = Callable[[Rows], Array]
@@ -286,17 +296,17 @@ def _block_seconds(recording: Recording, model: ArmModel) -> float:
     return min(options.block, max(seconds, 0.0) / LEAST_BLOCKS) or options.block
 
 
-def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:
+def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters, *, once: bool = False) -> Iterator[Rows]:
     """Yield the equations themselves, in chunks, for methods that need more than one pass.
 
     Recorded torques are multiplied by the factors of the motors that the description states, and lack what a known
-    payload needs.
+    payload needs. Rows stay in the recording's memory unless they are asked for `once`.
 
     Raises:
         RecordingError: the recording does not fit the arm or cannot be smoothed.
     """
     mixes = _torque_factors(model)
-    for rows in _recorded_rows(recording, model, base):
+    for rows in _recorded_rows(recording, model, base, once):
         yield _of_links(rows, recording, model, base, mixes)
 
 
@@ -359,24 +369,40 @@ def _torque_factors(model: ArmModel) -> Array | None:
     return np.asarray(np.linalg.solve(to_motors, np.array(factors)[:, None] * to_motors))
 
 
-def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters) -> Iterator[Rows]:
+def _recorded_rows(recording: Recording, model: ArmModel, base: BaseParameters, once: bool) -> Iterator[Rows]:
     if recording.joints != model.chain.joints:
         raise RecordingError(
             recording.path, f"has {recording.joints} joints but the arm {model.config.name} has {model.chain.joints}"
         )
+    # Weights, uncertainty and report each take the rows of the final model again.
+    memory, kind, asked = None if once else memory_of(recording), f"rows of {len(base.base)} columns", model
+    if memory is not None and (kept := memory.recall(kind, (id(asked), id(base)))) is not None:
+        yield from kept.rows
+        return
     model = with_chosen_cutoff(model, [recording])
     options = model.config.identification
     if options.smoothing.regressor_cutoff is not None:
         yield from _filtered_rows(recording, model, base, options.smoothing.regressor_cutoff)
         return
     H: Array | None = None
+    rows: list[Rows] | None = None if memory is None else []
+    size = 0
     for motion in motions_of(recording, model):
         for start in range(0, len(motion.time), _CHUNK):
             part = motion[slice(start, start + _CHUNK)]
-            reuse = H if H is not None and H.shape[2] >= len(part.time) else None
+            reuse = H if rows is None and H is not None and H.shape[2] >= len(part.time) else None
             regressor = _regressor(part, model, base, reuse)
             H = regressor if reuse is None else H
-            yield _rows(part, regressor, part.torque, model)
+            found = _rows(part, regressor, part.torque, model)
+            size += regressor.nbytes
+            if rows is not None and size <= min(_KEPT_BYTES, memory.max_bytes if memory else 0):
+                regressor.setflags(write=False)
+                rows.append(found)
+            else:
+                rows = None
+            yield found
+    if memory is not None and rows:
+        memory.remember(kind, (id(asked), id(base)), _KeptRows(asked, base, tuple(rows)))
 
 
 def motions_of(recording: Recording, model: ArmModel) -> Iterator[Motion]:

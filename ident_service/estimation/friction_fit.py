@@ -171,6 +171,7 @@ class FrictionTrials:
         self._tables = [np.concatenate(table) for table in tables]
         self.thirds = [slice(self._rows * k // FOLDS, self._rows * (k + 1) // FOLDS) for k in range(FOLDS)]
         self._products: dict[tuple[int, int, int], Array] = {}
+        self._tried: dict[tuple[int, int, int, tuple[tuple[float, float], ...]], tuple[Array, Array]] = {}
         self._places = [self._places_of(joint) for joint in self._joints]
         require_motion(recordings, model, moved)
 
@@ -209,21 +210,29 @@ class FrictionTrials:
             stribeck_velocity: v_s per drive [rad/s or m/s], shape (drives,).
             parts: of the samples, one result each, such as `thirds`; all together when None.
         """
-        used = self._friction(presliding, stribeck_velocity)
         wanted = [slice(0, self._rows)] if parts is None else list(parts)
         found: list[list[Array]] = [[] for _ in wanted]
+        used: dict[JointTerm, Array] | None = None
         for joint, table in enumerate(self._tables):
             fixed, new, places = self._places[joint]
             size = len(self._supports[joint]) + 1
-            F = self._new_columns(new, used)
+            shape = tuple((float(presliding[drive]), float(stribeck_velocity[drive])) for _, drive, _ in new)
+            F: Array | None = None
             for products, part in zip(found, wanted, strict=True):
                 product = np.empty((size, size))
                 product[fixed[:, None], fixed] = self._normal_matrix(joint, part)
                 if new:
-                    across = table[part].T @ F[part]
+                    # A third of all trials have for some joint the numbers of an earlier one.
+                    key = (joint, part.start, part.stop, shape)
+                    if key not in self._tried:
+                        if F is None:
+                            used = used or self._friction(presliding, stribeck_velocity)
+                            F = self._new_columns(new, used)
+                        self._tried[key] = (table[part].T @ F[part], F[part].T @ F[part])
+                    across, own = self._tried[key]
                     product[fixed[:, None], places] = across
                     product[places[:, None], fixed] = across.T
-                    product[places[:, None], places] = F[part].T @ F[part]
+                    product[places[:, None], places] = own
                 products.append(product)
         counts = [part.stop - part.start for part in wanted]
         return [
@@ -355,7 +364,7 @@ def _thinned_rows(
     """Read a recording's rows; a joint's table has its columns with the torque as the last."""
     parts: list[_Part] = []
     every, count, seen = 1, 0, 0
-    for rows in equation_rows(recording, model, base):
+    for rows in equation_rows(recording, model, base, once=True):
         picked = np.arange((-seen) % every, len(rows.time), every)
         seen += len(rows.time)
         parts.append(_part(rows, picked, columns, model))

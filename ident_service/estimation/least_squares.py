@@ -214,12 +214,19 @@ class Moments:
         variances = np.where(np.diag(inverse) > 0.0, variance * np.diag(inverse), np.inf)
         return beta, np.sqrt(variances)
 
+    @cached_property
+    def _spread(self) -> Array:
+        """Place the products among all parameters, once for many weights; shape (joints, base, base + 1)."""
+        found = np.zeros((len(self.products), self.base, self.base + 1))
+        for whole, support, product in zip(found, self.supports, self.products, strict=True):
+            whole[support[:, None], np.append(support, self.base)] = product[:-1]
+        return found
+
     def _normal(self, weights: Array) -> tuple[Array, Array]:
-        total, right = np.zeros((self.base, self.base)), np.zeros(self.base)
-        for support, product, weight in zip(self.supports, self.products, weights, strict=True):
-            total[support[:, None], support] += weight**2 * product[:-1, :-1]
-            right[support] += weight**2 * product[:-1, -1]
-        return total, right
+        total = np.zeros((self.base, self.base + 1))
+        for whole, weight in zip(self._spread, weights, strict=True):
+            total += weight**2 * whole
+        return total[:, :-1], total[:, -1]
 
     def weights(self, start: Array | None = None) -> Array:
         """Return the factors of the joints' equations that make their residuals alike, shape (joints,).

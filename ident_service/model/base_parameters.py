@@ -228,18 +228,18 @@ def base_from_expressions(expressions: tuple[str, ...], names: tuple[str, ...]) 
     Raises:
         ParameterError: no expressions, or ones that do not parse, use foreign names, or depend on each other.
     """
-    import scipy.linalg  # loads for 0.2 s, and few tables come without an arm
+    from scipy.linalg.lapack import dgeqp3  # loads for 0.2 s, and few tables come without an arm
 
     if not expressions:
         raise ParameterError("no expressions: a table of base parameters has at least one")
     K = parameter_matrix(expressions, names)
     if empty := [row + 1 for row in range(len(K)) if not K[row].any()]:
         raise ParameterError(f"expression {empty[0]} ({expressions[empty[0] - 1]!r}) is zero whatever the parameters")
-    _, R, order = scipy.linalg.qr(K.T, mode="economic", pivoting=True)
+    R, order = dgeqp3(K.T)[:2]  # columns are counted from 1
     rank = int(np.sum(np.abs(np.diag(R)) > _RANK_TOLERANCE * max(1.0, abs(R[0, 0]))))
     if rank < len(expressions):
         raise ParameterError(
-            f"expression {int(order[rank]) + 1} is a combination of the others: {expressions[order[rank]]!r}"
+            f"expression {int(order[rank])} is a combination of the others: {expressions[order[rank] - 1]!r}"
         )
     base, _ = _independent_columns(K)
     return BaseParameters(names, K, base, ("",) * len(expressions))

@@ -16,7 +16,6 @@ from ident_service.config.recording import RecordingFormat, disagreements, misma
 from ident_service.errors import RecordingError, UsageError
 from ident_service.estimation.spectra import EDGE, USUAL
 from ident_service.model.arm_model import ArmModel
-from ident_service.motion.state_machine import State
 from ident_service.recordings.adapters import (
     MeasuredRecording,
     RangeRecording,
@@ -34,7 +33,6 @@ from ident_service.recordings.recording import Recording
 
 # `_OF_ALL`: keys of a format about how all recordings become samples, not about the layout of one file.
 _STOPPING = 40  # level of events for a fault that stopped the arm (`motion/faults.py`)
-_ENDS = (State.STOPPED.value, State.FAULTED.value)
 _OF_ALL = ("gap", "stamps", "rate")
 
 
@@ -175,7 +173,10 @@ def _ended(whole: McapRecording | MeasuredRecording, recording: Recording) -> fl
     log = whole if isinstance(whole, McapRecording) else whole.whole
     if not log.own:
         return None
-    ends = (event.stamp_ns for event in log.read_extras().events if event.name == "ident" and event.message in _ENDS)
+    from ident_service.motion.state_machine import State  # brings drivers, and few recordings are of a motion by ident
+
+    final = (State.STOPPED.value, State.FAULTED.value)
+    ends = (event.stamp_ns for event in log.read_extras().events if event.name == "ident" and event.message in final)
     ended = min(ends, default=None)
     return None if ended is None else (ended - first_stamp(recording)) * 1e-9
 

@@ -30,7 +30,6 @@ from types import TracebackType
 from typing import IO, Final, Protocol, Self, cast
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike, NDArray
 
 from ident_service import __version__
@@ -423,6 +422,8 @@ class RecordingWriter:
             UsageError: it exists, finished or partial; an earlier recording is never overwritten.
             RecordingError: it cannot be created.
         """
+        from mcap.writer import CompressionType, Writer  # loads for 0.04 s, and readers share this module's names
+
         if self.path.exists():
             raise UsageError(f"{self.path}: exists already; recordings are never overwritten")
         try:

@@ -13,10 +13,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from ident_service.errors import UsageError
-from ident_service.motion.fault_store import CONTROLS, FaultStore
+
+if TYPE_CHECKING:  # brings drivers, and who keeps results moves no arm
+    from ident_service.motion.fault_store import FaultStore
 
 LOCK: Final = "serve.lock"
 URL_FILE: Final = "serve.url"
@@ -147,6 +149,8 @@ def known_arms(state: Path) -> list[str]:
 
 def control_path(state: Path, arm: str) -> Path:
     """Return the path of the arm's control file (`motion/command_channel.py`)."""
+    from ident_service.motion.fault_store import CONTROLS
+
     return arm_folder(state, arm) / CONTROLS
 
 
@@ -157,6 +161,8 @@ def ticket_path(state: Path, arm: str) -> Path:
 
 def fault_file(state: Path, arm: str) -> FaultStore:
     """Return the store of the arm's faults that no person has acknowledged (`motion/fault_store.py`)."""
+    from ident_service.motion.fault_store import FaultStore
+
     return FaultStore(arm_folder(state, arm))
 
 

@@ -163,10 +163,10 @@ def test_help_loads_no_large_library(words: list[str]) -> None:
 
 # What the common case may load: a quarter of its processor time is imports. Every other package waits for who needs it.
 IDENTIFY_LOADS = {
-    *("ident_service", "drivers", "numpy", "pinocchio", "coal", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
+    *("ident_service", "numpy", "pinocchio", "coal", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
     *("pydantic", "pydantic_core", "annotated_types", "typing_extensions", "typing_inspection"),  # configurations
     *("jinja2", "markupsafe"),  # the report
-    *("mcap", "lz4", "zstandard"),  # recordings
+    "mcap",  # recordings; of CSV its numbers of records alone
     # Clarabel takes LAPACK from scipy.linalg.
     *("scipy", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),
     *("scipy._cyutility", "scipy._distributor_init", "scipy._distributor_init_local"),
@@ -174,11 +174,14 @@ IDENTIFY_LOADS = {
     *("cmeel_pth", "sitecustomize", "usercustomize", "distutils-precedence"),  # of environments
 }
 NOT_OF_PYTHON = {"urllib.request", "http.client", "ssl", "xml.sax", "sqlite3", "asyncio", "multiprocessing"}
+# Packages load LAPACK and Student's t alone, and neither drivers nor MCAP's formats serve one who reads CSV.
+NOT_OF_SCIPY = {"scipy._lib._array_api", "scipy.linalg._basic", "scipy.special._support_alternative_backends"}
+NOT_FOR_CSV = {"mcap.records", "mcap.writer", "zstandard", "lz4", "drivers.arm", "ident_service.motion.faults"}
 
 
 @pytest.mark.slow
-def test_identification_loads_what_it_needs(quick: Commissioned, tmp_path: Path) -> None:
-    words = ["identify", str(quick.folder / "identification.mcap"), "--arm", str(quick.arm), "--json"]
+def test_identification_loads_what_it_needs(quick: Commissioned, samples: Samples, tmp_path: Path) -> None:
+    words = ["identify", str(samples.write(tmp_path / "run.csv")), "--arm", str(quick.arm), "--json", "--delay", "0"]
     program = (
         "import sys\n"
         "from ident_service.cli import main\n"
@@ -193,8 +196,31 @@ def test_identification_loads_what_it_needs(quick: Commissioned, tmp_path: Path)
     foreign = {name for name in packages - {"scipy"} if not name.startswith("_")}
     foreign |= {".".join(name.split(".")[:2]) for name in modules if name.split(".")[0] == "scipy"}
     assert foreign <= IDENTIFY_LOADS
-    assert not NOT_OF_PYTHON & set(modules)
-    assert not {"numpy.f2py.crackfortran", "numpy.testing._private"} & set(modules)
+    assert not (NOT_OF_PYTHON | NOT_OF_SCIPY | NOT_FOR_CSV) & set(modules)
+    assert not {"numpy.f2py", "numpy.testing"} & set(modules)
+    assert {"scipy.linalg.lapack", "scipy.special._ufuncs"} <= set(modules)
+
+
+@pytest.mark.slow
+def test_packages_that_load_in_part_give_all_their_names_when_asked() -> None:
+    program = (
+        "import os, sys\n"
+        "from ident_service.cli.identification_commands import quick_imports\n"
+        "with quick_imports():\n"
+        "    assert os.environ['PYDANTIC_DISABLE_PLUGINS']\n"
+        "    from scipy.linalg.lapack import dtrtrs\n"
+        "    from scipy.special import stdtrit\n"
+        "    import scipy.linalg.cython_lapack\n"
+        "    assert not hasattr(scipy.linalg, '_no_such_module') and not hasattr(scipy.linalg, '__wrapped__')\n"
+        "    assert not {'scipy.linalg._basic', 'scipy.special._basic'} & set(sys.modules)\n"
+        "assert 'PYDANTIC_DISABLE_PLUGINS' not in os.environ\n"
+        "import scipy.optimize, scipy.signal\n"
+        "assert scipy.special.stdtrit(3.0, 0.975) == stdtrit(3.0, 0.975)\n"
+        "assert scipy.special.gamma(5.0) == 24.0 and scipy.linalg.orth([[2.0]]).shape == (1, 1)\n"
+        "assert scipy.linalg.lapack.dtrtrs is dtrtrs and 'null_space' in dir(scipy.linalg)\n"
+        "assert not hasattr(scipy.linalg, 'no_such_name')\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 def test_foreign_packages_of_the_same_name_are_refused(

@@ -16,6 +16,7 @@ from ident_service.estimation.equations import Equations, equations
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import BaseParameters, base_parameters
 from ident_service.model.regressor import joint_regressor
+from ident_service.recordings.cached_recording import CachedRecording
 
 OPTIONS = plain_options(smoothing=plain_smoothing(cutoff=40.0))
 
@@ -137,3 +138,28 @@ def test_reversals_without_window_or_speed_keep_all_rows(
     got = equations(recording, everything, base)
     turns = np.sum(np.diff(np.signbit(smoothed_samples(recording, OPTIONS).velocity), axis=0), axis=0)
     np.testing.assert_array_equal(got.samples - got.total.rows, turns)
+
+
+def test_the_rows_of_a_model_are_made_once(
+    arm: ArmModel, base: BaseParameters, recording: SampledRecording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = list[int]()
+
+    def counted(*given: object) -> np.ndarray:
+        made.append(1)
+        return joint_regressor(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "joint_regressor", counted)
+    kept = CachedRecording(recording)
+    first = equations(kept, arm, base)
+    once = len(made)
+    assert_same_knowledge(equations(kept, arm, base), first)
+    assert len(made) == once
+    # Another model has other rows, and recordings beyond the bound are read again.
+    equations(kept, with_options(arm, OPTIONS), base)
+    assert len(made) == 2 * once
+    monkeypatch.setattr(module, "_KEPT_BYTES", 1)
+    large = CachedRecording(recording)
+    assert_same_knowledge(equations(large, arm, base), first)
+    assert_same_knowledge(equations(large, arm, base), first)
+    assert len(made) == 4 * once

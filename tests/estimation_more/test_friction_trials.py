@@ -107,3 +107,17 @@ def test_a_joint_that_stands_still_is_named() -> None:
     slow = with_options(model, options)
     with pytest.raises(RecordingError, match="never faster than"):
         FrictionTrials([rubbed(model, delta, X0)], slow, base_parameters(model.chain, model.layout))
+
+
+def test_what_a_joint_has_tried_is_not_computed_again_and_stays_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, _, delta = rubbing(FIT)
+    base = base_parameters(model.chain, model.layout)
+    recording = rubbed(model, delta, X0)
+    trials, fresh = FrictionTrials([recording], model, base), FrictionTrials([recording], model, base)
+    trials.moments(X0, V_S)
+    trials.moments(X0[::-1], V_S)
+    mixed = (np.array([X0[0], X0[0]]), V_S)  # of the first joint as in the first trial, of the second as in the second
+    expected = fresh.moments(*mixed, parts=None)[0]
+    monkeypatch.setattr(FrictionTrials, "_new_columns", None)
+    for found, wanted in zip(trials.moments(*mixed)[0].products, expected.products, strict=True):
+        np.testing.assert_array_equal(found, wanted)

@@ -152,11 +152,18 @@ def _least_squares(J: Array, r: Array) -> Array:
         J: its columns have unit length, or none, shape (rows, unknowns).
         r: shape (rows,).
     """
+    from scipy.linalg.lapack import dgelsy, dgelsy_lwork, dtrtrs  # alone: all of scipy.linalg loads for 0.2 s
+
     size = J.shape[1]
     R = triangle(np.column_stack([J, r]))
     if len(R) > size and np.abs(np.diag(R)[:size]).min(initial=1.0) > _RANK:
-        return np.asarray(scipy.linalg.solve_triangular(R[:size, :size], R[:size, size], check_finite=False))
-    return np.asarray(scipy.linalg.lstsq(J, r, lapack_driver="gelsy")[0])
+        # R^T is as LAPACK stores matrices: no copy.
+        return np.asarray(dtrtrs(R[:size, :size].T, R[:size, size], lower=True, trans=True)[0])
+    unknown = np.zeros(max(J.shape))
+    unknown[: len(r)] = r
+    free, precision = np.zeros((size, 1), dtype=np.int32), float(np.finfo(float).eps)
+    room = int(dgelsy_lwork(*J.shape, 1, precision)[0])
+    return np.asarray(dgelsy(J, unknown, free, precision, room)[1][:size])
 
 
 def _length(changes: Array, away: Array, going: Array, decrement: float) -> float:
