@@ -35,6 +35,7 @@ PATIENCE = 60.0  # s of the machine's time; nothing is judged by it but what nev
 TRIES = 5
 MOTION = {"kind": "seeded", "seed": 1, "base_frequency": 0.2, "harmonics": 5, "periods": 2}
 SHORT = {"kind": "seeded", "seed": 1, "base_frequency": 0.4, "harmonics": 2, "periods": 1}
+MIDST = 2.4  # s; such a motion moves then
 TORQUE_NOISE = [0.05, 0.02]
 # What a machine that stalls does to an arm in real time; a run that ended so is run again. 8250h is the emergency of a
 # drive whose torque frame is overdue, which may be heard before its watchdog's status.
@@ -91,6 +92,7 @@ def canopen(tree: dict[str, Any], bus: dict[str, Any], seed: int, **driver: Any)
         "drives": [drive | {"node": 1}, drive | {"node": 2}],
         "emulation": {"seed": seed, "truth": truth(), "torque_noise": TORQUE_NOISE},
         "watchdog_reason": "an emulated arm behind a machine that stalls",
+        "torque_deadline": max(0.01, 2.0 / tree["control"]["rate"]),  # two cycles at least
     }
     gears = {"ratios": [20.0, -20.0], "coupling": [[1.0, -0.5], [1.0, 0.5]], "drive_terms": "joints"}
     return tree | {"transmission": gears, "driver": section | driver}
@@ -212,14 +214,14 @@ class Moved:
         return not any("operation enabled" in state for state in self.behind.emulator.states)
 
 
-def moved_arm(folder: Path, tree: dict[str, Any], fault: str = "", stop_at: int | None = None) -> Moved:
+def moved_arm(folder: Path, tree: dict[str, Any], fault: str = "", stop_at: float | None = None) -> Moved:
     """A short motion of an arm over emulated drives in virtual time.
 
     Args:
         folder: for its description.
         tree: the description.
         fault: that strikes in the midst of it.
-        stop_at: cycle after which a stop is asked for.
+        stop_at: when a stop is asked for [s]; the motion begins after about two seconds.
     """
     tree["motions"] = {"identification": SHORT, "validation": SHORT}
     config = load_arm(write(folder, tree))
@@ -231,9 +233,9 @@ def moved_arm(folder: Path, tree: dict[str, Any], fault: str = "", stop_at: int 
     def asked() -> bool:
         nonlocal cycles
         cycles += 1
-        if cycles == 600 and fault:
+        if cycles == round(MIDST * config.control.rate) and fault:
             behind.inject(parse_fault(fault, tuple(config.joints)))
-        return stop_at is not None and cycles > stop_at
+        return stop_at is not None and cycles > stop_at * config.control.rate
 
     with CanopenArm(config, lambda _: [behind.link(0)]) as arm:
         try:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_run_bench import canopen, checked, described, moved_arm, truth, write
+from canopen_run_bench import MIDST, canopen, checked, described, moved_arm, truth, write
 from helpers.makers import CAPABLE, REFUSED, SHEETS
 
 from ident_service.cli import USAGE, VERDICT_NO, main
@@ -21,7 +21,7 @@ from ident_service.model.base_parameters import base_parameters
 from ident_service.operations.fieldbus import bus_probe, probe_text
 from sim_backend.emulator.lock_step import LockStepArm
 
-RATE, KP, KD = 250.0, 225.0, 30.0
+RATE, KP, KD = 125.0, 225.0, 30.0
 FILES = sorted(path.name for path in SHEETS.glob("*.[ed][dc][sf]"))
 # Where thousandths are of a current: of 1 A for EPOS2, of the rated current for Elmo Gold.
 OWN = {
@@ -42,6 +42,7 @@ def arm_of(name: str) -> dict[str, Any]:
         "eds": file,
         "torque_frames": "single",
         "drives": [drive | OWN.get(name, {}) | {"node": node} for node in (1, 2)],
+        "guarding": {"period": 0.024},
         "heartbeats": {"period": 0.02, "timeout": 0.11, "host_timeout": 0.06},
         "status": {"period": 0.1, "inhibit": 0.01},
         "measured_torque": "none",
@@ -103,7 +104,7 @@ FAULTS: dict[str, set[str]] = {
 def test_its_motion_is_stopped_by_a_person_and_by_faults(
     name: str, fault: str, codes: set[str], tmp_path: Path
 ) -> None:
-    came = moved_arm(tmp_path, arm_of(name), fault, None if fault else 600)
+    came = moved_arm(tmp_path, arm_of(name), fault, None if fault else MIDST)
     if codes:
         assert came.fault is not None
         assert came.fault.code in codes, came.fault

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from canopen_run_bench import Moved, canopen, checked, described, moved_arm, truth, write
+from canopen_run_bench import MIDST, Moved, canopen, checked, described, moved_arm, truth, write
 
 from drivers.canopen.driver import CanopenArm
 from ident_service.cli import main
@@ -136,7 +136,7 @@ def test_an_encoder_that_freezes_when_no_more_positions_are_given_is_found(share
     assert speed < 0.9
 
 
-def moved(folder: Path, fault: str = "", stop_at: int | None = None, **driver: Any) -> Moved:
+def moved(folder: Path, fault: str = "", stop_at: float | None = None, **driver: Any) -> Moved:
     """A short motion of it, with a fault in its midst."""
     return moved_arm(folder, positions("faulty", **driver), fault, stop_at)
 
@@ -147,7 +147,7 @@ def test_a_run_ends_where_it_began_and_a_stop_is_a_stop(tmp_path: Path) -> None:
     assert done.report.state.value == "done"
     assert done.report.warnings == {}
     assert done.off
-    stopped = moved(tmp_path, stop_at=600)
+    stopped = moved(tmp_path, stop_at=MIDST)
     assert stopped.report is not None
     assert stopped.story.states[-2:] == ["stopping", "stopped"]
     assert stopped.off

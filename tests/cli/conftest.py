@@ -85,9 +85,11 @@ def left_over(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
 
 
-# A quarter of the cycles of a real arm, with gains that are stable at this rate.
+# An eighth of the cycles of a real arm, with gains that are stable at this rate and the two cycles that a watchdog must
+# last.
 COARSE = (
-    ("gravity: [0", "control: {rate: 250}\ngravity: [0"),
+    ("gravity: [0", "control: {rate: 125}\ngravity: [0"),
+    ("  delay_cycles: 1\n", "  delay_cycles: 1\n  watchdog: 0.016\n"),
     ("following_error: 0.2, home: 0, kp: 400, kd: 40", "following_error: 0.4, home: 0, kp: 225, kd: 30"),
 )
 

@@ -45,7 +45,7 @@ def test_timing_is_the_loop_s_own_account(folder: Path) -> None:
     content = json.loads((folder / "evidence.json").read_text())
     assert [one["source"] for one in content["timing"]] == ["cycle", "cycle"]
     assert content["timing"][0]["invalid"] == [0, 0]
-    assert content["timing"][0]["rate"] == pytest.approx(250.0)
+    assert content["timing"][0]["rate"] == pytest.approx(125.0)
 
 
 def test_a_folder_without_evidence_says_what_to_do(folder: Path, ident: Ident) -> None:

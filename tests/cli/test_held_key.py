@@ -172,12 +172,13 @@ def test_the_terminal_is_given_back_as_it_was(keyboard: Keyboard, error: type[Ba
 
 
 def arm(folder: Path) -> Path:
-    """The planar arm in virtual time at 250 Hz, with a motion that outlasts what a hand does meanwhile."""
+    """The planar arm in virtual time at 125 Hz, with a motion that outlasts what a hand does meanwhile."""
     path = folder / "arm.yaml"
     motion = "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 200}"
     gains = "{kp: 225, kd: 30, following_error: 0.4}"
     path.write_text(
-        f"extends: {shipped_arms()['planar2']}\ncontrol: {{rate: 250}}\njoints: {{shoulder: {gains}, elbow: {gains}}}\n"
+        f"extends: {shipped_arms()['planar2']}\ncontrol: {{rate: 125}}\ndriver: {{watchdog: 0.016}}\n"
+        f"joints: {{shoulder: {gains}, elbow: {gains}}}\n"
         f"motions: {{identification: {motion}, validation: {motion}}}\n"
     )
     return path

@@ -150,20 +150,22 @@ def viewer(daemon: Asked) -> str:
     return add_token(daemon.service.db, "looks", "viewer", "test")
 
 
-# A quarter of the cycles of a real arm, with gains that are stable at this rate: what a daemon does with a motion takes
-# processes, not samples.
-_COARSE = "control: {rate: 250}\n"
+# An eighth of the cycles of a real arm, with gains that are stable at this rate and the two cycles that a watchdog must
+# last: what a daemon does with a motion takes processes, not samples.
+_COARSE = "control: {rate: 125}\n"
+_WATCHDOG = ("  delay_cycles: 1\n", "  delay_cycles: 1\n  watchdog: 0.016\n")
 _GAINS = ("following_error: 0.2, home: 0, kp: 400, kd: 40", "following_error: 0.4, home: 0, kp: 225, kd: 30")
 
 
 def quick_text(name: str = "quick", periods: int = 4) -> str:
-    """The shipped planar arm at 250 Hz with motions of periods of five seconds, under another name."""
+    """The shipped planar arm at 125 Hz with motions of periods of five seconds, under another name."""
     text = shipped_arms()["planar2"].read_text()
     changes = (
         ("base_frequency: 0.1", "base_frequency: 0.2"),
         ("periods: 2}", f"periods: {periods}}}"),
         ("name: planar2", f"name: {name}"),
         _GAINS,
+        _WATCHDOG,
     )
     for old, new in changes:
         assert old in text

@@ -205,7 +205,7 @@ def test_a_motion_that_is_refused_raises_at_the_end_of_its_block(client: IdentCl
 @pytest.mark.timeout(300)
 def test_a_motion_that_ends_in_a_fault_raises_it(client: IdentClient, state: Path) -> None:
     # Later than its preflight ends, and in the midst of its motion.
-    text = quick_text("faulty", 8).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)
+    text = quick_text("faulty", 16).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)
     assert "faults" in text
     checked_before(state, text)
     client.add_arm(text)

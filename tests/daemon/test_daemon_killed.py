@@ -74,7 +74,7 @@ def _renewed(client: IdentClient, job: str) -> None:
 def kill_once(state: Path, seed: int) -> str:
     """One kill; what became of the job."""
     chance = random.Random(seed)  # noqa: S311 - a seeded choice
-    kind, text = chance.choice(KINDS), quick_text(ARM, 8)  # a motion of some seconds of this machine's time
+    kind, text = chance.choice(KINDS), quick_text(ARM, 16)  # a motion of some seconds of this machine's time
     if kind == "run":
         checked_before(state, text)
     with daemon_process(state) as (process, client):

@@ -237,7 +237,7 @@ def test_a_stop_that_the_registry_does_not_take_is_entered_later(
 
 def held_text() -> str:
     """The arm `quick` without brakes, with motions that outlast a test."""
-    text = patient_text().replace("control: {rate: 250}", "control: {rate: 250, after_stop: hold}")
+    text = patient_text().replace("control: {rate: 125}", "control: {rate: 125, after_stop: hold}")
     assert "hold" in text
     return text
 

@@ -20,6 +20,12 @@ ARM = "format: ident-arm\nversion: 1\nname: spy\nkinematics: {{{kind}: arm.xml}}
 INERTIAL = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/>'
 
 
+@pytest.fixture(autouse=True)
+def started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start interpreters: limits of memory are for one of its own, and a daemon is to have loaded nothing yet."""
+    start_processes(monkeypatch)
+
+
 def body(kind: str, text: str) -> dict[str, object]:
     return {"description": ARM.format(kind=kind), "files": {"arm.xml": text}}
 
@@ -72,8 +78,7 @@ def test_a_mechanism_that_breaks_parsers_leaves_the_daemon_alive(
 
 
 @pytest.mark.slow
-def test_the_daemon_itself_reads_no_urdf_that_is_new(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    start_processes(monkeypatch)  # one that has loaded nothing yet
+def test_the_daemon_itself_reads_no_urdf_that_is_new(state: Path) -> None:
     configs = Path(__file__).resolve().parents[2] / "configs"
     text = (configs / "threelink.yaml").read_text().replace("name: threelink", "name: mine")
     upload = {"description": text, "files": {"threelink.urdf": (configs / "threelink.urdf").read_text()}}

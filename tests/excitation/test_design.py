@@ -43,7 +43,7 @@ def assert_good(model: ArmModel, **changes: Any) -> None:
     ("name", "kind", "starts"),
     [
         ("planar2", "d_optimal", 2),
-        *(("planar2", kind, 1) for kind in KINDS[1:]),
+        *(pytest.param("planar2", kind, 1, marks=pytest.mark.campaign) for kind in KINDS[1:]),
         ("threelink", "d_optimal", 1),  # a sliding joint
         *(pytest.param("threelink", kind, 2, marks=pytest.mark.campaign) for kind in KINDS),
     ],

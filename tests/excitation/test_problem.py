@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from design_bench import FOURIER, POSTURES, quick, random_task, small
+from helpers.examples import some
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -43,7 +44,7 @@ def slope_and_difference(problem: Problem, x: Array, rng: np.random.Generator) -
 @pytest.mark.slow
 @BASES
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=8)
+@some(3)
 @given(seed=SEEDS, joints=st.integers(2, 3))
 def test_the_gradient_is_what_central_differences_say_with_all_limits_broken(
     basis: Basis, kind: Any, seed: int, joints: int
@@ -85,7 +86,7 @@ def test_a_margin_of_torque_is_one_of_the_motors_too() -> None:
 
 
 @pytest.mark.parametrize("name", ALL_LIMITS)
-@pytest.mark.parametrize("seed", [1, 2, 4])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.campaign) for seed in (2, 4))])
 def test_the_gradient_of_each_kind_of_limit_alone(name: str, seed: int) -> None:
     task = random_task(seed, 3, "d_optimal", FOURIER)
     own = ("lower", "upper") if name == "position" else (name.replace(" ", "_"),)

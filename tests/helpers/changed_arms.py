@@ -18,7 +18,7 @@ from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Recording
 from ident_service.results.run_folder import write_manifest, write_results
 
-COARSE = 250.0  # Hz
+COARSE = 125.0  # Hz
 
 
 def truth_of(config: ArmConfig) -> dict[str, float]:
@@ -47,8 +47,8 @@ def changed(
         motion: seed of the identification motion; the description's when None.
         factors: what true parameters are multiplied by.
         added: what is added to them, in SI units.
-        rate: of the control loop [Hz], the description's when None; a quarter of it moves and records an arm in a
-            quarter of the time.
+        rate: of the control loop [Hz], the description's when None; an eighth of it moves and records an arm in an
+            eighth of the time.
         periods: of a seeded identification motion; the description's when None.
     """
     config = load_arm(arm) if isinstance(arm, str) else arm
@@ -66,7 +66,11 @@ def changed(
         assert isinstance(planned, SeededMotion)
         given = {key: value for key, value in wanted.items() if value is not None}
         motions = motions.model_copy(update={"identification": planned.model_copy(update=given)})
-    control = config.control if rate is None else config.control.model_copy(update={"rate": rate})
+    control = config.control
+    if rate is not None:
+        control = control.model_copy(update={"rate": rate})
+        # A watchdog lasts two cycles at least.
+        driver = driver.model_copy(update={"watchdog": max(driver.watchdog, 2.0 / rate)})
     return config.model_copy(update={"driver": driver, "motions": motions, "control": control})
 
 

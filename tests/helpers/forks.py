@@ -39,12 +39,14 @@ import pytest
 
 from ident_service import cli, daemon, operations
 
-# What our own code starts by `-m`. Not there: processes that limit their memory, which this one may have taken already.
+# What our own code starts by `-m`. Not there: processes that limit their memory, which this one may have taken already;
+# but for the one that judges uploads, whose gigabytes leave room beside the modules of a server.
 PROGRAMS: Final = frozenset(
     {
         "ident_service",
         "ident_service.daemon.jobs.socket_activation",
         "ident_service.motion.process",
+        "ident_service.operations.description_process",
         "ident_service.operations.target_process",
         "ident_service.recordings.recorder_main",
         "drivers.can.frame_log_process",

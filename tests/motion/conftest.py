@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from motion_bench import WatchedArm, watched
-from run_bench import Bench, Healthy
+from run_bench import RATE, Bench, Healthy
 
 from sim_backend.arm import Truth
 from sim_backend.faults import Fault
@@ -22,7 +22,7 @@ def make() -> Iterator[Callable[..., Bench]]:
 
     def build(*faults: Fault, **changes: Any) -> Bench:
         truth: list[Truth] = []
-        arm = watched(faults, truth.append, **changes)
+        arm = watched(faults, truth.append, **RATE | changes)
         arm.open()
         arms.append(arm)
         return Bench(arm, truth)
@@ -36,6 +36,6 @@ def make() -> Iterator[Callable[..., Bench]]:
 def healthy() -> Healthy:
     """An undisturbed run of the bench, for all to read and none to change."""
     truth: list[Truth] = []
-    with watched((), truth.append) as arm:
+    with watched((), truth.append, **RATE) as arm:
         bench = Bench(arm, truth)
         return Healthy(bench, bench.run())

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from motion_bench import Story, WatchedArm, bench_excitation, bench_limits, bench_model
+from motion_bench import Story, WatchedArm, bench_limits, bench_model
 
 from ident_service.errors import ArmFault, DriverError
+from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath, FourierSeries
 from ident_service.motion.command_channel import StopCondition
@@ -20,9 +21,10 @@ from sim_backend.arm import Truth
 Array = np.ndarray
 LIMITS = bench_limits()
 HOME = LIMITS.home
-MOTION = bench_excitation()
-PERIOD = 1e-3
-MIDWAY = 900  # a cycle in the middle of the excitation, both joints moving
+RATE = {"control": {"rate": 500.0}}  # Hz; half the cycles of most arms, as whole runs are what takes time
+PERIOD = 2e-3
+MOTION = excitation(bench_model(**RATE), "identification")
+MIDWAY = 450  # a cycle in the middle of the excitation, both joints moving
 FOREVER = 10**6
 HOLD = 0.1  # s; shorter than usual, for short tests
 
@@ -34,7 +36,7 @@ class Bench:
     arm: WatchedArm
     truth: list[Truth]
     story: Story = field(default_factory=Story)
-    model: Any = field(default_factory=bench_model)
+    model: Any = field(default_factory=lambda: bench_model(**RATE))
 
     def run(self, stop_requested: Callable[[], bool] = lambda: False, motion: Excitation = MOTION) -> RunReport:
         """Run; whatever comes of it, no torque was too large and none is left."""

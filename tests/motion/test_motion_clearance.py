@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.local_commands import LocalCommands
 from motion_bench import bench_excitation, bench_limits, bench_model
+from run_bench import MOTION as EXCITATION
 from run_bench import Bench
 
 from ident_service.config.motion_limits import MotionLimits
@@ -191,7 +192,7 @@ def test_in_a_run_a_return_that_is_not_clear_is_none(
     monkeypatch.setattr(ClearanceChecker, "require_clear", unclear)
     bench = make()
     with pytest.raises(ArmFault, match="the table is in the way") as caught:
-        run(bench.arm, bench.model, bench_excitation(), bench.story, Pausing(), hold_seconds=0.1)
+        run(bench.arm, bench.model, EXCITATION, bench.story, Pausing(), hold_seconds=0.1)
     assert caught.value.code == "no_way_back"
     assert len(asked) > 1  # searched again before it gave up
     assert bench.story.states[-3:] == ["paused", "stopping", "stopped"]

@@ -12,7 +12,7 @@ from helpers.examples import some
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from motion_bench import JOINTS, LOOKED, WatchedArm, bench_model, watched
-from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, Bench, Healthy
+from run_bench import FOREVER, HOLD, HOME, LIMITS, MIDWAY, MOTION, PERIOD, RATE, Bench, Healthy
 
 from drivers.arm import StopKind
 from ident_service.config.motion_limits import MotionLimits
@@ -85,7 +85,7 @@ def ended_where_it_began(bench: Bench) -> None:
     assert bench.arm.stops == [StopKind.TORQUE_OFF]
 
 
-@pytest.mark.parametrize("cycle", [1, 150, MIDWAY, 1300])
+@pytest.mark.parametrize("cycle", [1, 75, MIDWAY, 650])
 def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], healthy: Healthy, cycle: int) -> None:
     bench, whole = make(), healthy.bench
     report = played(bench, Hands(finished=cycle))
@@ -102,15 +102,15 @@ def test_a_run_is_finished_from_every_part_of_it(make: Callable[..., Bench], hea
 
 
 @settings(some(6), phases=[Phase.explicit, Phase.generate])
-@given(cycle=st.integers(1, 2600), speed=st.sampled_from([1.0, 0.6]), pause=st.integers(-400, 400))
+@given(cycle=st.integers(1, 1300), speed=st.sampled_from([1.0, 0.6]), pause=st.integers(-200, 200))
 def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pause: int) -> None:
     truth: list[Truth] = []
-    arm: WatchedArm = watched((), truth.append)
+    arm: WatchedArm = watched((), truth.append, **RATE)
     arm.open()
     try:
         bench = Bench(arm, truth)
         begin = max(cycle + pause, 1)
-        report = played(bench, Hands(finished=cycle, paused=(begin, begin + 100)), speed=speed)
+        report = played(bench, Hands(finished=cycle, paused=(begin, begin + 50)), speed=speed)
         assert report.state is State.DONE
         kept_all_limits(bench)
         ended_where_it_began(bench)
@@ -124,7 +124,7 @@ def test_limits_are_kept_whenever_a_run_is_finished(cycle: int, speed: float, pa
 
 def test_the_return_is_as_slow_as_the_run(make: Callable[..., Bench]) -> None:
     bench = make()
-    assert played(bench, Hands(finished=3000), speed=0.4).finished_at is not None
+    assert played(bench, Hands(finished=1500), speed=0.4).finished_at is not None
     stamps = bench.story.column("stamp_ns") * 1e-9
     velocity = bench.story.column("reference_velocity")[stamps > times(bench)["returning"]]
     assert (np.abs(velocity) <= 0.5 * 0.4 * LIMITS.velocity * 1.001).all()
@@ -132,19 +132,19 @@ def test_the_return_is_as_slow_as_the_run(make: Callable[..., Bench]) -> None:
 
 def test_a_finished_run_returns_from_a_pause_once_the_pause_is_over(make: Callable[..., Bench]) -> None:
     bench = make()
-    report = played(bench, Hands(finished=1200, paused=(700, 2000)))
+    report = played(bench, Hands(finished=600, paused=(350, 1000)))
     assert report.state is State.DONE
     assert bench.story.states[-5:] == ["exciting", "pausing", "paused", "returning", "done"]
-    assert times(bench)["returning"] == pytest.approx((LOOKED + 2000) * PERIOD, abs=2.5 * PERIOD)
+    assert times(bench)["returning"] == pytest.approx((LOOKED + 1000) * PERIOD, abs=2.5 * PERIOD)
     ended_where_it_began(bench)
 
 
 def test_a_run_is_finished_while_it_pauses_and_while_it_goes_on_again(make: Callable[..., Bench]) -> None:
     pausing, resuming = make(), make()
-    assert played(pausing, Hands(finished=710, paused=(700, 720))).finished_at is not None
+    assert played(pausing, Hands(finished=355, paused=(350, 360))).finished_at is not None
     assert pausing.story.states[-5:] == ["exciting", "pausing", "paused", "returning", "done"]
-    begin = 1500
-    assert played(resuming, Hands(finished=begin + 20, paused=(700, begin))).finished_at is not None
+    begin = 750
+    assert played(resuming, Hands(finished=begin + 20, paused=(350, begin))).finished_at is not None
     assert resuming.story.states[-7:] == ["pausing", "paused", "resuming", "pausing", "paused", "returning", "done"]
     for bench in (pausing, resuming):
         kept_all_limits(bench)
@@ -154,8 +154,8 @@ def test_a_run_is_finished_while_it_pauses_and_while_it_goes_on_again(make: Call
 def test_the_return_of_a_finished_run_can_be_paused(make: Callable[..., Bench]) -> None:
     free, bench = make(), make()
     played(free, Hands(finished=MIDWAY))
-    begin = round(times(free)["returning"] / PERIOD) - LOOKED + 200
-    assert played(bench, Hands(finished=MIDWAY, paused=(begin, begin + 300))).finished_at is not None
+    begin = round(times(free)["returning"] / PERIOD) - LOOKED + 100
+    assert played(bench, Hands(finished=MIDWAY, paused=(begin, begin + 150))).finished_at is not None
     expected = ["paused", "returning", "pausing", "paused", "resuming", "returning", "done"]
     assert bench.story.states[-7:] == expected
     kept_all_limits(bench)
@@ -185,7 +185,7 @@ def test_a_single_trajectory_is_not_finished_early(make: Callable[..., Bench]) -
     assert "returning" in ways[0][0]
 
 
-@pytest.mark.parametrize("after", [0, 30, 200, 350])
+@pytest.mark.parametrize("after", [0, 15, 100, 175])
 @pytest.mark.parametrize(("wish", "code"), [("stopped", ""), ("gone", "lease_lost")])
 def test_whatever_stops_the_arm_comes_first(make: Callable[..., Bench], wish: str, code: str, after: int) -> None:
     bench = make()
@@ -224,7 +224,7 @@ def test_where_the_straight_return_is_not_free_the_run_goes_on(
 
     monkeypatch.setattr(ClearanceChecker, "require_clear", home_is_blocked)
     bench = make()
-    report = played(bench, Hands(finished=MIDWAY, paused=(1600, 1700)))
+    report = played(bench, Hands(finished=MIDWAY, paused=(800, 850)))
     assert (report.state, report.finished_at) == (State.DONE, None)
     assert report.not_finished == "the table is in the way"
     expected = ["exciting", "pausing", "paused", "resuming", "exciting"]
@@ -248,7 +248,7 @@ def test_without_any_return_a_finish_ends_as_a_pause_does(
     monkeypatch.setattr(Paused, "resume_in_slices", refused)
     bench = make()
     with pytest.raises(ArmFault, match="it swings") as caught:
-        played(bench, Hands(finished=700))
+        played(bench, Hands(finished=350))
     assert caught.value.code == "no_way_back"
     assert bench.story.states[-3:] == ["paused", "stopping", "stopped"]
 
@@ -266,7 +266,9 @@ def test_the_return_keeps_clear(make: Callable[..., Bench]) -> None:
     middle = back[len(back) // 2]
     tip = 0.5 * np.array([np.cos(middle[0]) + np.cos(middle.sum()), np.sin(middle[0]) + np.sin(middle.sum()), 0.0])
     ball = {"from": tip.tolist(), "to": tip.tolist(), "radius": 0.01}
-    model = bench_model(geometry=bodies, workspace={"obstacles": {"ball": {"capsule": ball}}, "clearance": 0.001})
+    model = bench_model(
+        **RATE, geometry=bodies, workspace={"obstacles": {"ball": {"capsule": ball}}, "clearance": 0.001}
+    )
     paused = Paused(_Standing(back[0]), 0.0, LIMITS)
     search = paused.leave_in_slices(_Standing(back[-1]).at(0.0), LIMITS, ClearanceChecker(model, LIMITS))
     with pytest.raises(MotionRefused, match="at elbow - obstacle ball"):

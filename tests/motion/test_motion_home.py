@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.local_commands import LocalCommands
 from motion_bench import ELBOW, JOINTS, SHOULDER, bench_model
-from run_bench import HOLD, HOME, LIMITS, PERIOD, Bench
+from run_bench import HOLD, HOME, LIMITS, PERIOD, RATE, Bench
 
 from drivers.arm import StopKind
 from ident_service.config.motion_limits import motion_limits
@@ -106,7 +106,7 @@ def test_a_push_outwards_on_the_path_inwards_stops_the_arm(make: Callable[..., B
     bench = make(**standing(OUT, 0.5))
     away = np.array([0.08, 0.0])  # more than it may give way
     bench.arm.shown = lambda sample: replace(
-        sample, position=sample.position + away * min(max(sample.cycle - 100, 0) / 60.0, 1.0)
+        sample, position=sample.position + away * min(max(sample.cycle - 50, 0) / 30.0, 1.0)
     )
     with pytest.raises(ArmFault) as caught:
         go(bench)
@@ -116,7 +116,7 @@ def test_a_push_outwards_on_the_path_inwards_stops_the_arm(make: Callable[..., B
 @pytest.mark.slow
 def test_a_stop_on_the_path_home_is_a_stop(make: Callable[..., Bench]) -> None:
     bench, switches = make(**standing(-1.2, 1.0)), LocalCommands()
-    bench.arm.before_exchange = lambda cycle: setattr(switches, "stop", cycle > 1500)
+    bench.arm.before_exchange = lambda cycle: setattr(switches, "stop", cycle > 750)
     assert go(bench, controls=switches).state is State.STOPPED
     assert bench.story.states[-2:] == ["stopping", "stopped"]
     assert abs(positions(bench)[-1][0] - HOME[0]) > 0.5
@@ -125,7 +125,7 @@ def test_a_stop_on_the_path_home_is_a_stop(make: Callable[..., Bench]) -> None:
 @pytest.mark.slow
 def test_a_pause_on_the_path_home_ends_at_home(make: Callable[..., Bench]) -> None:
     bench, switches = make(**standing(-0.5, 0.4)), LocalCommands()
-    bench.arm.before_exchange = lambda cycle: setattr(switches, "pause", 1000 < cycle < 1800)
+    bench.arm.before_exchange = lambda cycle: setattr(switches, "pause", 500 < cycle < 900)
     assert go(bench, controls=switches).state is State.DONE
     assert bench.story.states[3:7] == ["pausing", "paused", "resuming", "returning"]
     assert (np.abs(positions(bench)[-1] - HOME) < 0.05).all()
@@ -134,6 +134,7 @@ def test_a_pause_on_the_path_home_ends_at_home(make: Callable[..., Bench]) -> No
 def test_a_path_through_an_obstacle_is_refused(make: Callable[..., Bench]) -> None:
     bench = make(**standing(-1.2, 0.0))
     bench.model = bench_model(
+        **RATE,
         geometry={"elbow": [{"from": [-0.45, 0, 0], "to": [0, 0, 0], "radius": 0.03}]},
         workspace={"obstacles": {"post": {"box": {"center": [0.75, -0.5, 0.0], "size": [0.1, 0.2, 0.2]}}}},
     )

@@ -30,7 +30,7 @@ def test_a_run_goes_out_and_comes_back(healthy: Healthy) -> None:
     assert (np.abs(bench.truth[-1].position - HOME) < 0.25 * LIMITS.following_error).all()
     cycles = bench.story.column("cycle")
     np.testing.assert_array_equal(cycles, np.arange(LOOKED, report.cycles - 1))
-    np.testing.assert_array_equal(np.diff(bench.story.column("stamp_ns")), 1_000_000)
+    np.testing.assert_array_equal(np.diff(bench.story.column("stamp_ns")), round(PERIOD * 1e9))
     assert bench.story.column("valid").all()
     assert not bench.story.column("lateness_ns").any()
 

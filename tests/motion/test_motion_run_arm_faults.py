@@ -75,7 +75,7 @@ def test_an_encoder_that_stays_wrong_never_steers_the_arm(make: Callable[..., Be
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-@pytest.mark.parametrize("begin", [600, MIDWAY, 1300])
+@pytest.mark.parametrize("begin", [300, MIDWAY, 650])
 def test_a_frozen_encoder_takes_the_torque_in_time(make: Callable[..., Bench], joint: int, begin: int) -> None:
     bench = make(Fault(begin, FaultKind.FROZEN_ENCODER, joint, FOREVER))
     error = bench.fault()
@@ -109,7 +109,7 @@ def test_a_position_that_is_no_number_takes_the_torque(make: Callable[..., Bench
 
 @pytest.mark.parametrize("joint", [0, 1])
 def test_a_drive_that_is_stuck_is_noticed(make: Callable[..., Bench], joint: int) -> None:
-    bench = make(Fault(MIDWAY, FaultKind.STUCK_TORQUE, joint, FOREVER))
+    bench = make(Fault(MIDWAY + 20, FaultKind.STUCK_TORQUE, joint, FOREVER))
     error = bench.fault()
     # What the arm does without one of its drives is for physics to say; that it is seen to do it, for the guard.
     assert error.code in {"over_velocity", "runaway", "following_error", "torque_absurd"}
@@ -121,7 +121,7 @@ def test_a_drive_that_is_stuck_for_a_moment_is_only_felt(make: Callable[..., Ben
     assert make(Fault(MIDWAY, FaultKind.STUCK_TORQUE, None, 5)).run().state is State.DONE
 
 
-@pytest.mark.parametrize("begin", [LOOKED, 300, MIDWAY, 1900])
+@pytest.mark.parametrize("begin", [LOOKED, 150, MIDWAY, 950])
 def test_a_bus_that_is_gone_ends_the_run(make: Callable[..., Bench], begin: int) -> None:
     bench = make(Fault(begin, FaultKind.BUS_GONE, duration=FOREVER))
     error = bench.fault()
@@ -140,13 +140,15 @@ def test_a_late_cycle_is_recorded_as_late(make: Callable[..., Bench]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gap", "told"), [(0, "0 ms"), (-1_000_000, "-1 ms"), (25_000_000, "25 ms"), (10**10, "10000 ms")]
+    ("gap", "told"), [(0, "0 ms"), (-1_000_000, "-1 ms"), (50_000_000, "50 ms"), (10**10, "10000 ms")]
 )
 def test_stamps_that_do_not_go_on_as_they_should_end_the_run(make: Callable[..., Bench], gap: int, told: str) -> None:
     bench = make()
 
     def shown(sample: Sample) -> Sample:
-        return sample if sample.cycle != MIDWAY else replace(sample, stamp_ns=sample.stamp_ns - 1_000_000 + gap)
+        return (
+            sample if sample.cycle != MIDWAY else replace(sample, stamp_ns=sample.stamp_ns - round(PERIOD * 1e9) + gap)
+        )
 
     bench.arm.shown = shown
     error = bench.fault()
@@ -162,7 +164,7 @@ def test_a_fault_carries_the_last_samples(make: Callable[..., Bench]) -> None:
     assert np.isnan(samples[-1].position[0])  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("begin", [100, 1900])
+@pytest.mark.parametrize("begin", [50, 950])
 def test_approach_and_return_are_guarded_too(make: Callable[..., Bench], begin: int) -> None:
     bench = make(Fault(begin, FaultKind.NAN_POSITION, 1))
     assert bench.fault().code == "feedback_not_finite"

@@ -76,16 +76,16 @@ def no_step_anywhere(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    "cycle", [pytest.param(200, marks=pytest.mark.campaign), MIDWAY, pytest.param(1900, marks=pytest.mark.campaign)]
+    "cycle", [pytest.param(100, marks=pytest.mark.campaign), MIDWAY, pytest.param(950, marks=pytest.mark.campaign)]
 )
 def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None:
     bench = make()
-    report = played(bench, Hands(((cycle, cycle + 600),)))
+    report = played(bench, Hands(((cycle, cycle + 300),)))
     assert report.state is State.DONE
     states = bench.story.states
     left = states[states.index("pausing") - 1]
     assert states[states.index("pausing") : states.index("pausing") + 4] == ["pausing", "paused", "resuming", left]
-    assert times(bench)["resuming"] == pytest.approx((LOOKED + cycle + 600) * PERIOD, abs=2.5 * PERIOD)
+    assert times(bench)["resuming"] == pytest.approx((LOOKED + cycle + 300) * PERIOD, abs=2.5 * PERIOD)
     no_step_anywhere(bench)
     stamps, paused = bench.story.column("stamp_ns") * 1e-9, times(bench)["paused"]
     standing = (stamps > paused) & (stamps < times(bench)["resuming"])
@@ -96,7 +96,7 @@ def test_a_pause_is_gone_on_from(make: Callable[..., Bench], cycle: int) -> None
 def test_the_whole_motion_is_made_in_spite_of_pauses(make: Callable[..., Bench], healthy: Healthy) -> None:
     bench = make()
     # Short enough that the second one strikes on the way back from the first.
-    report = played(bench, Hands(((700, 701), (1000, 1001), (1600, 1800))))
+    report = played(bench, Hands(((350, 351), (500, 501), (800, 900))))
     assert report.state is State.DONE
     assert bench.story.states.count("pausing") == 3
     assert bench.story.states[4:8] == ["pausing", "paused", "resuming", "pausing"]
@@ -114,17 +114,17 @@ def test_a_pause_wanted_for_a_moment_is_a_pause(make: Callable[..., Bench]) -> N
 
 def test_a_rehearsal_goes_on_as_slowly_as_it_went(make: Callable[..., Bench]) -> None:
     bench = make()
-    assert played(bench, Hands(((3000, 3500),)), speed=0.4).state is State.DONE
+    assert played(bench, Hands(((1500, 1750),)), speed=0.4).state is State.DONE
     stamps = bench.story.column("stamp_ns") * 1e-9
     velocity = bench.story.column("reference_velocity")[stamps > times(bench)["resuming"]]
     assert (np.abs(velocity) <= 0.4 * LIMITS.velocity * 1.001).all()
 
 
-@pytest.mark.parametrize(("pause", "stop"), [((700, 720), 720), ((700, 1400), 1200), ((700, 1000), 1200)])
+@pytest.mark.parametrize(("pause", "stop"), [((350, 360), 371), ((350, 700), 600), ((350, 500), 600)])
 def test_a_stop_is_obeyed_in_a_pause_too(make: Callable[..., Bench], pause: tuple[int, int], stop: int) -> None:
     bench = make()
     assert played(bench, Hands((pause,), stopped=stop)).state is State.STOPPED
-    before = {720: "pausing", 1200: "paused" if pause[1] == 1400 else "resuming"}[stop]
+    before = {371: "pausing", 600: "paused" if pause[1] == 700 else "resuming"}[stop]
     assert bench.story.states[-3:] == [before, "stopping", "stopped"]
     no_step_anywhere(bench)
 
@@ -137,12 +137,12 @@ def test_no_return_ends_the_pause(make: Callable[..., Bench], monkeypatch: pytes
     monkeypatch.setattr(Paused, "resume_in_slices", refused)
     bench = make()
     with pytest.raises(ArmFault, match="it swings") as caught:
-        played(bench, Hands(((700, 1500),)))
+        played(bench, Hands(((350, 750),)))
     assert caught.value.code == "no_way_back"
     assert bench.story.states[-3:] == ["paused", "stopping", "stopped"]
 
 
-@pytest.mark.parametrize("cycle", [300, MIDWAY, 1900])
+@pytest.mark.parametrize("cycle", [150, MIDWAY, 950])
 @pytest.mark.parametrize(("wish", "code"), [("gone", "lease_lost"), ("dead", "controls_failed")])
 def test_an_arm_that_nobody_watches_stops(make: Callable[..., Bench], wish: str, code: str, cycle: int) -> None:
     bench, latch = make(), ActiveFaults()
@@ -158,23 +158,23 @@ def test_an_arm_that_nobody_watches_stops(make: Callable[..., Bench], wish: str,
 def test_a_lease_lost_while_a_motion_is_planned_energises_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
     with pytest.raises(MotionRefused, match="the program that started the motion has ended"):
-        played(bench, Hands(gone=-1000))
+        played(bench, Hands(gone=-500))
     assert "armed" not in bench.story.states
 
 
 def test_a_lease_lost_in_a_pause_stops_and_one_lost_in_a_stop_is_nothing(make: Callable[..., Bench]) -> None:
     bench = make()
     with pytest.raises(ArmFault, match="lease_lost"):
-        played(bench, Hands(((700, FOREVER),), gone=1300))
+        played(bench, Hands(((350, FOREVER),), gone=650))
     assert bench.story.states[-3:] == ["paused", "stopping", "stopped"]
 
     class Leaving(Hands):
         @property
         def stop(self) -> bool:
-            return super().stop and self.cycle + LOOKED < 910
+            return super().stop and self.cycle + LOOKED < 455
 
     bench = make()
-    assert played(bench, Leaving(stopped=900, gone=920)).state is State.STOPPED
+    assert played(bench, Leaving(stopped=450, gone=460)).state is State.STOPPED
 
 
 def test_hold_to_run_is_a_short_lease(make: Callable[..., Bench]) -> None:
@@ -204,7 +204,7 @@ def test_stopped_means_that_the_arm_rests(make: Callable[..., Bench]) -> None:
     played(bench, Hands(stopped=MIDWAY))
     stopped = times(bench)["stopped"]
     before = [np.abs(moment.velocity) for moment in bench.truth if stopped - 0.015 <= moment.stamp_ns * 1e-9 <= stopped]
-    assert len(before) >= 15
+    assert len(before) >= 7
     assert (np.array(before) <= REST_SPEED * LIMITS.velocity).all()
 
 
@@ -223,7 +223,7 @@ def shaken(bench: Bench, begin: int, speed: float) -> None:
 
 def test_an_arm_that_does_not_come_to_rest_is_left_to_its_drives(make: Callable[..., Bench]) -> None:
     bench = make()
-    shaken(bench, MIDWAY + 100, 4.0 * REST_SPEED * LIMITS.velocity[0])
+    shaken(bench, MIDWAY + 50, 4.0 * REST_SPEED * LIMITS.velocity[0])
     with pytest.raises(
         ArmFault, match=r"^not_at_rest: shoulder: moves at .* rad/s 0.5 s after it was to rest: "
     ) as caught:
@@ -237,7 +237,7 @@ def test_an_arm_that_does_not_come_to_rest_is_left_to_its_drives(make: Callable[
 
 def test_a_pause_must_come_to_rest_too(make: Callable[..., Bench]) -> None:
     bench = make()
-    shaken(bench, MIDWAY + 100, 4.0 * REST_SPEED * LIMITS.velocity[0])
+    shaken(bench, MIDWAY + 50, 4.0 * REST_SPEED * LIMITS.velocity[0])
     with pytest.raises(ArmFault, match="not_at_rest"):
         played(bench, Hands(((MIDWAY - LOOKED, FOREVER),)))
     assert bench.story.states[-2:] == ["pausing", "faulted"]
@@ -245,7 +245,7 @@ def test_a_pause_must_come_to_rest_too(make: Callable[..., Bench]) -> None:
 
 def test_an_arm_that_is_pushed_while_it_is_held_is_left_to_its_drives(make: Callable[..., Bench]) -> None:
     bench = make()
-    shaken(bench, MIDWAY + 400, 3.0 * HOLD_SPEED * LIMITS.velocity[0])
+    shaken(bench, MIDWAY + 200, 3.0 * HOLD_SPEED * LIMITS.velocity[0])
     with pytest.raises(ArmFault, match=r"^hold_lost: shoulder: moves at ") as caught:
         played(bench, Hands(stopped=MIDWAY), hold_seconds=2.0)
     assert caught.value.code == "hold_lost"
@@ -253,7 +253,7 @@ def test_an_arm_that_is_pushed_while_it_is_held_is_left_to_its_drives(make: Call
 
 
 def test_an_arm_that_does_not_follow_is_lowered(make: Callable[..., Bench]) -> None:
-    bench, latch = make(Fault(700, FaultKind.LOAD_ATTACHED, None, None, 3.0)), ActiveFaults()
+    bench, latch = make(Fault(350, FaultKind.LOAD_ATTACHED, None, None, 3.0)), ActiveFaults()
     with pytest.raises(ArmFault, match="following_lost: ") as caught:
         played(bench, LocalCommands(), latch=latch)
     assert caught.value.code == "following_lost"
@@ -273,7 +273,7 @@ def test_a_latched_fault_refuses_the_next_run_until_it_is_acknowledged(make: Cal
         played(bench, LocalCommands(), latch=latch)
     (fault,) = latch.faults
     assert fault.cause.startswith("shoulder: position is not a number: ")
-    assert fault.since_ns == MIDWAY * 1_000_000
+    assert fault.since_ns == round(MIDWAY * PERIOD * 1e9)
     again = make()
     with pytest.raises(MotionRefused, match=r"unacknowledged faults: feedback_not_finite \(shoulder: "):
         played(again, LocalCommands(), latch=latch)
@@ -292,7 +292,7 @@ def test_rest_is_seen_in_all_samples_before_a_run(make: Callable[..., Bench]) ->
 
 
 def test_a_warning_is_reported_once_and_counted(make: Callable[..., Bench]) -> None:
-    bench = make(*(Fault(cycle, FaultKind.LOST_FEEDBACK, 1) for cycle in (700, 800, 900)))
+    bench = make(*(Fault(cycle, FaultKind.LOST_FEEDBACK, 1) for cycle in (350, 400, 450)))
     report = played(bench, LocalCommands())
     assert report.warnings == {"lost_feedback": 3}
     warnings = [message for _, level, message in bench.story.events if level == 30]

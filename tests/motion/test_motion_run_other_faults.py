@@ -26,7 +26,7 @@ Array = np.ndarray
 
 def test_a_recorder_that_is_behind_stops_the_arm(make: Callable[..., Bench]) -> None:
     bench = make()
-    bench.story.misbehave = lambda count: count < 850
+    bench.story.misbehave = lambda count: count < 425
     error = bench.fault()
     assert error.code == "recorder_behind"
     bench.stopped_under_control()
@@ -34,7 +34,7 @@ def test_a_recorder_that_is_behind_stops_the_arm(make: Callable[..., Bench]) -> 
 
 def test_a_recorder_that_knows_why_says_why(make: Callable[..., Bench]) -> None:
     bench = make()
-    bench.story.misbehave = lambda count: count < 850
+    bench.story.misbehave = lambda count: count < 425
     bench.story.error = "the recorder's process died"
     fault = bench.fault()
     assert fault.code == "recorder_behind"
@@ -43,8 +43,8 @@ def test_a_recorder_that_knows_why_says_why(make: Callable[..., Bench]) -> None:
 
 
 def test_a_warning_does_not_hide_that_the_recorder_is_behind(make: Callable[..., Bench]) -> None:
-    bench = make(Fault(LOOKED + 849, FaultKind.LOST_FEEDBACK, 0))
-    bench.story.misbehave = lambda count: count != 850
+    bench = make(Fault(LOOKED + 424, FaultKind.LOST_FEEDBACK, 0))
+    bench.story.misbehave = lambda count: count != 425
     assert bench.fault().code == "recorder_behind"
     bench.stopped_under_control()
 
@@ -54,7 +54,7 @@ def test_a_recorder_that_fails_stops_the_arm_under_control(make: Callable[..., B
     bench = make()
 
     def fail(count: int) -> bool:
-        if count >= 850:
+        if count >= 425:
             raise error
         return True
 
@@ -78,7 +78,7 @@ def test_events_that_cannot_be_kept_end_nothing(make: Callable[..., Bench]) -> N
 
 def test_every_notice_of_a_drive_is_reported_and_recorded_and_stops_nothing(make: Callable[..., Bench]) -> None:
     bench, words = make(), ["node 1: FF01h one", "node 2: FF02h another"]
-    cycles = {MIDWAY: words[0], MIDWAY + 300: words[1]}
+    cycles = {MIDWAY: words[0], MIDWAY + 150: words[1]}
 
     def informs(sample: Sample) -> Sample:
         said = cycles.get(sample.cycle)
@@ -92,7 +92,7 @@ def test_every_notice_of_a_drive_is_reported_and_recorded_and_stops_nothing(make
     assert all(said in message for said, message in zip(words, told, strict=True))
 
 
-@pytest.mark.parametrize("cycle", [250, MIDWAY, 1500])
+@pytest.mark.parametrize("cycle", [125, MIDWAY, 750])
 def test_a_stop_that_is_requested_is_controlled(make: Callable[..., Bench], cycle: int) -> None:
     bench = make()
     report = bench.run(lambda: len(bench.story.samples) >= cycle - LOOKED)
@@ -144,7 +144,7 @@ def test_a_mistake_in_the_control_law_takes_the_torque(
     bench, law = make(), ComputedTorque.torque
 
     def broken(self: ComputedTorque, *arguments: Any) -> Array:
-        if len(bench.arm.torques) > 500:
+        if len(bench.arm.torques) > 250:
             raise _Broken
         return law(self, *arguments)
 
@@ -166,13 +166,13 @@ def test_an_impossible_torque_never_leaves(
 
     def broken(self: ComputedTorque, *arguments: Any) -> Array:
         torque = law(self, *arguments)
-        return np.array([torque[0], wrong]) if len(bench.arm.torques) == 500 else torque
+        return np.array([torque[0], wrong]) if len(bench.arm.torques) == 250 else torque
 
     monkeypatch.setattr(ComputedTorque, "torque", broken)
     error = bench.fault()
     assert error.code == code
     assert "elbow" in str(error)
-    assert len(bench.arm.torques) == 500
+    assert len(bench.arm.torques) == 250
 
 
 def test_a_torque_beyond_the_limit_is_clipped_and_counted(
@@ -182,7 +182,7 @@ def test_a_torque_beyond_the_limit_is_clipped_and_counted(
 
     def strong(self: ComputedTorque, *arguments: Any) -> Array:
         torque = law(self, *arguments)
-        return 2.0 * LIMITS.torque if 500 <= len(bench.arm.torques) < 503 else torque
+        return 2.0 * LIMITS.torque if 250 <= len(bench.arm.torques) < 253 else torque
 
     monkeypatch.setattr(ComputedTorque, "torque", strong)
     report = bench.run()
@@ -202,7 +202,7 @@ def test_an_interrupt_takes_the_torque(make: Callable[..., Bench], where: str) -
         raise KeyboardInterrupt
 
     def later(count: int) -> bool:
-        return interrupt() if count == 850 else True
+        return interrupt() if count == 425 else True
 
     if where == "sample":
         bench.story.misbehave = later

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from motion_bench import JOINTS, LOOKED, PRIOR, bench_model
-from run_bench import HOME, LIMITS, MOTION, PERIOD, Bench, with_series
+from run_bench import HOME, LIMITS, MOTION, PERIOD, RATE, Bench, with_series
 
 from ident_service.errors import DriverError, MotionRefused
 from ident_service.excitation.motion_file import Excitation
@@ -62,7 +62,7 @@ def test_no_run_begins_where_a_position_is_no_number(make: Callable[..., Bench],
 
 def test_no_run_begins_without_prior_parameters(make: Callable[..., Bench]) -> None:
     bench = make()
-    bench.model = bench_model(prior=None)
+    bench.model = bench_model(**RATE, prior=None)
     _refused(bench, "prior parameters")
 
 
@@ -72,7 +72,7 @@ def test_no_run_begins_without_prior_parameters(make: Callable[..., Bench]) -> N
 def test_no_run_begins_without_its_limits(make: Callable[..., Bench], key: str) -> None:
     bench = make()
     elbow = {name: value for name, value in JOINTS["elbow"].items() if name not in (key, "home")}
-    bench.model = bench_model(joints=JOINTS | {"elbow": elbow})
+    bench.model = bench_model(**RATE, joints=JOINTS | {"elbow": elbow})
     _refused(bench, rf"joints\.elbow\.{key}")
 
 
@@ -83,7 +83,7 @@ def test_no_run_begins_that_cannot_reach_its_motion(make: Callable[..., Bench]) 
 
 def test_no_run_begins_where_the_arm_cannot_be_held(make: Callable[..., Bench]) -> None:
     bench = make()
-    bench.model = bench_model(prior=PRIOR | {"m2": 10.0, "lx2": -2.5, "Lyy2": 0.84, "Lzz2": 0.84})
+    bench.model = bench_model(**RATE, prior=PRIOR | {"m2": 10.0, "lx2": -2.5, "Lyy2": 0.84, "Lzz2": 0.84})
     # A motion that the arm could make if it were light enough where it stands now.
     series = replace(MOTION.path.series.scaled(0.0), q0=np.array([0.0, np.pi / 2]))
     motion = replace(with_series(series), arm_sha256=bench.model.config.motion_sha256)

@@ -73,7 +73,7 @@ def current_step(page: Page, reached: Reached) -> str:
 
 
 def test_from_the_first_page_to_the_urdf_and_back(browser: Browser, reached: Reached, place: Path) -> None:
-    known(reached, quick_text(ARM, 8))  # its motion takes some seconds of this machine's time
+    known(reached, quick_text(ARM, 16))  # its motion takes some seconds of this machine's time
     page = log_in(browser, reached)
     problems = list[str]()
     page.on("pageerror", lambda error: problems.append(str(error)))

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from compare.conftest import Ident
-from helpers.changed_arms import COARSE, changed, identified_folder, recorded_arm
+from helpers.changed_arms import changed, identified_folder, recorded_arm
 from helpers.once import made_once
 
 from ident_service.certificate_verifier import verify
@@ -34,6 +34,7 @@ TOOL = {
     "ly2": MASS * CENTER[1],
     "m2": MASS,
 }
+RATE = 250.0  # Hz; at half of it the tool is found, with another number in its first digit
 UNSEEN = {"Lxx2", "Lxy2", "Lxz2", "Lyy2", "Lyz2", "lz2"}
 
 
@@ -42,10 +43,10 @@ def arms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folders of results `bare` and `tooled`, recordings `bare.mcap` and `tooled.mcap`."""
 
     def make(folder: Path) -> None:
-        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=11), folder / "bare")
-        identified_folder(changed("planar2", rate=COARSE, periods=1, seed=12, added=TOOL), folder / "tooled")
-        recorded_arm(changed("planar2", rate=COARSE, periods=1, seed=13), folder / "bare.mcap")
-        recorded_arm(changed("planar2", rate=COARSE, periods=1, seed=14, added=TOOL), folder / "tooled.mcap")
+        identified_folder(changed("planar2", rate=RATE, periods=1, seed=11), folder / "bare")
+        identified_folder(changed("planar2", rate=RATE, periods=1, seed=12, added=TOOL), folder / "tooled")
+        recorded_arm(changed("planar2", rate=RATE, periods=1, seed=13), folder / "bare.mcap")
+        recorded_arm(changed("planar2", rate=RATE, periods=1, seed=14, added=TOOL), folder / "tooled.mcap")
 
     return made_once(tmp_path_factory, "payload", make)
 

@@ -10,8 +10,9 @@ from kill_bench import REAL, SLOW
 from ident_service.config.load import shipped_arms
 
 GAINS = "{kp: 225, kd: 30, following_error: 0.4}"
-# A quarter of the cycles of a real arm, with gains that are stable at this rate.
-COARSE = f"control: {{rate: 250}}\njoints: {{shoulder: {GAINS}, elbow: {GAINS}}}\n"
+# An eighth of the cycles of a real arm, with gains that are stable at this rate and the two cycles that a watchdog must
+# last.
+COARSE = f"control: {{rate: 125}}\njoints: {{shoulder: {GAINS}, elbow: {GAINS}}}\ndriver: {{watchdog: 0.016}}\n"
 
 
 def written(path: Path, motion: str) -> Path:
@@ -33,5 +34,5 @@ def real_arm(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def virtual_arm(tmp_path: Path) -> Path:
-    """The same in virtual time at 250 Hz, with motions of ten seconds."""
+    """The same in virtual time at 125 Hz, with motions of ten seconds."""
     return written(tmp_path / "virtual.yaml", "{kind: seeded, seed: 1, base_frequency: 0.2, harmonics: 5, periods: 2}")

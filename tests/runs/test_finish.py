@@ -99,7 +99,7 @@ def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     text = _report_text(report | {"until": {**report["until"], "missed": [missed, {"parameter": "m2", "share": None}]}})
     assert "target of 0.01%: missed by 2 parameters" in text
     assert f"\n  fv1: known to {missed['share']:.2%}\n  m2: not excited\n" in text
-    assert report["cycles"] > 2_500  # ten seconds of motion at 250 Hz
+    assert report["cycles"] > 1_250  # ten seconds of motion at 125 Hz
 
 
 @pytest.mark.slow

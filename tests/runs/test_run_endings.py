@@ -284,7 +284,7 @@ def test_a_refusal_stays_one_and_a_death_without_a_word_is_none(tmp_path: Path) 
 def loose(tmp_path: Path) -> list[str]:
     """Words of a run of an arm without brakes, which is held after a stop."""
     path = written(tmp_path / "loose.yaml", "{kind: seeded, seed: 1, base_frequency: 0.4, harmonics: 2, periods: 1}")
-    text = path.read_text().replace("{rate: 250}", "{rate: 250, after_stop: hold}")
+    text = path.read_text().replace("{rate: 125}", "{rate: 125, after_stop: hold}")
     path.write_text(text.replace("{kp:", "{brake: false, kp:"))
     write_checked_ticket(load_arm(path), tmp_path / "state")
     return ["run", str(path), "--out", str(tmp_path / "run"), "--state", str(tmp_path / "state")]

@@ -160,7 +160,7 @@ def test_a_rehearsal_is_the_same_path_at_a_fifth_of_the_speed(virtual_arm: Path,
     limits = load_arm(virtual_arm).joints
     recording = open_recording(tmp_path / "run" / "run.mcap", tuple(limits))
     position = np.concatenate([block.position for block in recording.blocks()])
-    fastest = np.abs(np.diff(position, axis=0)).max(axis=0) * 250.0
+    fastest = np.abs(np.diff(position, axis=0)).max(axis=0) * 125.0
     assert (fastest < 0.35 * np.array([joint.velocity for joint in limits.values()])).all()
 
 

@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from helpers.changed_arms import truth_of
 
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.errors import DriverError
+from ident_service.model.arm_model import arm_model
+from ident_service.model.pinocchio_models import InverseDynamics
 from sim_backend.plant_status import PlantStatus, read_status
 
 PATIENCE = 30.0
@@ -113,6 +116,22 @@ class Client:
         self.process.wait()
         assert self.process.stdout is not None
         self.process.stdout.close()
+
+
+def speed_of_held_torque(config: ArmConfig, status: PlantStatus, seconds: float) -> np.ndarray:
+    """Return how much faster each joint can become while the last torque, and gravity, act on for some time.
+
+    The inertia is the smallest that a joint has anywhere the arm was.
+    """
+    model = arm_model(config)
+    truth, names = truth_of(config), model.layout.names
+    dynamics = InverseDynamics(model.chain, model.layout, np.array([truth.get(name, 0.0) for name in names]))
+    still, most = np.zeros(model.chain.joints), np.zeros(model.chain.joints)
+    for share in np.random.default_rng(0).random((100, model.chain.joints)):
+        position = status.lowest + share * (status.highest - status.lowest)
+        acting = status.silent_peak_torque + np.abs(dynamics.torque(position, still, still))
+        most = np.maximum(most, np.abs(np.linalg.inv(dynamics.mass_matrix(position))) @ acting)
+    return most * seconds
 
 
 def limits(config: ArmConfig) -> tuple[np.ndarray, np.ndarray]:
