@@ -196,6 +196,8 @@ class Capabilities:
         unknown = "unknown"
         torque = unknown if self.torque is None else f"mode {self.torque.mode} by {named(self.torque.target)}"
         count = unknown if self.count is None else f"{self.count:.6g} N m"
+        if self.family.unit is not None and self.family.unit.writable:
+            count = "as described"  # from opening on: what the drive held before is gone
         limit = unknown if self.limit is None else named(self.limit.entry)
         speed = "none" if self.speed is None else where(self.speed)
         status = "with the position" if self.beside else "by timer" if self.event else "by SYNC"

@@ -146,7 +146,7 @@ def plan_reduced_trajectory(start: Setpoint, end: Setpoint, limits: MotionLimits
 def plan_reduced_trajectory_in_slices(
     start: Setpoint, end: Setpoint, limits: MotionLimits
 ) -> Generator[None, None, RuckigReference]:
-    """Plan as `plan_reduced_trajectory` does, in slices short enough for a control cycle; the generator returns the trajectory.
+    """Plan the same in slices short enough for a control cycle; the generator returns the trajectory.
 
     Raises:
         MotionRefused: as `way`, from any of its steps.

@@ -76,6 +76,18 @@ def check_nothing_is_open(bench: Bench) -> None:
     bench.behind.link(0).close()  # the bus is free
 
 
+def test_drives_are_the_same_for_a_ticket_when_they_are_opened_again() -> None:
+    """Opening writes their rated torque; what they held when they got power is gone then."""
+    told = weightless_config(drives=drives(rated_torque=0.5))
+    behind = LockStepArm(told)
+
+    def identities() -> tuple[str, ...]:
+        with CanopenArm(told, lambda _: [behind.link(0)]) as arm:
+            return arm.describe().identities
+
+    assert identities() == identities()
+
+
 @pytest.mark.parametrize(
     ("key", "asked", "words"),
     [

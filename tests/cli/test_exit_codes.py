@@ -182,7 +182,7 @@ def test_an_interrupt_that_was_caught_in_an_import_is_not_how_the_command_ends(t
     """Modules that are loaded late run strings; Python would end by SIGINT although the command has its own answer."""
     (tmp_path / "sitecustomize.py").write_text(_CAUGHT)
     paths = os.pathsep.join((str(tmp_path), *(path or str(Path.cwd()) for path in sys.path)))
-    words = [sys.executable, "-m", "ident_service", "arms", "--json", "--state", str(tmp_path / "state")]
+    words = [sys.executable, "-X", "utf8", "-m", "ident_service", "arms", "--json", "--state", str(tmp_path / "state")]
     done = subprocess.run(words, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["exit_code"] == 0
