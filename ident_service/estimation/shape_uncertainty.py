@@ -86,7 +86,7 @@ def shape_uncertainty(
         recordings: that both were fitted to.
         model: the arm, the shape of its friction as numbers.
         base: grouping of its parameters.
-        fitted: which of the numbers were fitted, as `to_be_fitted` names them.
+        fitted: which of the numbers were fitted, as `fitted_friction_parameters` names them.
         beta: base parameters, shape (base,).
         weights: per joint, what its equations are multiplied by, shape (joints,).
         torque_scales: what each joint's measured torque is multiplied by, shape (joints,).
