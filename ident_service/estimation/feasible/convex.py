@@ -299,7 +299,7 @@ class _Posed:
         )
 
     def _active(self) -> tuple[str, ...]:
-        """Return the names of the active constraints, custom ones too, by multiplier as `formulation.active_constraints` does."""
+        """Return the names of the active constraints, custom ones too, by multiplier as `active_constraints` does."""
         named = [(block.name, one) for block, one in zip(self._conditions.blocks, self._blocks, strict=True)]
         if self._custom is not None:
             named += [(f"{self._custom.name}, constraint {k}", one) for k, one in enumerate(self._known, 1)]
