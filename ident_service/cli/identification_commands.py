@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import atexit
 import gc
+import importlib.util
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -36,12 +36,11 @@ if TYPE_CHECKING:
     from ident_service.estimation.identify import Estimate
     from ident_service.estimation.plausibility import Objections
 
-# Two packages of scipy load all of their modules, which took a tenth of the time of `ident identify`; of them it uses
-# LAPACK and one distribution.
 _COLLECT_AFTER = 200_000  # objects more than before; Python's own 700 are for programs that make few that stay
 _NO_PLUGINS = {"PYDANTIC_DISABLE_PLUGINS": "__all__"}  # pydantic reads what every installed package says to find them
-
-_PARTLY = ("scipy.linalg", "scipy.special")  # Clarabel and estimates take LAPACK of the one, Student's t of the other
+# These load all of their modules, a tenth of the time of `ident identify`, which takes LAPACK of the one (as Clarabel
+# does) and Student's t of the other.
+_PARTLY = ("scipy.linalg", "scipy.special")
 
 
 def _add_commission(verbs: VerbList) -> None:
@@ -186,8 +185,8 @@ def quick_imports() -> Iterator[None]:
     Modules make objects that stay, and looks at them are a twentieth of the time.
     """
     for name in _PARTLY:
-        if name not in sys.modules and (spec := find_spec(name)) is not None:
-            package = module_from_spec(spec)
+        if name not in sys.modules and (spec := importlib.util.find_spec(name)) is not None:
+            package = importlib.util.module_from_spec(spec)
             package.__class__ = _Package
             sys.modules[name] = package
             parent, _, last = name.rpartition(".")
@@ -348,7 +347,7 @@ def _fleet_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _fleet_request(arguments: argparse.Namespace, **more: Any) -> Any:
-    missing = [name for name in ("distributed", "fsspec", "pyarrow") if find_spec(name) is None]
+    missing = [name for name in ("distributed", "fsspec", "pyarrow") if importlib.util.find_spec(name) is None]
     if missing:
         raise UsageError(f"{', '.join(missing)} is not installed; pip install 'ident-service[fleet]'")
     from ident_service.fleet.reduction import FleetRequest
