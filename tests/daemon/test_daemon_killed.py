@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from daemon.conftest import checked_before, patient_text, quick_text, serving
@@ -71,6 +72,17 @@ def _renewed(client: IdentClient, job: str) -> None:
             raise
 
 
+def settled(client: IdentClient, job: str) -> dict[str, Any]:
+    """Wait until a restarted daemon knows what became of a job, and return the job."""
+    until = time.monotonic() + 90.0
+    while True:
+        seen = client.get(f"/api/v1/jobs/{job}").json()
+        if "being looked for" not in seen["detail"] and seen["state"] not in ("queued", "running"):
+            return dict(seen)
+        assert time.monotonic() < until, seen
+        time.sleep(0.1)
+
+
 def kill_once(state: Path, seed: int) -> str:
     """One kill; what became of the job."""
     chance = random.Random(seed)  # noqa: S311 - a seeded choice
@@ -91,14 +103,8 @@ def kill_once(state: Path, seed: int) -> str:
         # What waited to move an arm is not begun by a restart.
         now = again.get(f"/api/v1/jobs/{waiting}").json()["state"]
         assert now == ("interrupted" if before[waiting] in ("queued", "running") else before[waiting])
-        until = time.monotonic() + 90.0
-        while True:
-            seen = again.get(f"/api/v1/jobs/{job}").json()
-            looked_for = "being looked for" in seen["detail"] or seen["state"] in ("queued", "running")
-            if not looked_for:
-                break
-            assert time.monotonic() < until, seen
-            time.sleep(0.1)
+        seen = settled(again, job)
+        settled(again, waiting)  # which may have begun to move the arm when the job before it was done
         if before[job] == "running":
             assert seen["state"] == "interrupted"
         elif before[job] == "queued":

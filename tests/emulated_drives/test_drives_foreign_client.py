@@ -26,6 +26,7 @@ class Bus:
 
     def boot(self, node: canopen.RemoteNode) -> None:
         self.network.add_node(node)
+        node.sdo.RESPONSE_TIMEOUT = 20.0  # or a busy machine's drives answer too late
         self._power_up()
         deadline = time.monotonic() + 20.0
         while node.nmt.timestamp is None:  # `wait_for_bootup` misses a message that came before it listened

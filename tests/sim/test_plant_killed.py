@@ -32,7 +32,8 @@ def killed(tmp_path, delay, **driver):
 def killed_story(tmp_path, delay, **driver):
     """Kill a client in the middle of a motion; what holds wherever that was, and what the plant said last."""
     path, bus = tmp_path / "status", f"kill-{os.getpid()}-{tmp_path.name}"
-    config = remote_config(status=str(path), bus=bus, watchdog=WATCHDOG, **driver)
+    # A machine that stalls may keep the client waiting for its plant; what follows the kill is looked at here.
+    config = remote_config(status=str(path), bus=bus, watchdog=WATCHDOG, deadline=10.0, **driver)
     client = Client(config)
     time.sleep(delay)
     running = read_status(path)
