@@ -294,7 +294,7 @@ _PER_WAY = 24  # samples of a search per segment between postures
 _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
 _MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
-_LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows
+_LOOKING, _LOOK = 0.2, 6.0  # of the time, and at most [s], for a first motion whose proof says how the arm follows
 _SOFT = 3.0  # times the stiffness that a joint lacks to follow at its velocity limit
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
@@ -512,23 +512,22 @@ def _searched(
     def left() -> float:
         return np.inf if budget.seconds is None else budget.seconds - (budget.clock() - begun)
 
-    def part(share: float) -> Budget:
-        return budget if budget.seconds is None else replace(budget, seconds=share * budget.seconds)
-
     aimed, looked = task, earlier
     before: tuple[Candidate, ...] = ()
-    if budget.seconds is not None and budget.starts is None and earlier is None:
-        # What the proof of a first motion finds to be missing is kept free from then on.
-        looked = search(task, safe, seed, part(_LOOKING), per, tell, cancelled)
-        if looked.candidates[0].start >= 0 and not cancelled():
-            aimed = prover.aimed(looked.candidates[0])
-        if aimed is not task:
-            before, looked = looked.candidates, None
-        first = part(1.0 - _LOOKING - _MENDING)
-    else:
-        first = part(1.0 - _MENDING)
-    found = search(aimed, prover.safe(aimed), seed, first, per, tell, cancelled, looked)
-    kept_back = None if budget.seconds is None else _MENDING * budget.seconds
+    seconds = kept_back = None
+    if budget.seconds is not None:
+        kept_back = _MENDING * budget.seconds
+        seconds = budget.seconds - kept_back
+        if budget.starts is None and earlier is None:
+            # What the proof of a first motion finds to be missing is kept free from then on.
+            look = min(_LOOK, _LOOKING * budget.seconds)
+            looked = search(task, safe, seed, replace(budget, seconds=look), per, tell, cancelled)
+            if looked.candidates[0].start >= 0 and not cancelled():
+                aimed = prover.aimed(looked.candidates[0])
+            if aimed is not task:
+                before, looked = looked.candidates, None
+            seconds -= look
+    found = search(aimed, prover.safe(aimed), seed, replace(budget, seconds=seconds), per, tell, cancelled, looked)
     best = prover.best_of(found.candidates, per, kept_back, cancelled, task=aimed)
     # What the first look came to may be better, made smaller, than what a short or cancelled search came to after it.
     best = prover.best_of(before[:1], per, 0.0, cancelled, best)

@@ -10,9 +10,10 @@ result however the rounds went.
 It runs in one process and has no clock of its own; the caller decides when to stop.
 
 Start number k of seed s is always the same motion to begin with, so that a search bounded by starts gives the same
-result every time, and one bounded by time can be resumed. Starts take a quarter of the time, because polishing gains
-more than the best of many starts is better than the first. What time is left when the best are polished goes to further
-starts, which are polished in their turn.
+result every time, and one bounded by time can be resumed. Time is spent in rounds, each as long as all before it, so
+that a longer search begins as a shorter one does and finds no less. Starts take a quarter of a round, because polishing
+gains more than the best of many starts is better than the first. What time is left when the best are polished goes to
+further starts, which are polished in their turn; a polish that a round cuts short goes on in the next.
 """
 
 from __future__ import annotations
@@ -238,7 +239,8 @@ def within_limits(problem: Problem, coefficients: Array) -> bool:
 
 _KEPT = 8  # best candidates
 _POLISHED = 4
-_STARTS_SHARE = 0.25
+_FIRST_ROUND = 18.0  # s
+_STARTS_SHARE = 0.25  # of a round
 _STARTS_TAKE = 0.5  # of all the time, where their number is given
 _FINER = 2  # the grid of the polish against that of the starts
 _TICK = 0.2
@@ -338,11 +340,12 @@ def search(
     begun = budget.clock()
     run = _Run(task, safe, seed, budget, begun, tell, cancelled, earlier)
     with _worker_pool(task, safe, seed, budget, per_period, cancelled) as workers:
-        run.starts(workers)
-        run.polish(workers)
-        while run.has_time_for_starts():
-            run.starts(workers)
-            run.polish(workers)
+        for end in run.round_ends():
+            run.starts(workers, end)
+            run.polish(workers, end)
+            while end is not None and run.has_time_for_starts(end):
+                run.starts(workers, end)
+                run.polish(workers, end)
     return run.found()
 
 
@@ -407,15 +410,25 @@ class _Run:
         elapsed = self._before + self._budget.clock() - self._begun
         return SearchResult(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
-    def has_time_for_starts(self) -> bool:
-        """Return whether there is time for further starts, and the budget allows them."""
-        seconds, starts = self._budget.seconds, self._budget.starts
-        return seconds is not None and starts is None and not self._over(self._begun + seconds)
+    def round_ends(self) -> Iterator[float | None]:
+        """Yield the time at which each round ends: twice as late each time, at last when the search does."""
+        seconds = self._budget.seconds
+        if seconds is None or self._budget.starts is not None:
+            yield None if seconds is None else self._begun + seconds
+            return
+        passed = 0.0
+        while passed < seconds and not self._over(None):
+            passed = min(seconds, 2.0 * passed or _FIRST_ROUND)
+            yield self._begun + passed
 
-    def starts(self, workers: _WorkerPool) -> None:
-        """Run starts in a share of the time that is left, or as many as are asked for."""
-        seconds, now = self._budget.seconds, self._budget.clock()
-        until = None if seconds is None else now + _STARTS_SHARE * (self._begun + seconds - now)
+    def has_time_for_starts(self, end: float) -> bool:
+        """Return whether there is time for further starts in a round, and the budget allows them."""
+        return self._budget.starts is None and not self._over(end)
+
+    def starts(self, workers: _WorkerPool, end: float | None) -> None:
+        """Run starts in a share of the time that is left of a round, or as many as are asked for."""
+        now = self._budget.clock()
+        until = None if end is None else now + _STARTS_SHARE * (end - now)
         last = None if self._budget.starts is None else self._first + self._budget.starts
         running: set[Future[Candidate]] = set()
         while True:
@@ -430,11 +443,9 @@ class _Run:
                 self._finished += 1
                 self._take(candidate)
 
-    def polish(self, workers: _WorkerPool) -> None:
-        until = None if self._budget.seconds is None else self._begun + self._budget.seconds
+    def polish(self, workers: _WorkerPool, until: float | None) -> None:
         running: set[Future[Candidate]] = set()
         waiting = [one for one in self._best if one.start not in self._polished][:_POLISHED]
-        self._polished |= {one.start for one in waiting}
         while (waiting or running) and not self._broken:
             while waiting and len(running) < self._budget.workers and not self._over(until):
                 running.add(workers.submit(waiting[0].start, waiting.pop(0), until))
@@ -442,6 +453,8 @@ class _Run:
                 return
             for candidate in self._finished_of(workers, running, "polish"):
                 self._take(candidate)
+                if not self._over(until):
+                    self._polished.add(candidate.start)
 
     def _over(self, until: float | None) -> bool:
         return self._broken or self._cancelled() or (until is not None and self._budget.clock() >= until)

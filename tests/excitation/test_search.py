@@ -42,10 +42,10 @@ def searched(number: int) -> tuple[SearchResult, tuple[Progress, ...]]:
     return starts(number, tell=told.append), tuple(told)
 
 
-def ticking() -> Callable[[], float]:
-    """A clock that goes on by two milliseconds whenever the search looks at it."""
+def ticking(tick: float = 2e-3) -> Callable[[], float]:
+    """A clock that goes on by some seconds whenever the search looks at it."""
     ticks = count()
-    return lambda: 2e-3 * next(ticks)
+    return lambda: tick * next(ticks)
 
 
 def assert_same(one: SearchResult, other: SearchResult) -> None:
@@ -153,6 +153,17 @@ def test_a_budget_of_time_is_kept() -> None:
     assert 0.6 < found.seconds < 1.05
     assert found.finished > 0
     assert within_limits(COARSE, found.candidates[0].coefficients)
+
+
+@pytest.mark.slow
+def test_twice_the_time_begins_as_half_of_it_does_and_finds_no_less() -> None:
+    shorter, longer = (
+        starts(None, seconds=seconds, clock=ticking(0.05), seed=0).candidates for seconds in (18.0, 36.0)
+    )
+    assert longer[0].value <= shorter[0].value
+    # Each start of the shorter search is polished on, or has been driven out by eight that are better.
+    after = {candidate.start: candidate.value for candidate in longer}
+    assert all(after.get(one.start, longer[-1].value) <= one.value + 1e-12 for one in shorter)
 
 
 def test_a_budget_too_short_for_a_single_climb_still_has_a_candidate() -> None:
