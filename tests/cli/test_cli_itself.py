@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from cli.conftest import COARSE, Commissioned, Ident, Samples, left_over, quick_arm
 
 from ident_service import __version__
-from ident_service.cli import main, parser
+from ident_service.cli import GROUPS, main, parser
+from ident_service.cli.arguments import Parser
 
 
 @pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])
@@ -67,6 +70,21 @@ def test_home_zero_is_set_home() -> None:
     assert formerly.verb is now.verb
     assert formerly.zero
     assert now.zero
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
+def test_a_verb_is_parsed_with_its_group_alone_as_with_all(group: ModuleType) -> None:
+    alone, every = parser(GROUPS[group][0]), parser()
+    assert tuple(alone.shown) == GROUPS[group]
+    for verb in GROUPS[group]:
+        assert _verbs(alone)[verb].format_help() == _verbs(every)[verb].format_help()
+    for words in ("check", "--version", "no-such-verb", "--json"):
+        assert _verbs(parser(words)).keys() == _verbs(every).keys()
+
+
+def _verbs(top: Parser) -> dict[str, Parser]:
+    (action,) = (one for one in top._actions if isinstance(one, argparse._SubParsersAction))
+    return dict(action.choices)
 
 
 def test_version(ident: Ident) -> None:
