@@ -181,7 +181,7 @@ def test_help_loads_no_large_library(words: list[str]) -> None:
 
 # What the common case may load: a quarter of its processor time is imports. Every other package waits for who needs it.
 IDENTIFY_LOADS = {
-    *("ident_service", "numpy", "pinocchio", "coal", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
+    *("ident_service", "numpy", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
     *("pydantic", "pydantic_core", "annotated_types", "typing_extensions", "typing_inspection"),  # configurations
     *("jinja2", "markupsafe"),  # the report
     "mcap",  # recordings; of CSV its numbers of records alone
@@ -192,14 +192,25 @@ IDENTIFY_LOADS = {
     *("cmeel_pth", "sitecustomize", "usercustomize", "distutils-precedence"),  # of environments
 }
 NOT_OF_PYTHON = {"urllib.request", "http.client", "ssl", "xml.sax", "sqlite3", "asyncio", "multiprocessing"}
-# Packages load LAPACK and Student's t alone, and neither drivers nor MCAP's formats serve one who reads CSV.
+# Packages load LAPACK and Student's t alone; drivers, their sections and MCAP's formats serve nobody who reads CSV.
 NOT_OF_SCIPY = {"scipy._lib._array_api", "scipy.linalg._basic", "scipy.special._support_alternative_backends"}
-NOT_FOR_CSV = {"mcap.records", "mcap.writer", "zstandard", "lz4", "drivers.arm", "ident_service.motion.faults"}
+NOT_FOR_CSV = {
+    *("mcap.records", "mcap.writer", "zstandard", "lz4", "drivers.arm", "ident_service.motion.faults"),
+    *("ident_service.config.canopen", "ident_service.config.barrett"),
+}
 
 
 @pytest.mark.slow
 def test_identification_loads_what_it_needs(quick: Commissioned, samples: Samples, tmp_path: Path) -> None:
-    words = ["identify", str(samples.write(tmp_path / "run.csv")), "--arm", str(quick.arm), "--json", "--delay", "0"]
+    words = [
+        "identify",
+        str(samples.write(tmp_path / "run.csv")),
+        "--arm",
+        str(quick.arm),
+        "--json",
+        "--delay",
+        "0.001",
+    ]
     program = (
         "import sys\n"
         "from ident_service.cli import main\n"
