@@ -27,16 +27,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ident_service.config.load import load_arm
-from ident_service.config.quantities import TextFile
 from ident_service.errors import IdentError, ModelError
 from ident_service.model.arm_model import ArmModel, arm_model
-from ident_service.model.dynamic_model import read_back
 from ident_service.model.urdf import urdf_text
 from ident_service.results.export import urdf as urdf_file
 from ident_service.results.export.bodies import is_real, moved
 from ident_service.results.export.identified_arm import IdentifiedArm
-from ident_service.results.export.round_trip import gravity_of, supported_terms
-from ident_service.results.export.urdf import original_urdf, urdf_export, write_urdf, written_arm, xml_places
+from ident_service.results.export.round_trip import supported_terms
+from ident_service.results.export.urdf import original_urdf, urdf_export, xml_places
 
 Array = np.ndarray
 
@@ -398,48 +396,3 @@ def test_comments_stand_at_the_end_and_once(tmp_path: Path) -> None:
     again = arm_of_file(tmp_path, "urdf", text)
     assert urdf_export(again, delta, "a.urdf", said)[0] == text
     assert urdf_export(again, delta, "a.urdf")[0] == bare
-
-
-def test_a_new_file_is_read_back_as_pinocchio_reads_it() -> None:
-    """`identify` reads what it wrote by the reader here, and saves itself the tenth of a second of pinocchio."""
-    rng = np.random.default_rng(5)
-    models = [arm_model(load_arm("wam7")), *(model_around(random_chain(rng, 1 + number % 7)) for number in range(20))]
-    for model in models:
-        file = TextFile(name="new.urdf", text=urdf_text(model, random_delta(rng, model.layout)))
-        ours, theirs = written_arm(file, gravity_of(model)), read_back(file, "urdf", gravity_of(model))
-        order = [theirs.chain.names.index(name) for name in ours.chain.names]  # pinocchio sorts branches by name
-        for arm, places in ((ours, range(len(order))), (theirs, order)):
-            hang_on = {arm.chain.names[k]: ("", *arm.chain.names)[arm.chain.parents[k] + 1] for k in places}
-            assert hang_on == dict(zip(model.chain.names, _carriers(model), strict=True))
-            assert [arm.chain.revolute[k] for k in places] == list(model.chain.revolute)
-        np.testing.assert_array_equal(ours.chain.gravity, theirs.chain.gravity)
-        for key in ("axes", "rotation", "translation", "link_rotation", "link_translation"):
-            np.testing.assert_allclose(getattr(ours.chain, key), getattr(theirs.chain, key)[order], atol=1e-14)
-        for key in ("bodies", "armature", "damping", "friction"):
-            np.testing.assert_allclose(getattr(ours, key), getattr(theirs, key)[order], rtol=1e-11, atol=1e-12)
-
-
-def _carriers(model: ArmModel) -> list[str]:
-    return [("", *model.chain.names)[parent + 1] for parent in model.chain.parents]
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        ('type="continuous"', 'type="fixed"', "not of the kind that is written here"),
-        ('<axis xyz="0.0 0.0 1.0" />', '<mimic joint="shoulder"/>', "not of the kind that is written here"),
-        ('<mass value="', '<mass of="', "torques are up to"),
-        ("</inertial>", "</inertial><!DOCTYPE a>", "refused in a URDF"),
-        ('damping="', 'damping="x', "damping is 'x"),
-    ],
-)
-def test_what_is_not_written_here_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, said: str
-) -> None:
-    model = arm_model(load_arm("planar2"))
-    text = urdf_text(model, some_delta(model)).replace('type="revolute"', 'type="continuous"')
-    assert old in text, text
-    monkeypatch.setattr(urdf_file, "urdf_text", lambda *_: text.replace(old, new, 1))
-    with pytest.raises(ModelError, match=said):
-        write_urdf(tmp_path / "new.urdf", model, some_delta(model))
-    assert list(tmp_path.iterdir()) == []

@@ -25,9 +25,8 @@ from ident_service.config.arm import JointTerm
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
-from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.mechanism import count_mechanism, require_urdf
-from ident_service.model.parameter_layout import WrittenArm, about_center, joint_drives
+from ident_service.model.chain import Array
+from ident_service.model.parameter_layout import about_center, joint_drives
 from ident_service.model.solids import rotation_rpy
 from ident_service.model.urdf import urdf_text
 from ident_service.results.export.bodies import about_origin, is_real, joint_bodies, moved
@@ -304,15 +303,11 @@ def _origin(element: Element | None, name: str) -> tuple[Array, Array]:
     return rotation_rpy(roll, pitch, yaw), _numbers(attributes.get("xyz", "0 0 0"), name)
 
 
-def _axis(joint: Element, name: str) -> Array:
-    element = joint.first("axis")
-    axis = _numbers("1 0 0" if element is None else element.attributes.get("xyz", "1 0 0"), name)
-    return np.asarray(axis / np.linalg.norm(axis))
-
-
 def _moved_by(joint: Element, position: float, name: str) -> tuple[Array, Array]:
     """Return rotation, shape (3, 3), and translation [m], shape (3,), of a joint at a position [rad or m]."""
-    axis = _axis(joint, name)
+    element = joint.first("axis")
+    axis = _numbers("1 0 0" if element is None else element.attributes.get("xyz", "1 0 0"), name)
+    axis = axis / np.linalg.norm(axis)
     if joint.attributes.get("type") == "prismatic":
         return np.eye(3), position * axis
     cross = np.cross(np.eye(3), axis)
@@ -387,15 +382,9 @@ _TERMS: tuple[JointTerm, ...] = ("viscous", "coulomb")
 
 
 def urdf_export(
-    model: ArmModel,
-    delta: Array,
-    name: str,
-    said: tuple[str, ...] = (),
-    motion: RecordedMotion | None = None,
-    *,
-    own_reader: bool = False,
+    model: ArmModel, delta: Array, name: str, said: tuple[str, ...] = (), motion: RecordedMotion | None = None
 ) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
-    """Return the identified URDF, after it was read back with the same torques.
+    """Return the identified URDF, after pinocchio has read it back with the same torques.
 
     Args:
         model: the arm.
@@ -403,8 +392,6 @@ def urdf_export(
         name: of the file, for errors.
         said: of its bodies, for a comment at its end.
         motion: that the arm was identified from, which says how large the torque of what is lost is.
-        own_reader: whether a new file is read back by `written_arm`, which loads no library; else pinocchio reads it,
-            as it always does the arm's own file.
 
     Returns:
         The text, what it does not carry, and notes.
@@ -412,6 +399,8 @@ def urdf_export(
     Raises:
         ModelError: a link has no positive mass, or the file does not say what it should.
     """
+    from ident_service.model.dynamic_model import read_back
+
     has = supported_terms(model, delta, _TERMS)
     notes: tuple[str, ...] = ()
     own = model.config.kinematics if model.config.kinematics.urdf is not None else None
@@ -422,65 +411,9 @@ def urdf_export(
     gravity = "gravity" if model.chain.gravity.any() else ""
     unwritten = unsupported_terms(model, delta, has, motion)
     text = _commented(text, (*presliding_left_out(model, delta), *said))
-    file = TextFile(name=name, text=text)
-    if own_reader and own is None:
-        written = written_arm(file, gravity_of(model))
-    else:
-        from ident_service.model.dynamic_model import read_back  # pinocchio loads for 0.1 s
-
-        written = read_back(file, "urdf", gravity_of(model), own)
+    written = read_back(TextFile(name=name, text=text), "urdf", gravity_of(model), own)
     require_same_torques(model, delta, written, has, name)
     return text, tuple(filter(None, (gravity, *unwritten))), notes
-
-
-_TYPES = {"revolute": True, "continuous": True, "prismatic": False}
-
-
-def written_arm(file: TextFile, gravity: tuple[float, float, float]) -> WrittenArm:
-    """Read a URDF as `urdf_text` writes it: one link that does not move, and one with a body for every joint.
-
-    Args:
-        file: what was written.
-        gravity: in the base frame [m/s^2].
-
-    Raises:
-        ModelError: what no reader of URDF would accept, or anything that `urdf_text` does not write: a joint that does
-            not move or mimics another, a link without a body, a joint before the one that carries it.
-    """
-    count_mechanism(file, "urdf")
-    require_urdf(file)
-    root = xml_places(file.text, file.name)
-    links = {link.attributes["name"]: link for link in root.all("link")}
-    joints = list(root.all("joint"))
-    carried = [_named(joint, "child", file.name) for joint in joints]
-    n = len(joints)
-    parents, bodies = list[int](), np.zeros((n, 10))
-    axes, rotation, translation = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3))
-    drives = {"damping": np.zeros(n), "friction": np.zeros(n)}
-    for k, joint in enumerate(joints):
-        parent, body = _named(joint, "parent", file.name), _ten(links[carried[k]], file.name)
-        if joint.attributes["type"] not in _TYPES or joint.first("mimic") is not None or body is None:
-            name = joint.attributes["name"]
-            raise ModelError(f"{file.name}: joint {name!r} is not of the kind that is written here, or carries no body")
-        parents.append(carried.index(parent) if parent in carried else WORLD)
-        bodies[k] = body
-        axes[k] = _axis(joint, file.name)
-        rotation[k], translation[k] = _origin(joint.first("origin"), file.name)
-        if (dynamics := joint.first("dynamics")) is not None:
-            for key, values in drives.items():
-                values[k] = float(dynamics.attributes.get(key, "0"))
-    chain = Chain(
-        names=tuple(joint.attributes["name"] for joint in joints),
-        parents=tuple(parents),
-        revolute=tuple(_TYPES[joint.attributes["type"]] for joint in joints),
-        axes=axes,
-        rotation=rotation,
-        translation=translation,
-        link_rotation=np.tile(np.eye(3), (n, 1, 1)),
-        link_translation=np.zeros((n, 3)),
-        gravity=np.array(gravity),
-    )
-    return WrittenArm(chain, bodies, np.zeros(n), drives["damping"], drives["friction"])
 
 
 def _commented(text: str, said: tuple[str, ...]) -> str:
@@ -492,7 +425,7 @@ def _commented(text: str, said: tuple[str, ...]) -> str:
 
 
 def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
-    """Write the identified URDF, after it was read back with the same torques.
+    """Write the identified URDF, after pinocchio has read it back with the same torques.
 
     Args:
         path: the file.
@@ -503,5 +436,5 @@ def write_urdf(path: Path, model: ArmModel, delta: Array) -> None:
         ModelError: a link has no positive mass, or the file does not say what it should.
         UsageError: the file cannot be written.
     """
-    text, _, _ = urdf_export(model, delta, str(path), own_reader=True)
+    text, _, _ = urdf_export(model, delta, str(path))
     write_atomically(path, text)
