@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import atexit
 import gc
 import importlib.util
 import os
@@ -193,12 +192,13 @@ def quick_imports() -> Iterator[None]:
             setattr(sys.modules[parent], last, package)
     plugins = {name: os.environ.get(name) for name in _NO_PLUGINS}
     os.environ.update(_NO_PLUGINS)
-    atexit.register(gc.freeze)  # nor when the process ends
+    gc.unfreeze()
     usual = gc.get_threshold()
     gc.set_threshold(_COLLECT_AFTER, *usual[1:])
     try:
         yield
     finally:
+        gc.freeze()  # or all of these objects would be looked at now, and again when the process ends
         gc.set_threshold(*usual)
         for name, value in plugins.items():
             if value is None:

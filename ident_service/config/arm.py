@@ -7,21 +7,22 @@ Sousa & Cortesao 2014 have their place here.
 from __future__ import annotations
 
 import hashlib
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard
 
 from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     Tag,
+    TypeAdapter,
     ValidationInfo,
     field_validator,
     model_validator,
 )
+from pydantic_core import core_schema
 
-from ident_service.config.barrett import BarrettDriver
-from ident_service.config.can_bus import CanBus
-from ident_service.config.canopen import CanopenDriver
 from ident_service.config.control import Control, Realtime
 from ident_service.config.kinematics import Kinematics
 from ident_service.config.motion_design import Design, Geometry, Supply, Workspace
@@ -43,6 +44,11 @@ from ident_service.config.quantities import (
 from ident_service.config.recording import RecordingFormat, Transmission
 from ident_service.config.simulation import SimulatedDriver
 
+if TYPE_CHECKING:
+    from ident_service.config.barrett import BarrettDriver
+    from ident_service.config.can_bus import CanBus
+    from ident_service.config.canopen import CanopenDriver
+
 BUILT_IN_KINDS = ("simulated", "canopen", "barrett")
 
 
@@ -61,17 +67,54 @@ def _driver_kind(value: Any) -> str:
     return kind if kind in BUILT_IN_KINDS else "plugin"
 
 
-# Chosen by `kind`, so that a mistake in a built-in driver's section is not taken for a plug-in's options.
-Driver = Annotated[
-    Annotated[SimulatedDriver, Tag("simulated")]
-    | Annotated[CanopenDriver, Tag("canopen")]
-    | Annotated[BarrettDriver, Tag("barrett")]
-    | Annotated[PluginDriver, Tag("plugin")],
-    Discriminator(_driver_kind),
-]
+def _driver_model(kind: str) -> type[Section]:
+    """Return the model of a kind of driver; those of real drives are loaded with the first arm that has them."""
+    if kind == "canopen":
+        from ident_service.config.canopen import CanopenDriver
+
+        return CanopenDriver
+    if kind == "barrett":
+        from ident_service.config.barrett import BarrettDriver
+
+        return BarrettDriver
+    return SimulatedDriver if kind == "simulated" else PluginDriver
 
 
-_BUILT_IN = (SimulatedDriver, CanopenDriver, BarrettDriver)
+def _driver_section(value: Any, info: ValidationInfo) -> Section:
+    # Chosen by `kind`, so that a mistake in a built-in driver's section is not taken for a plug-in's options.
+    return _driver_model(_driver_kind(value)).model_validate(value, context=info.context)
+
+
+class _OfItsKind:
+    """Marks the section `driver` as one of several models, none of which is loaded before an arm has it."""
+
+    def __get_pydantic_core_schema__(self, _source: Any, _handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        as_it_is = core_schema.simple_ser_schema("any")
+        return core_schema.with_info_plain_validator_function(_driver_section, serialization=as_it_is)
+
+    def __get_pydantic_json_schema__(
+        self, _schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        kinds = [Annotated[_driver_model(kind), Tag(kind)] for kind in (*BUILT_IN_KINDS, "plugin")]
+        union: Any = Annotated[kinds[0] | kinds[1] | kinds[2] | kinds[3], Discriminator(_driver_kind)]
+        return handler(TypeAdapter(union).core_schema)
+
+
+if TYPE_CHECKING:
+    Driver = SimulatedDriver | CanopenDriver | BarrettDriver | PluginDriver
+else:
+    Driver = Annotated[Section, _OfItsKind()]
+
+
+def is_canopen(driver: Driver | None) -> TypeGuard[CanopenDriver]:
+    """Return whether drives are CANopen's, without loading their model for others."""
+    return driver is not None and driver.kind == "canopen"
+
+
+def is_barrett(driver: Driver | None) -> TypeGuard[BarrettDriver]:
+    """Return whether drives are Barrett's pucks, likewise."""
+    return driver is not None and driver.kind == "barrett"
+
 
 JointTerm = Literal["drive_inertia", "viscous", "coulomb", "offset", "stribeck", "quadratic", "viscous_asymmetry"]
 FeasibleSetName = Literal["pseudo_inertia", "inertia"]
@@ -484,23 +527,23 @@ class ArmConfig(ExtendedSection):
     @property
     def can_buses(self) -> tuple[CanBus, ...]:
         """Return the CAN buses of the arm's drives, in the order of their numbers; none where they are on none."""
-        if isinstance(self.driver, CanopenDriver):
+        if is_canopen(self.driver):
             return self.driver.buses
-        return (self.driver.bus,) if isinstance(self.driver, BarrettDriver) else ()
+        return (self.driver.bus,) if is_barrett(self.driver) else ()
 
     @property
     def motor_torques(self) -> tuple[float, ...] | None:
         """Return what the motors give at most [N m], in the order of the transmission; None where unknown."""
-        if isinstance(self.driver, CanopenDriver):
+        if is_canopen(self.driver):
             return tuple(drive.max_torque * drive.torque_scale for drive in self.driver.drives)
-        if isinstance(self.driver, BarrettDriver):
+        if is_barrett(self.driver):
             return tuple(puck.max_torque * puck.torque_scale for puck in self.driver.pucks)
         return None
 
     @property
     def point_speed_limit(self) -> float | None:
         """Return the speed of elbow and tip at which the arm's own safety system stops it [m/s]; None without one."""
-        return self.driver.limits.velocity if isinstance(self.driver, BarrettDriver) else None
+        return self.driver.limits.velocity if is_barrett(self.driver) else None
 
     @property
     def watchdog(self) -> float | None:
@@ -508,12 +551,12 @@ class ArmConfig(ExtendedSection):
 
         What an open arm reports of itself counts more (`ArmDescription.watchdog`); this is for before it is opened.
         """
-        return self.driver.watchdog if isinstance(self.driver, _BUILT_IN) else None
+        return None if self.driver is None or isinstance(self.driver, PluginDriver) else self.driver.watchdog
 
     @property
     def watchdog_reason(self) -> str:
         """Return why drives of an arm that can fall may go on for longer than usual; empty for no reason."""
-        return self.driver.watchdog_reason if isinstance(self.driver, _BUILT_IN) else ""
+        return "" if self.driver is None or isinstance(self.driver, PluginDriver) else self.driver.watchdog_reason
 
     @property
     def delay_cycles(self) -> int:
@@ -523,8 +566,8 @@ class ArmConfig(ExtendedSection):
     @property
     def zeroed_at_home(self) -> bool:
         """Return whether a person zeroes the arm at its home, since encoders count from where power came."""
-        at_home = isinstance(self.driver, CanopenDriver) and self.driver.zero == "at_home"
-        return at_home or isinstance(self.driver, BarrettDriver)
+        at_home = is_canopen(self.driver) and self.driver.zero == "at_home"
+        return at_home or is_barrett(self.driver)
 
     @property
     def idle_drives_hold(self) -> bool:
@@ -532,7 +575,7 @@ class ArmConfig(ExtendedSection):
 
         Idle pucks brake by their windings, so that an arm sinks; there is nothing to let go of.
         """
-        return isinstance(self.driver, CanopenDriver)
+        return is_canopen(self.driver)
 
     def has_brake(self, joint: str) -> bool:
         """Return whether a holding brake holds the joint when its drive has no power."""

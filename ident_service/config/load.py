@@ -11,153 +11,21 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from ident_service.config import barrett, control, motion_design, recording, simulation
-from ident_service.config.arm import ArmConfig, FourierMotion, Joint
-from ident_service.config.barrett import BarrettDriver
-from ident_service.config.canopen import ABORTING, CanopenDriver, joint_torques, motor_speeds
-from ident_service.config.eds import data_sheet
+from ident_service.config import control, motion_design, recording, simulation
+from ident_service.config.arm import ArmConfig, FourierMotion, Joint, is_barrett, is_canopen
 from ident_service.config.kinematics import DHTable
 from ident_service.config.payload import Payload
 from ident_service.config.quantities import UPLOAD, AnyTextBeside, Section, TextFile, did_you_mean
-from ident_service.config.recording import RecordingFormat, Transmission
+from ident_service.config.recording import RecordingFormat
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, arm_schema_file, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
-from ident_service.errors import ConfigError, DriverError, Problem, UsageError, plain_mistake
+from ident_service.errors import ConfigError, Problem, UsageError, plain_mistake
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 _FEW = 3  # sections that are named as those in which a key belongs
-_ASKED = 0.7  # of the guard time, after which a drive is asked again; all must be asked within it
-_WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
-_ANOTHER_UNIT = 100.0  # times between a joint's torque limit and what its motors give: no choice is so far off
-_POSITION_RATES = 100.0, 500.0  # Hz; slower the guard sees too little, faster a torque path is what a drive has
-_LEAST_DEADLINE = 2.0  # cycles: one frame may be late
-# Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.
-_LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
-
-
-def disagreements(
-    driver: CanopenDriver,
-    transmission: Transmission | None,
-    joints: Sequence[str],
-    rate: float,
-    homeless: Sequence[str] = (),
-    velocities: Sequence[float | None] = (),
-    torques: Sequence[float | None] = (),
-) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield what is inconsistent with an arm of these joints: the place in the file, and the mistake.
-
-    Args:
-        driver: the section `driver`.
-        transmission: the arm's.
-        joints: names of the arm's joints; none where the file does not name them.
-        rate: cycles per second.
-        homeless: those without a `home`.
-        velocities: of the joints [rad/s or m/s], None where one has no limit; none where the file names no joints.
-        torques: torque limits of the joints [N m or N], likewise.
-    """
-    if driver.zero == "at_home" and homeless:
-        yield (
-            ("driver", "zero"),
-            "driver.zero: at_home needs every joint's home, the posture in which a person zeroes the arm; missing: "
-            + ", ".join(f"joints.{name}.home" for name in homeless),
-        )
-    if driver.reactions.abort_connection == 0 and any(drive.watchdog in ABORTING for drive in driver.drives):
-        yield (
-            ("driver", "reactions"),
-            "driver.reactions.abort_connection: 0 has drives do nothing when the host is gone (6007h); take what the"
-            " drive's manual calls a quick stop or a fault",
-        )
-    guarded = sum(drive.watchdog == "node_guarding" for drive in driver.drives)
-    if guarded / rate > _ASKED * driver.guarding.period:
-        yield (
-            ("driver", "guarding"),
-            f"driver.guarding.period: {driver.guarding.period:g} s is too short to ask {guarded} drives, one a cycle"
-            f" at {rate:g} Hz; at least {guarded / rate / _ASKED:.3g} s",
-        )
-    if guarded and any(b.data_bitrate for b in driver.buses):
-        yield ("driver", "buses"), "driver.buses: CAN FD has no remote frames, which node guarding asks with"
-    if driver.torque_deadline * rate < _LEAST_DEADLINE:
-        yield (
-            ("driver", "torque_deadline"),
-            f"driver.torque_deadline: {driver.torque_deadline:g} s at {rate:g} Hz has no room for a late torque frame;"
-            f" at least {_LEAST_DEADLINE:g} cycles are needed, {_LEAST_DEADLINE / rate:g} s",
-        )
-    if driver.lost_cycles > max(_MOST_LOST, _LONGEST_LOSS * rate):
-        yield (
-            ("driver", "lost_cycles"),
-            f"driver.lost_cycles: {driver.lost_cycles} at {rate:g} Hz is {1e3 * driver.lost_cycles / rate:g} ms without"
-            f" positions; at most {max(_MOST_LOST, int(_LONGEST_LOSS * rate))} cycles",
-        )
-    if transmission is None:
-        yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
-    elif len(transmission.ratios) != len(driver.drives):
-        yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
-    elif len(velocities) == len(driver.drives):
-        for k, (drive, speed) in enumerate(zip(driver.drives, motor_speeds(transmission, velocities), strict=True)):
-            if drive.max_speed < _WHOLE_TURNS * speed:
-                yield (
-                    ("driver", "drives", k),
-                    f"driver.drives: node {drive.node} would give no torque above max_speed {drive.max_speed:g} turns"
-                    f" per minute (6080h), but its motor turns at {speed:.0f} when joints move at their limits:"
-                    " raise max_speed, or lower joints.NAME.velocity",
-                )
-    if transmission is not None and len(torques) == len(driver.drives) == len(transmission.ratios):
-        for k, (limit, reach) in enumerate(zip(torques, joint_torques(driver, transmission), strict=True)):
-            ratio = 1.0 if limit is None else max(reach / limit, limit / reach)
-            if ratio > _ANOTHER_UNIT:
-                yield (
-                    ("driver", "drives", k),
-                    f"driver.drives: joint {joints[k]} can be given {reach:.4g} by its gears and max_torque, but"
-                    f" joints.{joints[k]}.torque is {limit:g}: {ratio:.3g} times apart, which is another unit or gear",
-                )
-    yield from _positions(driver, rate)
-    shares = driver.drives_a_frame > 1 and any(
-        sum(drive.bus == bus for drive in driver.drives) > 1 for bus in range(len(driver.buses))
-    )
-    if why := data_sheet(driver.eds.text).mistake:
-        yield ("driver", "eds"), f"driver.eds: {driver.eds.name} is not an EDS (CiA 306): {why}; take the drive maker's"
-    elif shares and not driver.shares_by_sheet:
-        yield (
-            ("driver", "eds"),
-            f"driver.eds: {driver.eds.name} has no Dummy0003=1 under [DummyUsage], nor another dummy of 8 or 16"
-            " bits, so that these drives cannot share torque frames; set driver.torque_frames to single, at a rate"
-            " that it fits",
-        )
-    elif driver.measured_torque in ("cyclic", "status") and not all(sheet.has(0x6077) for sheet in driver.sheets):
-        yield (
-            ("driver", "measured_torque"),
-            f"driver.measured_torque: {driver.eds.name} has no 6077h, so that these drives do not tell their torque",
-        )
-    try:
-        driver.families  # noqa: B018 - reading them checks them
-    except DriverError as error:
-        yield ("driver", "profiles"), f"driver.profiles: {error}"
-    if joints and len(joints) != len(driver.drives):
-        yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"
-
-
-def _positions(driver: CanopenDriver, rate: float) -> Iterator[tuple[tuple[str | int, ...], str]]:
-    """Yield what is inconsistent with drives that are given positions."""
-    if driver.streams != "position":
-        return
-    if driver.torque_reports != "cyclic":
-        yield (
-            ("driver", "measured_torque"),
-            "driver.measured_torque: drives that are given positions (driver.streams) must tell their torque in every"
-            " cycle, as nobody else knows it; leave it out, or set it to cyclic",
-        )
-    least, most = _POSITION_RATES
-    if not least <= rate <= most:
-        yield (
-            ("driver", "streams"),
-            f"driver.streams: positions are streamed at {least:g} to {most:g} Hz, between which drives interpolate"
-            f" (60C2h); control.rate is {rate:g}",
-        )
-    elif abs(1e6 / rate - round(1e6 / rate)) > 1e-6:
-        yield ("driver", "streams"), f"driver.streams: a period of 1/{rate:g} s is not whole microseconds (60C2h)"
 
 
 _MOST_JSON = 4 * 2**20  # bytes: a text, a URDF and an EDS at their limits
@@ -213,7 +81,9 @@ def with_sheets(config: ArmConfig, files: Sequence[str]) -> ArmConfig:
     """
     if not files:
         return config
-    if not isinstance(config.driver, CanopenDriver):
+    from ident_service.config.eds import data_sheet  # which only CANopen's drives have
+
+    if not is_canopen(config.driver):
         raise UsageError(f"{config.name}: the driver is not CANopen's, so that no data sheet describes its drives")
     driver, sheets = config.driver, tuple(map(sheet_file, files))
     for sheet in sheets:
@@ -597,13 +467,18 @@ def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
         slides = table is not None and name in table.joints and table.joints[name].type == "prismatic"
         yield from _other_units(name, one, slides=slides)
     homeless = [name for name in names if (joint := config.joints.get(name)) is None or joint.home is None]
-    if isinstance(config.driver, BarrettDriver):
+    if is_barrett(config.driver):
+        from ident_service.config import barrett
+
         yield from barrett.disagreements(config.driver, config.transmission, names, config.control.rate, homeless)
-    if isinstance(config.driver, CanopenDriver):
+    if is_canopen(config.driver):
+        from ident_service.config import canopen
+
         velocities = [joint.velocity if (joint := config.joints.get(name)) else None for name in names]
         torques = [joint.torque if (joint := config.joints.get(name)) else None for name in names]
         limits = velocities, torques
-        yield from disagreements(config.driver, config.transmission, names, config.control.rate, homeless, *limits)
+        rate = config.control.rate
+        yield from canopen.disagreements(config.driver, config.transmission, names, rate, homeless, *limits)
         if config.driver.streams == "position" and config.control.after_stop in ("hold", "lower"):
             yield (
                 ("control", "after_stop"),

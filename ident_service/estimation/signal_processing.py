@@ -26,7 +26,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.errors import RecordingError
 from ident_service.estimation.spectra import with_filter
 from ident_service.model.friction_state import friction_direction
-from ident_service.model.zero_phase import local_polynomial, low_pass, widened
+from ident_service.model.zero_phase import local_polynomial, low_pass, spline_shifted, widened
 from ident_service.recordings.cached_recording import memory_of
 from ident_service.recordings.recording import Block, Recording, cut, join
 from ident_service.recordings.resampling import Grid, UniformRun, grid, uniform
@@ -229,12 +229,7 @@ class _Smoother:
         if self._held:
             torque = np.vstack([torque[:1], 0.5 * (torque[:-1] + torque[1:])])
         if self._delay:
-            import scipy.ndimage  # loads for 0.2 s, and few arms have a delay
-
-            steps = self._delay / self._period
-            torque = np.column_stack(
-                [scipy.ndimage.shift(column, -steps, order=3, mode="nearest") for column in torque.T]
-            )
+            torque = spline_shifted(torque, self._delay / self._period)
         if self._smoothing.filter_torque:
             torque = self._low_pass(torque)
         time = np.asarray((window.stamp_ns - first_ns) * 1e-9, dtype=np.float64)

@@ -13,8 +13,7 @@ from drivers.arm import Sample
 from drivers.canopen.bus_load import budget
 from drivers.canopen.driver import CanopenArm
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDriver
-from ident_service.config.load import disagreements
+from ident_service.config.canopen import CanopenDriver, disagreements
 from ident_service.errors import RecordingError
 from ident_service.recordings.adapters import MeasuredRecording
 from ident_service.recordings.cycle import Cycle

@@ -16,8 +16,7 @@ from drivers.canopen.driver import CanopenArm
 from drivers.canopen.object_dictionary import Entry, Kind
 from drivers.canopen.pdo_mapping import HEARTBEAT, Write
 from ident_service.config.arm import ArmConfig
-from ident_service.config.canopen import CanopenDrive, CanopenDriver, quick_stop_decelerations
-from ident_service.config.load import disagreements
+from ident_service.config.canopen import CanopenDrive, CanopenDriver, disagreements, quick_stop_decelerations
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError
 from ident_service.model.arm_model import arm_model

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 from cli.conftest import COARSE, Commissioned, Ident, Samples, left_over, quick_arm
 
 from ident_service import __version__
-from ident_service.cli import main, parser
+from ident_service.cli import GROUPS, main, parser
+from ident_service.cli.arguments import Parser
 
 
 @pytest.mark.parametrize("words", [(), ("simulate",), ("identify",), ("config",), ("config", "check"), ("correct",)])
@@ -67,6 +70,21 @@ def test_home_zero_is_set_home() -> None:
     assert formerly.verb is now.verb
     assert formerly.zero
     assert now.zero
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
+def test_a_verb_is_parsed_with_its_group_alone_as_with_all(group: ModuleType) -> None:
+    alone, every = parser(GROUPS[group][0]), parser()
+    assert tuple(alone.shown) == GROUPS[group]
+    for verb in GROUPS[group]:
+        assert _verbs(alone)[verb].format_help() == _verbs(every)[verb].format_help()
+    for words in ("check", "--version", "no-such-verb", "--json"):
+        assert _verbs(parser(words)).keys() == _verbs(every).keys()
+
+
+def _verbs(top: Parser) -> dict[str, Parser]:
+    (action,) = (one for one in top._actions if isinstance(one, argparse._SubParsersAction))
+    return dict(action.choices)
 
 
 def test_version(ident: Ident) -> None:
@@ -163,7 +181,7 @@ def test_help_loads_no_large_library(words: list[str]) -> None:
 
 # What the common case may load: a quarter of its processor time is imports. Every other package waits for who needs it.
 IDENTIFY_LOADS = {
-    *("ident_service", "numpy", "pinocchio", "coal", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
+    *("ident_service", "numpy", "clarabel", "jsonschema_rs", "threadpoolctl", "yaml"),
     *("pydantic", "pydantic_core", "annotated_types", "typing_extensions", "typing_inspection"),  # configurations
     *("jinja2", "markupsafe"),  # the report
     "mcap",  # recordings; of CSV its numbers of records alone
@@ -174,14 +192,25 @@ IDENTIFY_LOADS = {
     *("cmeel_pth", "sitecustomize", "usercustomize", "distutils-precedence"),  # of environments
 }
 NOT_OF_PYTHON = {"urllib.request", "http.client", "ssl", "xml.sax", "sqlite3", "asyncio", "multiprocessing"}
-# Packages load LAPACK and Student's t alone, and neither drivers nor MCAP's formats serve one who reads CSV.
+# Packages load LAPACK and Student's t alone; drivers, their sections and MCAP's formats serve nobody who reads CSV.
 NOT_OF_SCIPY = {"scipy._lib._array_api", "scipy.linalg._basic", "scipy.special._support_alternative_backends"}
-NOT_FOR_CSV = {"mcap.records", "mcap.writer", "zstandard", "lz4", "drivers.arm", "ident_service.motion.faults"}
+NOT_FOR_CSV = {
+    *("mcap.records", "mcap.writer", "zstandard", "lz4", "drivers.arm", "ident_service.motion.faults"),
+    *("ident_service.config.canopen", "ident_service.config.barrett"),
+}
 
 
 @pytest.mark.slow
 def test_identification_loads_what_it_needs(quick: Commissioned, samples: Samples, tmp_path: Path) -> None:
-    words = ["identify", str(samples.write(tmp_path / "run.csv")), "--arm", str(quick.arm), "--json", "--delay", "0"]
+    words = [
+        "identify",
+        str(samples.write(tmp_path / "run.csv")),
+        "--arm",
+        str(quick.arm),
+        "--json",
+        "--delay",
+        "0.001",
+    ]
     program = (
         "import sys\n"
         "from ident_service.cli import main\n"
