@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.interpolate
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 from hypothesis import given
 from hypothesis import strategies as st
 from made_recordings import Array, MadeRecording, curve, jittered, moving, segments_of, whole

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cvxpy as cp
 import numpy as np
 
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions, parse_expression
 from ident_service.model.parameter_layout import INERTIAL
+
+if TYPE_CHECKING:
+    import cvxpy as cp
 
 Array = np.ndarray
 
@@ -45,6 +47,8 @@ def moments_of(points: Array, masses: Array) -> Array:
 
 def condition(kind: str, ten: Any) -> Any:
     """The matrix that must be positive, from a vector of ten cvxpy expressions."""
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     xx, xy, xz, yy, yz, zz, lx, ly, lz, m = (ten[k] for k in range(10))
     if kind == "inertia":
         return cp.bmat(
@@ -69,6 +73,8 @@ def condition(kind: str, ten: Any) -> Any:
 
 def conditions(kind: str, names: tuple[str, ...], delta: cp.Variable, margin: Any, total_mass: float) -> list[Any]:
     """Every link's matrix, every joint's Ia, fv and fc, and what is left of the total mass, are at least `margin`."""
+    import cvxpy as cp
+
     index = {name: column for column, name in enumerate(names)}
     links = [int(name[1:]) for name in names if re.fullmatch(r"m\d+", name)]
     constraints = []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from estimation.bodies import conditions as second_conditions
@@ -65,6 +64,8 @@ def case(seed: int, kind: FeasibleSetName, *, joints: int = 2, noise: float = 0.
 
 def second_test(beta: np.ndarray, base: BaseParameters, kind: str, solver: str) -> float:
     """BPFT with delta itself as the variable."""
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     delta, margin = cp.Variable(len(base.names)), cp.Variable()
     constraints = [base.K @ delta == beta, margin <= 1e3]
     constraints += second_conditions(kind, base.names, delta, margin, TOTAL_MASS)
@@ -82,6 +83,8 @@ def second_nearest(
     inset: float = EPSILON,
 ) -> tuple[np.ndarray, float]:
     """BPFC (eq. 55) and FBPE (eq. 74), the norm bounded by the Schur complement of eqs. 54 and 73 or by a cone."""
+    import cvxpy as cp
+
     delta = cp.Variable(len(base.names))
     # A column of the metric's own size keeps the matrix well scaled.
     size = np.linalg.norm(metric, ord=2)

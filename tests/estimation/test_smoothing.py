@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 from estimation.synthetic import SampledRecording, smoothed_samples, stamps, waves
 from helpers.plain import plain_options, plain_smoothing
 

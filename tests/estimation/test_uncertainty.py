@@ -6,7 +6,7 @@ from functools import reduce
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 from estimation.synthetic import one_joint_information, random_information, serial_chain
 from helpers.random_arms import model_around, random_delta
 

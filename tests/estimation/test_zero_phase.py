@@ -7,8 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-import scipy.ndimage
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 from estimation.synthetic import SampledRecording, recorded, serial_chain, smoothed_samples, stamps, waves, with_options
 from helpers.plain import plain_friction, plain_options, plain_smoothing
 from helpers.random_arms import model_around, random_delta

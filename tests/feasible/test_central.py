@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from feasible.random_cases import random_case
@@ -54,6 +53,8 @@ def test_every_body_with_the_same_base_parameters_leads_to_the_same_one(arm: str
 
 @pytest.mark.parametrize(("likely", "moves"), [(False, False), (True, False), (True, True)])
 def test_it_is_the_minimiser_that_another_solver_finds(likely: bool, moves: bool) -> None:
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     model, base = of("planar2")
     bodies = likely_bodies(replace(model, prior=None)) if likely else None
     rng = np.random.default_rng(2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from feasible.random_cases import RandomCase, random_case
@@ -119,6 +118,8 @@ def test_an_infeasible_euclidean_prior_cannot_pull_the_estimate_out() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_prior_is_that_of_a_second_formulation(kind: Kind) -> None:
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     case = random_case(5, joints=2, noise=0.2)
     base, fit, names = case.base, case.fit, case.base.names
     conditions = feasible_set("pseudo_inertia", names)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import cvxpy as cp
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from estimation.synthetic import random_information
@@ -23,11 +24,16 @@ from ident_service.estimation.least_squares import torque_error, weighted_least_
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions, base_parameters
 from ident_service.model.parameter_layout import INERTIAL
 
+if TYPE_CHECKING:
+    import cvxpy as cp
+
 NAMES = tuple(f"{symbol}1" for symbol in INERTIAL)
 
 
 def matrices(conditions: FeasibleSet, delta: cp.Variable) -> list[tuple[cp.Expression, np.ndarray, np.ndarray]]:
     """Per block its value as a matrix, the identity and the reference scale."""
+    import cvxpy as cp  # loads for a second, which every worker that collects this file would pay
+
     result = []
     for block in conditions.blocks:
         if block.size:
@@ -69,6 +75,8 @@ def test_a_finger_of_three_grams_is_as_good_inside_the_set(kind: FeasibleSetName
 @pytest.mark.parametrize("kind", ["inertia", "pseudo_inertia"])
 @pytest.mark.parametrize("seed", [1, 10, 18, 21])
 def test_scaled_margin_is_that_of_a_second_formulation(seed: int, kind: FeasibleSetName) -> None:
+    import cvxpy as cp
+
     case = random_case(seed, joints=2, noise=0.3)
     names = case.base.names
     conditions = bounded(kind, names)
@@ -169,6 +177,8 @@ def test_correction_in_a_covariance_does_not_depend_on_the_base_columns(kind: Fe
 
 @pytest.mark.parametrize("seed", [1, 10, 18, 22])
 def test_correction_in_a_covariance_is_that_of_a_second_formulation(seed: int) -> None:
+    import cvxpy as cp
+
     case = random_case(seed, joints=2, noise=0.3)
     base, beta = case.base, case.fit.beta
     conditions = bounded("pseudo_inertia", base.names)

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load for a second where they are used
 from mcap.data_stream import RecordBuilder
 from mcap.records import Message, MessageIndex
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from ident_service.config.load import load_arm
 from ident_service.fleet.factor import Described, Merged
@@ -265,7 +265,7 @@ def write_samples(
     period = float(stamps[1] - stamps[0]) * 1e-9
     share = period / (period + _LOW_PASS_S)
     for number, measured in enumerate(
-        (lfilter([share], [1.0, share - 1.0], np.diff(position, axis=0) / period, axis=0), velocity[1:])
+        (scipy.signal.lfilter([share], [1.0, share - 1.0], np.diff(position, axis=0) / period, axis=0), velocity[1:])
     ):
         rows[f"position{number}"], rows[f"velocity{number}"], rows[f"torque{number}"] = (
             position[1:],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.base_parameters import base_parameters

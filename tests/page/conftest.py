@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from daemon.served import Reached, listening
-from helpers.browser import chromium_program
+from helpers.browser import FEWER_FEATURES, chromium_program
 from playwright.sync_api import Browser, Page, sync_playwright
 
 
@@ -36,13 +36,23 @@ def reached(place: Path) -> Iterator[Reached]:
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    """Headless Chromium."""
+def chromium() -> Iterator[Browser]:
+    """Headless Chromium, which draws by the processor, whatever the machine has."""
     path = chromium_program()
+    # SwiftShader for WebGL alone, which `--use-angle=swiftshader` would have put all pages together with.
+    switches = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", FEWER_FEATURES]
     with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        found = playwright.chromium.launch(executable_path=path, args=switches)
         yield found
         found.close()
+
+
+@pytest.fixture
+def browser(chromium: Browser) -> Iterator[Browser]:
+    """The browser that tests share; what a test has opened would go on drawing and asking, and is closed."""
+    yield chromium
+    for context in chromium.contexts:
+        context.close()
 
 
 def log_in(

@@ -26,5 +26,8 @@ def test_the_api_can_be_browsed_without_network_or_token(browser: Browser, reach
     page.goto(f"{reached.url}/api/docs")
     expect(page.get_by_text("Stop all arms, under control").first).to_be_visible(timeout=60_000)
     expect(page.get_by_text("Identify from a run").first).to_be_attached()
+    for width, height in ((1280, 860), (400, 800)):
+        page.set_viewport_size({"width": width, "height": height})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
     assert all(url.startswith((reached.url, "data:", "blob:")) for url in asked), asked
     assert said == []

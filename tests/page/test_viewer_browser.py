@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from daemon.conftest import commissioned as commissioned
 from daemon.conftest import quick_text
-from helpers.browser import chromium_program
 from helpers.meshes import threelink
 from page.conftest import Reached, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect
@@ -58,25 +57,19 @@ LOOK = """() => {
 
 
 @pytest.fixture(scope="module")
-def shown(
-    browser: Browser, tmp_path_factory: pytest.TempPathFactory, commissioned: Path
-) -> Iterator[tuple[Browser, Reached, str]]:
-    """A browser that draws WebGL by software, a service with an arm, and a run of it."""
+def shown(tmp_path_factory: pytest.TempPathFactory, commissioned: Path) -> Iterator[tuple[Reached, str]]:
+    """A service with an arm, and a run of it."""
     state = tmp_path_factory.mktemp("viewer") / "state"
-    switches = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
     with listening(state) as reached:
         add_arm(reached.service.db, state, quick_text(ARM), {}, "test", replace=True)
         import_run(reached.service.db, state, commissioned, "test")
-        # By the driver of all tests' browser: a process may have one.
-        drawing = browser.browser_type.launch(executable_path=chromium_program(), args=switches)
-        yield drawing, reached, commissioned.name
-        drawing.close()
+        yield reached, commissioned.name
 
 
 @pytest.fixture
-def page(shown: tuple[Browser, Reached, str]) -> Iterator[Page]:
+def page(browser: Browser, shown: tuple[Reached, str]) -> Iterator[Page]:
     """A page of an operator on which nothing may be complained of."""
-    browser, reached, _ = shown
+    reached, _ = shown
     page = log_in(browser, reached)
     said = list[str]()
 
@@ -114,8 +107,8 @@ def confirm_page(page: Page, reached: Reached, kind: str = "run", arm: str = ARM
     page.get_by_label("Type the arm's name").wait_for()
 
 
-def test_a_motion_is_seen_before_it_is_made(shown: tuple[Browser, Reached, str], page: Page) -> None:
-    _, reached, _ = shown
+def test_a_motion_is_seen_before_it_is_made(shown: tuple[Reached, str], page: Page) -> None:
+    reached, _ = shown
     confirm_page(page, reached)
     page.locator("#viewer-controls").wait_for()
     expect(page.get_by_label("Type the arm's name")).to_be_focused()  # the viewer takes nothing from the question
@@ -146,8 +139,8 @@ def test_a_motion_is_seen_before_it_is_made(shown: tuple[Browser, Reached, str],
     assert drawn(page) > 50
 
 
-def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], page: Page) -> None:
-    _, reached, run = shown
+def test_a_run_is_seen_as_it_was_measured(shown: tuple[Reached, str], page: Page) -> None:
+    reached, run = shown
     page.goto(f"{reached.url}/runs/{run}")
     page.locator("#viewer-controls").wait_for()
     assert drawn(page) > 50
@@ -158,8 +151,8 @@ def test_a_run_is_seen_as_it_was_measured(shown: tuple[Browser, Reached, str], p
     assert path.count("L") == len(view["clearance"]["samples"]) - 1
 
 
-def test_distances_are_reported_while_the_arm_moves(shown: tuple[Browser, Reached, str], page: Page) -> None:
-    _, reached, _ = shown
+def test_distances_are_reported_while_the_arm_moves(shown: tuple[Reached, str], page: Page) -> None:
+    reached, _ = shown
     page.add_init_script(COUNTED)
     confirm_page(page, reached, "rehearse")
     page.locator("#viewer-controls").wait_for()
@@ -187,13 +180,13 @@ def test_distances_are_reported_while_the_arm_moves(shown: tuple[Browser, Reache
     expect(page.locator("#viewer-distances")).to_be_hidden()
 
 
-def test_the_browser_places_joints_as_the_service_does(shown: tuple[Browser, Reached, str], page: Page) -> None:
+def test_the_browser_places_joints_as_the_service_does(shown: tuple[Reached, str], page: Page) -> None:
     """The pictures' kinematics against those that identification uses, on the arm with the most joints."""
     from ident_service.config.load import load_arm
     from ident_service.model.arm_model import arm_model
     from ident_service.model.kinematics import joint_frames
 
-    _, reached, _ = shown
+    reached, _ = shown
     model = arm_model(load_arm("wam7_sim"))
     confirm_page(page, reached)
     page.evaluate("document.getElementById('viewer').dataset.source = '/api/v1/arms/wam7_sim/view?motion=own'")
@@ -224,9 +217,9 @@ def test_the_browser_places_joints_as_the_service_does(shown: tuple[Browser, Rea
 
 
 def test_meshes_cover_the_capsules_that_distances_are_of(
-    shown: tuple[Browser, Reached, str], page: Page, tmp_path: Path
+    shown: tuple[Reached, str], page: Page, tmp_path: Path
 ) -> None:
-    _, reached, _ = shown
+    reached, _ = shown
     text, urdf, meshes = threelink("crane")
     for name, content in meshes.items():
         (tmp_path / name).write_bytes(content)
@@ -251,8 +244,8 @@ def test_meshes_cover_the_capsules_that_distances_are_of(
     expect(box).to_be_hidden()
 
 
-def test_without_webgl_times_and_distances_stay(shown: tuple[Browser, Reached, str], page: Page) -> None:
-    _, reached, _ = shown
+def test_without_webgl_times_and_distances_stay(shown: tuple[Reached, str], page: Page) -> None:
+    reached, _ = shown
     page.add_init_script(NO_WEBGL)
     confirm_page(page, reached)
     page.locator("#viewer-controls").wait_for()
@@ -263,8 +256,8 @@ def test_without_webgl_times_and_distances_stay(shown: tuple[Browser, Reached, s
     expect(page.locator("#viewer-itself")).to_contain_text(" mm, ")
 
 
-def test_what_cannot_be_shown_is_stated(shown: tuple[Browser, Reached, str], page: Page) -> None:
-    _, reached, _ = shown
+def test_what_cannot_be_shown_is_stated(shown: tuple[Reached, str], page: Page) -> None:
+    reached, _ = shown
     page.route("**/view?motion=own*", lambda route: route.fulfill(status=409, json={"error": {"message": "no limits"}}))
     confirm_page(page, reached)
     expect(page.locator("#viewer-status")).to_have_text("The arm cannot be shown: no limits")

@@ -7,6 +7,7 @@ uploaded, and an arm with recordings only.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -228,7 +229,6 @@ def test_the_report_has_no_findings_with_all_unfolded(browser: Browser, story: S
 def test_pages_without_a_login_are_whole(browser: Browser, state: Path) -> None:
     with listening(state) as reached:
         page = browser.new_context().new_page()
-        page.set_default_timeout(150_000)  # the API's viewer is large
         told = heard(page)
         page.goto(f"{reached.url}/login")
         found = complaints(page, "login", told)
@@ -237,11 +237,6 @@ def test_pages_without_a_login_are_whole(browser: Browser, state: Path) -> None:
         page.get_by_role("alert").wait_for()
         told.words.clear()  # Chromium tells of the refusal that was asked for
         found += complaints(page, "login refused", told)
-        page.goto(f"{reached.url}/api/docs")
-        page.get_by_text("Stop all arms, under control").first.wait_for()
-        for width, height in SIZES:
-            page.set_viewport_size({"width": width, "height": height})
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert found + told.words == []
 
 
@@ -325,15 +320,20 @@ def test_times_are_the_browsers_own(browser: Browser, story: Story) -> None:
     expect(page.locator("#zone")).to_have_text("Asia/Tokyo")
 
 
+def numbers_apart(name: str) -> list[tuple[int, str]]:
+    """Order names as people do and the page does, numbers in them by their size: runs may be of one second."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
+
+
 def test_runs_are_sorted_filtered_and_overlaid(browser: Browser, story: Story) -> None:
     page = log_in(browser, story.reached)
     page.goto(f"{story.reached.url}/runs")
     rows = page.locator("table.sortable tbody tr")
     names = rows.locator("th a").all_inner_texts()
     page.get_by_role("button", name="Run", exact=True).click()
-    assert rows.locator("th a").all_inner_texts() == sorted(names)
+    assert rows.locator("th a").all_inner_texts() == sorted(names, key=numbers_apart)
     page.get_by_role("button", name="Run", exact=True).click()
-    assert rows.locator("th a").all_inner_texts() == sorted(names, reverse=True)
+    assert rows.locator("th a").all_inner_texts() == sorted(names, key=numbers_apart, reverse=True)
     page.get_by_label("Tag").select_option("warm")
     page.get_by_role("button", name="Show").click()
     expect(rows).to_have_count(1)

@@ -12,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from helpers.browser import FEWER_FEATURES
+
 # Both ends are copied first: either may itself be 3 or 4.
 _START = """
 import os, sys
@@ -99,7 +101,7 @@ def chromium(program: str, home: Path) -> Iterator[Tab]:
     """A browser with one tab, its files in `home`, ended with the block."""
     request_out, request_in = os.pipe()
     answer_out, answer_in = os.pipe()
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe"]
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--remote-debugging-pipe", FEWER_FEATURES]
     process = subprocess.Popen(
         [sys.executable, "-c", _START, str(request_out), str(answer_in), program, *flags, f"--user-data-dir={home}"],
         pass_fds=(request_out, answer_in),

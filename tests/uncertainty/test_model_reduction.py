@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.signal
+import scipy  # its parts load for a second where they are used
 from estimation.synthetic import one_joint_information
 
 from ident_service.errors import ModelError
