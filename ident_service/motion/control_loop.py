@@ -151,7 +151,7 @@ class Loop:
             self.deadlines.elapsed,
             self.control.feedforward,
             known=self.deadlines.known,
-            unexplained=sample.torque - self._explained if self._explained is not None else 0.0,
+            unexplained=sample.torque - self._explained if self._explained is not None else None,
         )
         law = self._law(sample, usable, reference, free)
         if self.gives_positions:
