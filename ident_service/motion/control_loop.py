@@ -408,7 +408,7 @@ class Loop:
 
     def _remember(self, sample: Sample, usable: Flags, reference: Setpoint) -> None:
         error = np.abs(reference.position - sample.position)
-        if not usable.all():
+        if not all(usable.tolist()):
             error = np.where(usable, error, 0.0)
         np.maximum(self.peaks.following_error, error, out=self.peaks.following_error)
         np.maximum(self.peaks.torque, np.abs(sample.torque), out=self.peaks.torque)
