@@ -229,10 +229,13 @@ class BusCodec:
             DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.
         """
         try:
-            return [
-                Frame(one.cob_id, one.pack(*[counts[k] << one.shift if one.shift else counts[k] for k in one.drives]))
-                for one in self._frames
-            ]
+            frames = []
+            for one in self._frames:
+                values = [counts[k] for k in one.drives]
+                if one.shift:
+                    values = [value << one.shift for value in values]
+                frames.append(Frame(one.cob_id, one.pack(*values)))
+            return frames
         except (struct.error, IndexError, TypeError) as error:
             raise DriverError(f"bus {self.profile.number}: targets {list(counts)} cannot be sent: {error}") from None
 
@@ -326,10 +329,11 @@ class BusCodec:
         else:
             values = self._unpack_position(data)
             drive.position = values[0]
-            if self._tells_torque:
-                drive.torque, drive.torques = values[-1], drive.torques + 1
-            if self._tells_status:
-                self._take_status(drive, values[1])
+            if len(values) > 1:
+                if self._tells_torque:
+                    drive.torque, drive.torques = values[-1], drive.torques + 1
+                if self._tells_status:
+                    self._take_status(drive, values[1])
             drive.seen = drive.answered = True
             self._missing -= 1
             drive.age = 0
