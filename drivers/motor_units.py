@@ -128,7 +128,7 @@ class Coordinates:
             DriverError: a torque that is not finite (or absurd), or not of this shape.
         """
         wanted = np.asarray(torque, dtype=float)
-        if wanted.shape != self.offset.shape or not np.abs(wanted).max() < _ABSURD:
+        if wanted.shape != self.offset.shape or not all(abs(one) < _ABSURD for one in wanted.tolist()):
             raise DriverError(f"{len(self.limit)} finite joint torques are needed, not {torque}")
         exact = (self.count_per_torque @ wanted).tolist()
         counts, clipped = [0] * len(exact), False

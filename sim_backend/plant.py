@@ -338,7 +338,7 @@ class Plant:
         h = self._period if period is None else period
         if h != self._stepped:
             self._stepped, self._half = h, 0.5 * h
-            self._damp()
+            self._damp_steps()
         v = self._velocity
         sign = np.sign(v)
         q_m = self._position + self._half * v
@@ -385,17 +385,27 @@ class Plant:
         self._damp()
 
     def _damp(self) -> None:
-        # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for.
+        """Compute what depends on drives, friction and braking."""
         coupling = self._chain.coupling
         whole = coupling.T @ (self._viscous[:, None] * coupling)
         whole = whole + (self._braking if self._braking.ndim == 2 else np.diag(self._braking))
         self._damping = np.diag(whole).copy()
-        # Between joints it does not, nor does drive inertia: pinocchio has an armature per joint only.
+        self._armature = np.diag(self._drive_matrix)
         damping = whole - np.diag(self._damping)
-        inertia = self._drive_matrix - np.diag(np.diag(self._drive_matrix))
         self._coupled: Array | None = damping if damping.any() else None
-        self._matrix: Array | None = inertia + self._half * damping if damping.any() or inertia.any() else None
-        self._model.armature = np.diag(self._drive_matrix) + self._half * self._damping
+        self._drive_coupling = self._drive_matrix - np.diag(self._armature)
+        self._couples = bool(damping.any() or self._drive_coupling.any())
+        self._damp_steps()
+
+    def _damp_steps(self) -> None:
+        """Compute what depends on the length of a step, too."""
+        # Implicit viscous friction acts like more drive inertia, so that it costs nothing to solve for. Between joints
+        # it does not, nor does drive inertia: pinocchio has an armature per joint only.
+        self._model.armature = self._armature + self._half * self._damping
+        self._matrix: Array | None = None
+        if self._couples:
+            damping = 0.0 if self._coupled is None else self._coupled
+            self._matrix = self._drive_coupling + self._half * damping
 
     def _stick_or_slip(self, q_m: Array, v_m: Array, smooth: Array) -> tuple[Array, Array]:
         """Return the velocities of joints and drives at the end of the step."""

@@ -151,6 +151,7 @@ class MeasuredTorque:
         self._cycle = 0
         self._outside, self._before = [0.0] * len(coordinates.limit), [0.0] * len(coordinates.limit)
         self._reports = [0] * len(coordinates.limit)
+        self._none = read_only(np.full(len(coordinates.offset), np.nan))
         self.torque: Vector | None = None
         self.difference: Vector | None = None
 
@@ -167,7 +168,7 @@ class MeasuredTorque:
         new = [drive.torques > known for drive, known in zip(drives, self._reports, strict=True)]
         if not any(new):
             if self.torque is not None:
-                self.torque = np.full(len(new), np.nan)
+                self.torque = self._none
             return
         least, most = self._told.min(axis=0).tolist(), self._told.max(axis=0).tolist()
         for k, drive in enumerate(drives):
@@ -451,7 +452,7 @@ class CanopenArm(Arm):
             if not self._enabled:
                 raise DriverError("a torque was given, but the arm is not enabled")
             wanted = np.asarray(torque, dtype=float)
-            if wanted.shape != self._limits.shape or not np.isfinite(wanted).all():
+            if wanted.shape != self._limits.shape or not all(np.isfinite(wanted).tolist()):
                 raise DriverError(f"{len(self._limits)} finite torques are needed, not {torque}")
             wanted = np.minimum(np.maximum(wanted, -self._limits), self._limits)  # np.clip takes three times as long
             self._counts, _ = self._coordinates.torque_counts(wanted)
@@ -470,7 +471,7 @@ class CanopenArm(Arm):
         if not self._enabled:
             raise DriverError("a position was given, but the arm is not enabled")
         wanted = np.asarray(position, dtype=float)
-        if wanted.shape != self._limits.shape or not np.isfinite(wanted).all():
+        if wanted.shape != self._limits.shape or not all(np.isfinite(wanted).tolist()):
             raise DriverError(f"{len(self._limits)} finite positions are needed, not {position}")
         self._counts = [signed(counts) for counts in self._coordinates.counts_at(wanted)]
         return self._exchanged(buses, sends=True)

@@ -191,7 +191,8 @@ class BusCodec:
         self._events: list[Event] = []
         self._status_cycles = math.ceil(profile.status_timeout * profile.rate)
         # With the torque that it measures, a report is one number longer.
-        self._positions, self._reports = _packing(profile.position_slots), _packing(profile.status_slots)
+        positions, self._reports = _packing(profile.position_slots), _packing(profile.status_slots)
+        self._position_bytes, self._unpack_position = positions.size, positions.unpack
         self._tells_status, self._tells_torque = (
             entry in profile.position_slots for entry in (od.STATUS_WORD, od.TORQUE_ACTUAL)
         )
@@ -228,7 +229,13 @@ class BusCodec:
             DriverError: a value that its bits do not hold, or too few of them; nothing is to be sent then.
         """
         try:
-            return [Frame(one.cob_id, one.pack(*[counts[k] << one.shift for k in one.drives])) for one in self._frames]
+            frames = []
+            for one in self._frames:
+                values = [counts[k] for k in one.drives]
+                if one.shift:
+                    values = [value << one.shift for value in values]
+                frames.append(Frame(one.cob_id, one.pack(*values)))
+            return frames
         except (struct.error, IndexError, TypeError) as error:
             raise DriverError(f"bus {self.profile.number}: targets {list(counts)} cannot be sent: {error}") from None
 
@@ -310,8 +317,9 @@ class BusCodec:
             self._on_other(frame)
 
     def _on_position(self, drive: Drive, frame: Frame) -> None:
-        if len(frame.data) != self._positions.size:
-            self._wrong_length(drive, frame, "position", self._positions.size)
+        data = frame.data
+        if len(data) != self._position_bytes:
+            self._wrong_length(drive, frame, "position", self._position_bytes)
         elif not self._open:
             drive.late += 1
             self._tell(EventCode.LATE, drive.node, "its position came after its cycle")
@@ -319,11 +327,13 @@ class BusCodec:
             drive.duplicates += 1
             self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
         else:
-            drive.position, *others = self._positions.unpack(frame.data)
-            if self._tells_torque:
-                drive.torque, drive.torques = others[-1], drive.torques + 1
-            if self._tells_status:
-                self._take_status(drive, others[0])
+            values = self._unpack_position(data)
+            drive.position = values[0]
+            if len(values) > 1:
+                if self._tells_torque:
+                    drive.torque, drive.torques = values[-1], drive.torques + 1
+                if self._tells_status:
+                    self._take_status(drive, values[1])
             drive.seen = drive.answered = True
             self._missing -= 1
             drive.age = 0

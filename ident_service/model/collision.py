@@ -481,6 +481,7 @@ class Contact:
 
     Attributes:
         pairs: readable names of their owners, one per pair of solids.
+        clear: what `depths` returns while nothing touches, minus infinity for each pair, shape (len(pairs),).
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -504,8 +505,8 @@ class Contact:
             solids, found = geometry(around, [pair for _, pair in named[turn :: self._turns]])
             self._groups.append((solids, found, slice(turn, None, self._turns)))
         self._turn = 0
-        self._clear = np.full(len(named), -np.inf)
-        self._clear.setflags(write=False)
+        self.clear = np.full(len(named), -np.inf)
+        self.clear.setflags(write=False)
 
     def depths(self, position: Array) -> Array:
         """Return the penetration depth of each pair of solids that is checked in this call.
@@ -518,14 +519,14 @@ class Contact:
             for pairs whose turn it is not, and for all while nothing touches.
         """
         if not self.pairs:
-            return self._clear
+            return self.clear
         solids, found, rows = self._groups[self._turn]
         self._turn = (self._turn + 1) % self._turns
         nearest = pin.computeDistances(self._model, self._data, solids, found, position)
         # If all distances are NaN, there is no nearest pair.
         if nearest < len(solids.collisionPairs) and found.distanceResults[nearest].min_distance >= 0.0:
-            return self._clear
-        depths = self._clear.copy()
+            return self.clear
+        depths = self.clear.copy()
         distances = np.array([result.min_distance for result in found.distanceResults])
         depths[rows] = np.where(np.isnan(distances), np.inf, -distances)
         return depths

@@ -82,7 +82,7 @@ class FrictionFeedforward:
             limits: for the velocity over which Coulomb friction turns round.
         """
         self.friction, self.share = friction, share
-        self._coupling = chain.coupling
+        self._coupling = None if np.array_equal(chain.coupling, np.eye(chain.joints)) else chain.coupling
         self._coulomb, self._viscous = share * friction.coulomb, share * friction.viscous
         moves = np.abs(chain.coupling)
         over = np.maximum(_TURNS * moves @ limits.velocity, self._coulomb * (moves @ limits.acceleration) / _TURNING)
@@ -90,9 +90,9 @@ class FrictionFeedforward:
 
     def torque(self, velocity: Array) -> Array:
         """Return the torque to add [N m or N] for a reference's velocity [rad/s or m/s], each (..., joints)."""
-        rate = velocity @ self._coupling.T
+        rate = velocity if self._coupling is None else velocity @ self._coupling.T
         felt = self._coulomb * np.tanh(self._turns * rate) + self._viscous * rate + self.friction.offset
-        return np.asarray(felt @ self._coupling)
+        return np.asarray(felt if self._coupling is None else felt @ self._coupling)
 
 
 def friction_feedforward(model: ArmModel, limits: MotionLimits) -> FrictionFeedforward:

@@ -151,7 +151,7 @@ class Loop:
             self.deadlines.elapsed,
             self.control.feedforward,
             known=self.deadlines.known,
-            unexplained=sample.torque - self._explained if self._explained is not None else 0.0,
+            unexplained=sample.torque - self._explained if self._explained is not None else None,
         )
         law = self._law(sample, usable, reference, free)
         if self.gives_positions:
@@ -408,7 +408,7 @@ class Loop:
 
     def _remember(self, sample: Sample, usable: Flags, reference: Setpoint) -> None:
         error = np.abs(reference.position - sample.position)
-        if not usable.all():
+        if not all(usable.tolist()):
             error = np.where(usable, error, 0.0)
         np.maximum(self.peaks.following_error, error, out=self.peaks.following_error)
         np.maximum(self.peaks.torque, np.abs(sample.torque), out=self.peaks.torque)

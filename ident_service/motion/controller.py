@@ -122,7 +122,7 @@ class ComputedTorque:
     def _filtered(self, position: Vector, valid: Flags, elapsed: float | None) -> Vector:
         """Update the velocity filter and return the position, predicted where it was not measured."""
         seconds = self._period if elapsed is None else elapsed
-        if self._missing is not None or not valid.all():
+        if self._missing is not None or not all(valid.tolist()):
             return self._bridged(position, valid, seconds)
         gain = self._gain if seconds == self._period else _gain(self._cutoff, seconds)
         if seconds > 0.0:

@@ -10,11 +10,10 @@ one: a loop that loses more than `LATE * FOLLOWS` of every period still falls be
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterable
 from typing import Any
-
-import numpy as np
 
 from drivers.arm import Watchdog
 from ident_service.motion.faults import Fault, FaultCounter
@@ -33,7 +32,7 @@ class Histogram:
     def __init__(self) -> None:
         self.count = 0
         self.worst_ns = 0
-        self._edges = np.array(_EDGES_US, dtype=np.int64) * 1000
+        self._edges = [1000 * edge for edge in _EDGES_US]
         self._counts = [0] * (len(_EDGES_US) + 1)
 
     def add(self, time_ns: int) -> None:
@@ -41,7 +40,7 @@ class Histogram:
         self.count += 1
         if time_ns > self.worst_ns:
             self.worst_ns = time_ns
-        self._counts[int(self._edges.searchsorted(time_ns, side="left"))] += 1
+        self._counts[bisect_left(self._edges, time_ns)] += 1
 
     def below_us(self, share: float) -> float:
         """Return the bin edge [us] that `share` of all times do not exceed; the longest time if in the last bin."""

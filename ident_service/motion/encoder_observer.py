@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.arm import Counts, Flags, Vector
+from drivers.arm import Flags, Vector
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import MotionLimits
 from ident_service.model.arm_model import ArmModel
@@ -142,16 +142,16 @@ class FrozenEncoderObserver:
         """
         self._dynamics, self._least, self._period = dynamics, least or dynamics, period
         self._encoders = EncoderCoordinates.of(coupling, len(resolution))
-        self._standing, self._sliding = STANDING * friction, SLIDING * friction
+        self._standing, self._sliding = (STANDING * friction).tolist(), (SLIDING * friction).tolist()
         hidden = HIDDEN_SHARE * limits.following_error + STEPS * resolution
         self._hidden = self._encoders.largest_motions(hidden)
         self._speed, self._way = np.zeros_like(friction), np.zeros_like(friction)
-        self._base, self._base_answer = np.zeros_like(friction), np.zeros_like(friction)
-        self._base_fed = np.zeros_like(friction)
+        # Push, feedback acceleration and friction fed forward with which each position last changed.
+        self._base, self._base_answer, self._base_fed = ([0.0] * len(friction) for _ in range(3))
         self._none: Flags = np.zeros(len(friction), dtype=bool)
-        self._direction, self._slid = np.zeros_like(friction), np.zeros_like(friction)
+        self._direction, self._slid = [0.0] * len(friction), [0.0] * len(friction)
         self._cycle, self._slides_within = 0, max(1, round(SLID / period))
-        self._stepped: Counts = np.zeros(len(friction), dtype=np.int64)
+        self._stepped = [0] * len(friction)
         self._owing = False
 
     def update(
@@ -178,28 +178,24 @@ class FrozenEncoderObserver:
         """
         self._cycle += 1
         encoders, given = self._encoders, correction
-        fed = encoders.forces(np.full(correction.shape, feedforward))
+        fed = feedforward if isinstance(feedforward, np.ndarray) else np.full(correction.shape, feedforward)
+        fed = encoders.forces(fed)
         correction, answer = encoders.forces(correction), encoders.velocities(answer)
         pushed = correction + fed
-        changed = direction != 0.0
-        if changed.any():
-            slides = (direction == self._direction) & (self._cycle - self._stepped <= self._slides_within)
-            np.copyto(self._slid, direction * slides, where=changed)
-            np.copyto(self._direction, direction, where=changed)
-            np.copyto(self._stepped, self._cycle, where=changed)
-            np.copyto(self._base, pushed, where=changed)
-            np.copyto(self._base_answer, answer, where=changed)
-            np.copyto(self._base_fed, fed, where=changed)
-        change = pushed - self._base
-        allowed = np.where(change * self._slid > 0.0, self._sliding, self._standing)
-        if not (np.abs(change) > allowed).any():
+        self._note_changes(direction, pushed, answer, fed)
+        shifts = [push - base for push, base in zip(pushed.tolist(), self._base, strict=True)]
+        limits = zip(shifts, self._slid, self._sliding, self._standing, strict=True)
+        most = [sliding if shift * slid > 0.0 else standing for shift, slid, sliding, standing in limits]
+        beyond = [abs(shift) > limit for shift, limit in zip(shifts, most, strict=True)]
+        if not any(beyond):
             self._reset_estimate()
             return self._none
         if not given.any():
-            self._base, self._base_answer = correction.copy(), answer.copy()
-            self._base_fed = np.zeros_like(correction)
+            self._base, self._base_answer = correction.tolist(), answer.tolist()
+            self._base_fed = [0.0] * len(self._base)
             self._reset_estimate()
             return self._none
+        change, allowed = np.array(shifts), np.array(most)
         inertia = encoders.inertias(self._dynamics.mass_matrix(position))
         own = np.sign(change) * (inertia * (answer - self._base_answer) + fed - self._base_fed)
         push = np.minimum(np.abs(change), own) - allowed
@@ -208,6 +204,17 @@ class FrozenEncoderObserver:
         self._way = np.where(acting, self._way + self._speed * self._period, 0.0)
         self._owing = True
         return np.asarray(self._way > self._hidden)
+
+    def _note_changes(self, direction: Vector, pushed: Vector, answer: Vector, fed: Vector) -> None:
+        """Note with what each position that has changed did so, and whether its joint slides."""
+        rows = zip(direction.tolist(), pushed.tolist(), answer.tolist(), fed.tolist(), strict=True)
+        for k, (towards, push, acceleration, friction) in enumerate(rows):
+            if towards == 0.0:
+                continue
+            slides = towards == self._direction[k] and self._cycle - self._stepped[k] <= self._slides_within
+            self._slid[k] = towards if slides else 0.0
+            self._direction[k], self._stepped[k] = towards, self._cycle
+            self._base[k], self._base_answer[k], self._base_fed[k] = push, acceleration, friction
 
     def _reset_estimate(self) -> None:
         if self._owing:

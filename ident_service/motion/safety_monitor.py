@@ -1,7 +1,9 @@
 """Judge every sample before the next torque leaves, and every torque before it leaves.
 
-Nearly all cycles are healthy, so all thresholds are compared at once, in one array. Only when one of them is violated
-is each compared by itself and put into words. NaN violates every threshold.
+Nearly all cycles are healthy, so a cycle first asks only whether all thresholds are kept. Only when one of them is
+violated is each compared by itself and put into words. NaN violates every threshold.
+
+For a handful of joints, `all(flags.tolist())` takes a tenth of the time of `flags.all()`, and floats less than arrays.
 """
 
 from __future__ import annotations
@@ -313,6 +315,7 @@ class SafetyMonitor:
             frozen, sudden = (max(_LEAST_UNCHANGED, round(one / period)) for one in seconds)
             self._frozen_after = frozen, sudden
         self._target = self._previous_target = position.copy()
+        self._none = np.zeros(joints)
         self._healthy: tuple[int, ...] = ()
         self._was_powered = np.zeros(joints, dtype=bool)
         self._jump = JUMP * limits.velocity * period
@@ -320,11 +323,9 @@ class SafetyMonitor:
         together = np.eye(joints, dtype=bool) if limits.motors is None else limits.motors.together
         self._joined = together @ together.T  # which joints share motors
         self._braking = 2.0 * ENVELOPE * limits.acceleration
-        zero, slack = np.zeros(joints), (ENVELOPE_SLACK * limits.velocity) ** 2
-        away = limits.following_error
-        self._bounds = np.array([zero, zero, slack, slack, VELOCITY_STOP * limits.velocity, away, self._jump])
-        self._values = np.zeros_like(self._bounds)
-        self._rows = tuple(self._values)
+        slack, fastest = (ENVELOPE_SLACK * limits.velocity) ** 2, VELOCITY_STOP * limits.velocity
+        bounds = limits.lower, limits.upper, self._braking, slack, fastest, limits.following_error
+        self._quiet_bounds = list(zip(*(bound.tolist() for bound in bounds), strict=True))
 
     @property
     def warnings(self) -> dict[str, int]:
@@ -342,7 +343,7 @@ class SafetyMonitor:
         feedforward: Vector | float = 0.0,
         *,
         known: bool = True,
-        unexplained: Vector | float = 0.0,
+        unexplained: Vector | None = None,
     ) -> tuple[Flags, Fault | None]:
         """Check a sample against all thresholds; returns the usable positions and the most severe fault.
 
@@ -358,19 +359,20 @@ class SafetyMonitor:
             feedforward: friction in the torque before this sample [N m or N], shape (joints,), which pushes a joint
                 against its own friction as the correction does.
             unexplained: torque that drives which are given positions measure beside the model's [N m or N], shape
-                (joints,), by which they push a joint on their own.
+                (joints,), by which they push a joint on their own; None where none is known.
 
         Returns:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
         self.findings.cycle += 1
         self._elapsed, self._known = self._period if elapsed is None else elapsed, known
-        answered = bool(sample.valid.all())
+        answered = all(sample.valid.tolist())
         encoders = self._encoders
         steps, valid = encoders.steps(sample.position, self._shown), encoders.valid(sample.valid)
-        own = np.abs(encoders.forces(np.full(correction.shape, unexplained)))
-        pushed = np.maximum(np.abs(encoders.forces(correction + feedforward)), own)
-        self._count_stationary_cycles((steps != 0.0) & valid, pushed)
+        pushed = np.abs(encoders.forces(correction + feedforward))
+        if unexplained is not None:
+            pushed = np.maximum(pushed, np.abs(encoders.forces(unexplained)))
+        self._count_stationary_cycles(steps, valid, pushed)
         same = (steps == 0.0) & valid
         if self._most_torque is not None:
             # A drive that has been given no other position brings its joint to a stand.
@@ -378,7 +380,7 @@ class SafetyMonitor:
             self._previous_target = self._target
         self._count_unchanged(same, velocity)
         if self._encoder_observer is not None and answer is not None:
-            direction = np.where(valid, (steps > 0.0) * 1.0 - (steps < 0.0), 0.0)
+            direction = np.subtract(steps > 0.0, steps < 0.0, dtype=float) * valid
             self._owes = self._encoder_observer.update(direction, correction, answer, self._position, feedforward)
         held = answered and self._all_fresh and self._quiet(sample.position, reference.position, velocity)
         if held and self._plain(sample):
@@ -389,7 +391,7 @@ class SafetyMonitor:
             with np.errstate(all="ignore"):
                 usable, fault = self._judged(sample, reference.position, velocity)
         if self._most_torque is not None:
-            pushes = self._count_pushes(unexplained)
+            pushes = self._count_pushes(self._none if unexplained is None else unexplained)
             fault = pushes if pushes is not None and (fault is None or fault.reaction < pushes.reaction) else fault
         if sample.events:
             event = fault_from_events(sample.events, self._names, self.findings)
@@ -410,9 +412,9 @@ class SafetyMonitor:
         limit, before, motors = self._limits.torque, self._sent, self._limits.motors
         size = np.abs(wanted)
         if (
-            (size <= limit).all()
-            and (motors is None or (motors.used(wanted) <= 1.0).all())
-            and (before is None or (np.abs(wanted - before) <= self.rate).all())
+            all((size <= limit).tolist())
+            and (motors is None or all((motors.used(wanted) <= 1.0).tolist()))
+            and (before is None or all((np.abs(wanted - before) <= self.rate).tolist()))
         ):
             self._sent = wanted
             return wanted, None
@@ -487,23 +489,25 @@ class SafetyMonitor:
 
     def _quiet(self, position: Vector, wanted: Vector, velocity: Vector) -> bool:
         """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
-        above, below, to_upper, to_lower, speed, away, jump = self._rows
-        np.subtract(position, self._limits.upper, out=above)
-        np.subtract(self._limits.lower, position, out=below)
-        np.abs(velocity, out=speed)
-        signed = velocity * speed
-        # v |v| - 2 a d, towards either limit.
-        np.multiply(self._braking, above, out=to_upper)
-        np.add(to_upper, signed, out=to_upper)
-        np.multiply(self._braking, below, out=to_lower)
-        np.subtract(to_lower, signed, out=to_lower)
-        np.subtract(wanted, position, out=away)
-        np.abs(away, out=away)
-        np.subtract(position, self._position, out=jump)
-        np.subtract(jump, velocity * self._elapsed, out=jump)
-        np.abs(jump, out=jump)
-        self._bounds[-1] = self._farthest()
-        return bool((self._values <= self._bounds).all())
+        rows = zip(
+            *(position.tolist(), self._position.tolist(), wanted.tolist(), velocity.tolist()),
+            *(self._farthest().tolist(), self._quiet_bounds),
+            strict=True,
+        )
+        for here, before, target, speed, farthest, (lower, upper, braking, slack, fastest, away) in rows:
+            above, below, signed = here - upper, lower - here, speed * abs(speed)
+            kept = (
+                above <= 0.0
+                and below <= 0.0
+                and braking * above + signed <= slack  # v |v| - 2 a d, towards either limit
+                and braking * below - signed <= slack
+                and abs(speed) <= fastest
+                and abs(target - here) <= away
+                and abs(here - before - speed * self._elapsed) <= farthest
+            )
+            if not kept:
+                return False
+        return True
 
     def _farthest(self) -> Vector:
         """Return how far a position may be from the expected one [rad or m], shape (joints,)."""
@@ -511,24 +515,23 @@ class SafetyMonitor:
 
     def _plain(self, sample: Sample) -> bool:
         """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""
-        if not (self._none_still and self._all_change) and bool(self._frozen().any()):
+        if not (self._none_still and self._all_change) and any(self._frozen().tolist()):
             return False
         if sample.status is not self._healthy and not self._all_drives_healthy(sample.status):
             return False
-        if self._sent is not None and not bool((np.abs(sample.torque - self._sent) <= self._not_applied).all()):
+        if self._sent is not None and not all((np.abs(sample.torque - self._sent) <= self._not_applied).tolist()):
             return False
-        if self._most_torque is not None and not bool((np.abs(sample.torque) <= self._most_torque).all()):
+        if self._most_torque is not None and not all((np.abs(sample.torque) <= self._most_torque).tolist()):
             return False
-        if sample.torque_difference is not None and not bool(
-            (np.abs(sample.torque_difference) <= self._not_applied).all()
-        ):
+        more = sample.torque_difference
+        if more is not None and not all((np.abs(more) <= self._not_applied).tolist()):
             return False
-        if sample.velocity is not None and not bool(np.isfinite(sample.velocity).all()):
+        if sample.velocity is not None and not all(np.isfinite(sample.velocity).tolist()):
             return False
         if self._contact is None:
             return True
         self._depths = self._contact.depths(sample.position)
-        return bool((self._depths <= 0.0).all())
+        return self._depths is self._contact.clear or all((self._depths <= 0.0).tolist())
 
     def _all_drives_healthy(self, status: tuple[int, ...]) -> bool:
         """Return whether no drive has tripped or lost its power; remembers healthy status words."""
@@ -578,7 +581,7 @@ class SafetyMonitor:
                 return usable, self._found(check)
         return usable, None
 
-    def _count_pushes(self, unexplained: Vector | float) -> Fault | None:
+    def _count_pushes(self, unexplained: Vector) -> Fault | None:
         """Count for how many cycles each drive has pushed beside the model's torque; returns a fault after too many."""
         if self._elapsed > _STALLED * self._period:
             self._catching_up = 2 * self._frozen_after[0]
@@ -587,15 +590,16 @@ class SafetyMonitor:
         self._pushing = np.where(hit, self._pushing + 1, 0)
         if not (long := self._pushing >= self._frozen_after[0]).any():
             return None
-        numbers = (np.broadcast_to(unexplained, long.shape), self._limits.torque)
+        numbers = (unexplained, self._limits.torque)
         return self._found(
             Check("torque_unexplained", long, "the drive measures {} {f} beside the model's, of {}", numbers)
         )
 
-    def _count_stationary_cycles(self, changed: Flags, pushes: Vector) -> None:
+    def _count_stationary_cycles(self, steps: Vector, valid: Flags, pushes: Vector) -> None:
         """Count for how many cycles each position has stood still while the controller, or the drive, pushed."""
         pushed = pushes > self._push
-        if pushed.any():
+        if any(pushed.tolist()):
+            changed = (steps != 0.0) & valid
             self._still = np.where(pushed & ~changed, self._still + 1, 0)
             self._none_still = False
         elif not self._none_still:
@@ -604,7 +608,7 @@ class SafetyMonitor:
 
     def _count_unchanged(self, same: Flags, velocity: Vector) -> None:
         """Count for how many cycles each position has stood still, and note whether that began in full motion."""
-        if same.any():
+        if any(same.tolist()):
             fast = np.abs(self._encoders.velocities(velocity)) > self._fast
             self._sudden = np.where(self._unchanged == 0, same & fast, self._sudden)
             self._unchanged = np.where(same, self._unchanged + 1, 0)

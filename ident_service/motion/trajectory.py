@@ -48,7 +48,7 @@ class PathReference:
 
     def at(self, time: float) -> Setpoint:
         """Return the setpoint at `time` [s]."""
-        position, velocity, acceleration, _ = self._path.at(min(time, self.duration))
+        position, velocity, acceleration = self._path.derivatives(np.asarray(min(time, self.duration), dtype=float), 2)
         return Setpoint(position, velocity, acceleration)
 
 

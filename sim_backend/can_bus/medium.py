@@ -281,7 +281,7 @@ class Medium:
         return True
 
     def _finish(self, sender: BusEndpoint, frame: Frame, end: int) -> None:
-        for key in (sender, None):
+        for key in (sender, None) if self._to_destroy else ():
             if self._to_destroy.get(key, 0):
                 self._to_destroy[key] -= 1
                 self._destroyed(sender, frame, end)
@@ -290,12 +290,14 @@ class Medium:
             self._destroyed(sender, frame, end)
             return
         self.sent += 1
-        heard = frame._replace(stamp_ns=end)
-        self._note(sender, sender.counters.sent(end))
+        identifier, data, remote, error, extended, _, fd = frame
+        heard = Frame(identifier, data, remote, error, extended, end, fd)  # `_replace` takes three times as long
+        if sender.counters.sending:
+            self._note(sender, sender.counters.sent(end))
         for port in self.ports:
             if port.counters.state == "off":
                 continue
-            if port is not sender:
+            if port is not sender and port.counters.receiving:
                 self._note(port, port.counters.received(end))
             if port is not sender or port.own:
                 port.hear(heard, port is sender)

@@ -75,6 +75,11 @@ class PythonCanBuses:
         for thread in self._threads:
             thread.start()
 
+    @property
+    def waits(self) -> bool:
+        """Return whether a frame has come that needs no look at an interface."""
+        return not self._heard.empty()
+
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
         """Return the next frame with its bus, None when none comes in time.
 
@@ -187,6 +192,11 @@ class HostedBuses:
         except BaseException:
             self.close()
             raise
+
+    @property
+    def waits(self) -> bool:
+        """Return whether a frame has come that needs no look at a wire."""
+        return bool(self._heard)
 
     def receive(self, timeout: float) -> tuple[int, Frame] | None:
         """Return the next frame with its bus, None when none comes in time.
@@ -359,19 +369,20 @@ class _Run:
                     self._look(now)
                     if stop_requested() or (end is not None and now >= end):
                         break
-                heard = self._station.receive(self._poll_timeout(now, looked))
-                # Time goes on to when nothing waited any more, however late this process is.
-                now = clock.now_ns()
-                heard, at_once = heard or self._station.receive(0.0), 0
-                while heard is not None:
+                heard, at_once = self._station.receive(max(0, self._next_due(looked) - now) * 1e-9), 0
+                while at_once < _AT_ONCE:
+                    now = clock.now_ns()
+                    if heard is None and now >= self._next_due(looked):
+                        heard = self._station.receive(0.0)  # what came before what is due is handled before it
+                    if heard is None:
+                        break
                     at_once += 1
                     bus, frame = heard
                     # Drives act when a frame is on the wire, not when this process comes to it.
                     at_ns = frame.stamp_ns if self._stamps else clock.now_ns()
                     answer = partial(self._send_ready_frames, requested_ns=at_ns)
                     answer(emulator.receive(bus, frame, at_ns, answer=answer))
-                    now = clock.now_ns()
-                    heard = self._station.receive(0.0) if at_once < _AT_ONCE else None
+                    heard = self._station.receive(0.0) if self._station.waits else None
                 if at_once:
                     self._heard += at_once
                     heard_ns = clock.now_ns()
@@ -390,13 +401,14 @@ class _Run:
             (now - begun) * 1e-9, self._heard, self._sent, self._station.unsent, emulator.states, self._is_at_rest(now)
         )
 
-    def _poll_timeout(self, now_ns: int, looked_ns: int) -> float:
+    def _next_due(self, looked_ns: int) -> int:
+        """Return when there is something to do although no frame comes [ns]."""
         due = [looked_ns + _POLL_NS, *(item[0] for item in self._later[:1])]
         if (deadline := self._emulator.next_deadline_ns) is not None:
             due.append(deadline)
         if self._streaming and (overdue := self._emulator.body.overdue_ns) is not None:
             due.append(overdue)
-        return max(0, min(due) - now_ns) * 1e-9
+        return min(due)
 
     def _send_ready_frames(self, sent: Sequence[Sent], requested_ns: int | None = None) -> None:
         """Send what is ready, the lowest identifiers first, as a bus would, but no position too late."""

@@ -207,6 +207,8 @@ def test_wrong_values_are_refused_and_leave_no_record(ring: Callable[..., int]) 
         ("torque", np.float64(1.0)),
         ("valid", np.ones((3, 1))),
         ("age", np.ones(1)),
+        ("position", np.zeros(3, dtype=np.int64)),  # its bytes would be other numbers
+        ("age", np.zeros(3, dtype=np.int32)),
     ):
         with pytest.raises(ValueError, match="but the ring has 3 joints"):
             writer.put(good._replace(**{name: value}))
