@@ -599,12 +599,13 @@ def _emulate(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.control import Realtime
     from ident_service.config.load import load_arm, with_sheets
     from ident_service.motion.realtime import temporary_privileges
-    from sim_backend.emulator.process import emulate
+    from sim_backend.emulator.process import emulate, emulated_buses
 
     config = with_sheets(load_arm(arguments.arm), arguments.eds)
+    emulated_buses(config)  # refuses before memory is locked, which takes a while
     first = ["set-home", arguments.arm] if config.zeroed_at_home else ["bus", "scan", arguments.arm]
     then = f"; in another terminal: `{command(arguments, first)}`"
-    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then if config.can_buses else ''}")
+    tell(arguments, f"{config.name}: emulated drives; Ctrl-C ends{then}")
     stopping = StopOnSignal()
     # On another core than the motion process, if there is one.
     with stopping, temporary_privileges(core_from_last=1, settings=Realtime(priority=config.realtime.priority)):

@@ -277,6 +277,23 @@ class Emulated:
     at_rest: bool
 
 
+def emulated_buses(config: ArmConfig) -> tuple[CanBus, ...]:
+    """Return the buses that a process of emulated drives serves.
+
+    Raises:
+        UsageError: drives that are not on a CAN bus, or in the process that moves them.
+    """
+    buses = config.can_buses
+    if not buses:
+        raise UsageError(f"{config.name}: the driver has no CAN bus, so there is no drive to emulate")
+    if any(bus.interface == INTERFACE for bus in buses):
+        raise UsageError(
+            f"{config.name}: {INTERFACE} drives live in the process that moves them; "
+            "name an interface such as socketcan, udp_multicast or ident_wire"
+        )
+    return buses
+
+
 def emulate(
     config: ArmConfig,
     *,
@@ -300,17 +317,10 @@ def emulate(
         The summary.
 
     Raises:
-        UsageError: drives that are not on a CAN bus, or in the process that moves them; a malformed fault.
+        UsageError: as `emulated_buses`; a malformed fault.
         DriverError: as `build_emulator`, an interface that cannot be had or is lost.
     """
-    buses = config.can_buses
-    if not buses:
-        raise UsageError(f"{config.name}: the driver has no CAN bus, so there is no drive to emulate")
-    if any(bus.interface == INTERFACE for bus in buses):
-        raise UsageError(
-            f"{config.name}: {INTERFACE} drives live in the process that moves them; "
-            "name an interface such as socketcan, udp_multicast or ident_wire"
-        )
+    buses = emulated_buses(config)
     emulator = build_emulator(config)
     try:
         emulator.add_configured(parse_fault(text, emulator.names) for text in faults)

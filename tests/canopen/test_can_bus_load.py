@@ -12,8 +12,8 @@ from can_arms import MAX_TORQUE, RATED
 
 from drivers.canopen.motor_units import coordinates
 from ident_service.cli import DONE, USAGE, VERDICT_NO, main
-from ident_service.config.canopen import CanopenDriver
-from ident_service.config.load import disagreements, load_arm
+from ident_service.config.canopen import CanopenDriver, disagreements
+from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ConfigError
 from ident_service.model.arm_model import arm_model

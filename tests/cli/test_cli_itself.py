@@ -185,6 +185,7 @@ IDENTIFY_LOADS = {
     *("pydantic", "pydantic_core", "annotated_types", "typing_extensions", "typing_inspection"),  # configurations
     *("jinja2", "markupsafe"),  # the report
     "mcap",  # recordings; of CSV its numbers of records alone
+    *("pinocchio", "coal"),  # the URDF that was made is read back
     # Clarabel takes LAPACK from scipy.linalg.
     *("scipy", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),
     *("scipy._cyutility", "scipy._distributor_init", "scipy._distributor_init_local"),
