@@ -29,8 +29,8 @@ TESTS := $(BIN)/pytest -n 4 --dist worksteal
 unit: $(READY)
 	$(TESTS) -m "not campaign and not slow and not realtime"
 
-# Every branch of what stops an arm, by its own tests: less than all of them fails. In one process, which is done before
-# the type checker beside it: each worker more would first load for three seconds what it traces.
+# Every branch of what stops an arm, by its own tests: less than all of them fails. One process ends before the type checker
+# beside it does; each further one would spend three seconds on imports.
 GUARDED := encoder_observer faults safety_monitor state_machine stop_trajectory
 GUARD_TESTS := $(addprefix tests/motion/test_motion_, guard.py guard_motors.py guard_positions.py guard_table.py encoder_observer.py states.py stop.py drive_events.py)
 coverage: $(READY)

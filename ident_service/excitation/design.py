@@ -35,7 +35,7 @@ from ident_service.excitation.prediction import (
     information,
     seconds_of_information,
 )
-from ident_service.excitation.search import Budget, Candidate, Progress, SearchResult, polished, search
+from ident_service.excitation.search import FIRST_LOOK, Budget, Candidate, Progress, SearchResult, polished, search
 from ident_service.excitation.trajectory import Basis, FourierBasis, FourierPath, PostureBasis, PosturePath
 from ident_service.model.arm_model import ArmModel, control_model
 from ident_service.model.base_parameters import BaseParameters, base_parameters, static_base_parameters
@@ -294,7 +294,7 @@ _PER_WAY = 24  # samples of a search per segment between postures
 _MOST_SAMPLES = 2000
 _EXACT = 1e6  # exponent of power means that are as good as the extremes themselves
 _MENDING = 0.2  # of the time of a search, for what the proof of its result objects to
-_LOOKING, _LOOK = 0.2, 6.0  # of the time, and at most [s], for a first motion whose proof says how the arm follows
+_LOOKING = 0.2  # of the time, for a first motion and what its proof says about how the arm follows; FIRST_LOOK at most
 _SOFT = 3.0  # times the stiffness that a joint lacks to follow at its velocity limit
 _SHORTEST = 1.0  # s, below which it does not pay to begin another part of a search
 
@@ -520,7 +520,7 @@ def _searched(
         seconds = budget.seconds - kept_back
         if budget.starts is None and earlier is None:
             # What the proof of a first motion finds to be missing is kept free from then on.
-            look = min(_LOOK, _LOOKING * budget.seconds)
+            look = min(FIRST_LOOK, _LOOKING * budget.seconds)
             looked = search(task, safe, seed, replace(budget, seconds=look), per, tell, cancelled)
             if looked.candidates[0].start >= 0 and not cancelled():
                 aimed = prover.aimed(looked.candidates[0])

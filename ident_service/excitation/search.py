@@ -10,10 +10,11 @@ result however the rounds went.
 It runs in one process and has no clock of its own; the caller decides when to stop.
 
 Start number k of seed s is always the same motion to begin with, so that a search bounded by starts gives the same
-result every time, and one bounded by time can be resumed. Time is spent in rounds, each as long as all before it, so
-that a longer search begins as a shorter one does and finds no less. Starts take a quarter of a round, because polishing
-gains more than the best of many starts is better than the first. What time is left when the best are polished goes to
-further starts, which are polished in their turn; a polish that a round cuts short goes on in the next.
+result every time, and one bounded by time can be resumed. Time is spent in rounds, each as long as all before it and
+the look before them, however long the search will be, so that a longer search begins as a shorter one does. Starts
+take a quarter of a round, because polishing gains more than the best of many starts is better than the first. What
+time is left when the best are polished goes to further starts, which are polished in their turn; a polish that a
+round cuts short goes on in the next.
 """
 
 from __future__ import annotations
@@ -239,7 +240,8 @@ def within_limits(problem: Problem, coefficients: Array) -> bool:
 
 _KEPT = 8  # best candidates
 _POLISHED = 4
-_FIRST_ROUND = 18.0  # s
+FIRST_LOOK = 6.0  # s, at most, which whoever designs a motion spends before the rounds
+_FIRST_ROUND = 18.0  # s; so that rounds end with searches of 30, 60, 120 s, a fifth of which mends what was found
 _STARTS_SHARE = 0.25  # of a round
 _STARTS_TAKE = 0.5  # of all the time, where their number is given
 _FINER = 2  # the grid of the polish against that of the starts
@@ -397,6 +399,7 @@ class _Run:
         earlier: SearchResult | None,
     ) -> None:
         self._budget, self._begun, self._tell, self._cancelled = budget, begun, tell, cancelled
+        self._end = None if budget.seconds is None else begun + budget.seconds
         self._seed = seed
         self._broken = False
         self._before = 0.0 if earlier is None else earlier.seconds
@@ -411,24 +414,23 @@ class _Run:
         return SearchResult(self._seed, self._finished, elapsed, tuple(self._best) or (self._standing,))
 
     def round_ends(self) -> Iterator[float | None]:
-        """Yield the time at which each round ends: twice as late each time, at last when the search does."""
-        seconds = self._budget.seconds
-        if seconds is None or self._budget.starts is not None:
-            yield None if seconds is None else self._begun + seconds
+        """Yield when each round ends, the last perhaps after the search; one round where starts are counted."""
+        if self._end is None or self._budget.starts is not None:
+            yield self._end
             return
-        passed = 0.0
-        while passed < seconds and not self._over(None):
-            passed = min(seconds, 2.0 * passed or _FIRST_ROUND)
+        passed = _FIRST_ROUND
+        while not self._over(self._end):
             yield self._begun + passed
+            passed = 2.0 * passed + FIRST_LOOK
 
     def has_time_for_starts(self, end: float) -> bool:
         """Return whether there is time for further starts in a round, and the budget allows them."""
-        return self._budget.starts is None and not self._over(end)
+        return self._budget.starts is None and not self._over(self._within(end))
 
     def starts(self, workers: _WorkerPool, end: float | None) -> None:
         """Run starts in a share of the time that is left of a round, or as many as are asked for."""
         now = self._budget.clock()
-        until = None if end is None else now + _STARTS_SHARE * (end - now)
+        until = None if end is None else self._within(now + _STARTS_SHARE * (end - now))
         last = None if self._budget.starts is None else self._first + self._budget.starts
         running: set[Future[Candidate]] = set()
         while True:
@@ -443,7 +445,9 @@ class _Run:
                 self._finished += 1
                 self._take(candidate)
 
-    def polish(self, workers: _WorkerPool, until: float | None) -> None:
+    def polish(self, workers: _WorkerPool, end: float | None) -> None:
+        """Polish the best that are not polished yet, until a round ends."""
+        until = None if end is None else self._within(end)
         running: set[Future[Candidate]] = set()
         waiting = [one for one in self._best if one.start not in self._polished][:_POLISHED]
         while (waiting or running) and not self._broken:
@@ -455,6 +459,9 @@ class _Run:
                 self._take(candidate)
                 if not self._over(until):
                     self._polished.add(candidate.start)
+
+    def _within(self, time: float) -> float:
+        return time if self._end is None else min(time, self._end)
 
     def _over(self, until: float | None) -> bool:
         return self._broken or self._cancelled() or (until is not None and self._budget.clock() >= until)

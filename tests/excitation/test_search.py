@@ -156,10 +156,17 @@ def test_a_budget_of_time_is_kept() -> None:
 
 
 @pytest.mark.slow
-def test_twice_the_time_begins_as_half_of_it_does_and_finds_no_less() -> None:
+def test_a_longer_search_begins_as_a_shorter_one_does_and_finds_no_less() -> None:
+    # Of the shorter one, the second round is cut short.
+    told: dict[float, list[Progress]] = {30.0: [], 42.0: []}
     shorter, longer = (
-        starts(None, seconds=seconds, clock=ticking(0.05), seed=0).candidates for seconds in (18.0, 36.0)
+        starts(None, seconds=seconds, clock=ticking(0.05), seed=0, tell=steps.append).candidates
+        for seconds, steps in told.items()
     )
+    both = [[(one.phase, one.finished, one.best, one.elapsed) for one in steps] for steps in told.values()]
+    common = [step for step in both[0] if step[-1] < 30.0]
+    assert len(common) > 5
+    assert both[1][: len(common)] == common
     assert longer[0].value <= shorter[0].value
     # Each start of the shorter search is polished on, or has been driven out by eight that are better.
     after = {candidate.start: candidate.value for candidate in longer}
