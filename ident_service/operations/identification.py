@@ -12,7 +12,7 @@ import numpy as np
 from ident_service.config.arm import ArmConfig, Method
 from ident_service.config.load import config_error, folder_of, load_arm, load_recording_format
 from ident_service.config.payload import Payload
-from ident_service.errors import RecordingError, SolverError, UsageError
+from ident_service.errors import ModelError, RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
 from ident_service.estimation.feasible.convex import convex_least_squares
@@ -27,6 +27,7 @@ from ident_service.estimation.plausibility import (
     reasons_in_length,
     reasons_in_recording,
     remarks_on_limits,
+    torque_clipped,
     torque_missing,
 )
 from ident_service.model.arm_model import arm_model
@@ -161,6 +162,9 @@ def identify_files(
         if all(joint.torque[0] == joint.torque[1] for joint in seen.joints):
             reason = "the torque of every joint is always the same; were other columns meant, or was it not recorded?"
             raise RecordingError(recording.path, reason)
+        if all(joint.standstill > _AT_REST for joint in seen.joints):
+            reason = "no joint moves: each is slower than 0.005 rad/s or m/s over 20 ms; record a motion"
+            raise RecordingError(recording.path, reason)
     warnings = opened.remarks
     warnings += tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
     # Replicates take 0.05 s each, reduction a third of the rest; neither is known better before.
@@ -180,11 +184,11 @@ def identify_files(
         )
     except CustomError as error:
         raise config_error(request.arm, CUSTOM, str(error)) from error
-    except SolverError as error:
-        # Values too large or small for the solver come from the recording; the error then names the reason.
+    except (ModelError, RecordingError, SolverError) as error:
+        # Values too large or small for filter or solver come from the recording; the error then names the reason.
         for recording, seen in found:
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
-                raise RecordingError(recording.path, reason) from error
+                raise RecordingError(recording.path, reason.removeprefix(f"{recording.path.name}: ")) from error
         raise
     for recording, seen in found:
         warnings += remarks_on_limits(recording.path.name, seen.joints, model)
@@ -214,6 +218,7 @@ def identify_files(
 
 
 CUSTOM = ("constraints", "custom")
+_AT_REST = 0.99  # share of the time at standstill of a recording that shows nothing
 
 
 def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
@@ -245,7 +250,10 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     wrong = (reason for reasons in seen for reason in reasons)
     # Without a joint's torque every reading of the others is as wrong.
     known = not any(torque_missing(joint) for _, one in fitted for joint in one.joints)
-    against = reasons_against(estimate, [recording for recording, _ in fitted]) if known else ()
+    clipped = torque_clipped(estimate, [one.joints for _, one in fitted])
+    against = clipped
+    if known and not clipped:
+        against = reasons_against(estimate, [recording for recording, _ in fitted])
     return Objections((*wrong, *against), reasons_in_length(estimate, seconds))
 
 
