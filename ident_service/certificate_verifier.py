@@ -964,7 +964,9 @@ def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: A
         )
     for key, label in (("name", arm.name), ("joints", list(arm.joints))):
         if label and told.get(key, label) != label:
-            raise VerificationError(f"the file's arm.{key} is not that of {arm.name}: {clean(str(told[key]))[:100]}")
+            raise VerificationError(
+                f"arm.{key}: not as the description of {arm.name} has it: {clean(str(told[key]))[:100]}"
+            )
     links = tuple(sorted(link for symbol, link in map(split_name, arm.names) if symbol == "m"))
     if claim.links != links:
         raise VerificationError(f"the certificate's links are not the {len(links)} of {arm.name}")
