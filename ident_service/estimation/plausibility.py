@@ -41,7 +41,7 @@ _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
 # Gravity alone may hold a torque on one side of zero, but seldom of so many joints at almost nothing.
 _JOINTS_WITH_SIGN, _NEARLY_NOTHING = 4, 0.01  # and share of a joint's largest torque
-_CLIPPED, _CLIPPED_ERROR = 0.02, 10.0  # share of the samples, and percent of the joint's torque, only together
+_CLIPPED, _CLIPPED_ERROR = 0.05, 10.0  # share of the samples, and percent of the joint's torque, only together
 _WEAKEST = 0.005  # of its limit, that the torque of some joint reaches in every motion
 _AT_REST = 0.9  # share of the time at standstill from which a joint need not feel a changing torque
 
