@@ -12,7 +12,7 @@ import numpy as np
 from ident_service.config.arm import ArmConfig, Method
 from ident_service.config.load import config_error, folder_of, load_arm, load_recording_format
 from ident_service.config.payload import Payload
-from ident_service.errors import ModelError, RecordingError, SolverError, UsageError
+from ident_service.errors import RecordingError, SolverError, UsageError
 from ident_service.estimation.bootstrap import bootstrap
 from ident_service.estimation.custom import CustomError, CustomFunction, load_custom
 from ident_service.estimation.feasible.convex import convex_least_squares
@@ -159,6 +159,7 @@ def identify_files(
     for count, recording in enumerate(opened.recordings):
         step(f"looking at {recording.path.name}", 0.1 + 0.1 * count / len(opened.recordings))
         found.append((recording, seen := recording_quality(recording, model)))
+        _require_measurable(recording, seen)
         if all(joint.torque[0] == joint.torque[1] for joint in seen.joints):
             reason = "the torque of every joint is always the same; were other columns meant, or was it not recorded?"
             raise RecordingError(recording.path, reason)
@@ -184,7 +185,7 @@ def identify_files(
         )
     except CustomError as error:
         raise config_error(request.arm, CUSTOM, str(error)) from error
-    except (ModelError, RecordingError, SolverError) as error:
+    except (RecordingError, SolverError) as error:
         # Values too large or small for filter or solver come from the recording; the error then names the reason.
         for recording, seen in found:
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
@@ -218,6 +219,7 @@ def identify_files(
 
 
 CUSTOM = ("constraints", "custom")
+_LARGEST = 1e15  # of a position or torque in any unit; its fourth power is still finite
 _AT_REST = 0.99  # share of the time at standstill of a recording that shows nothing
 
 
@@ -255,6 +257,14 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     if known and not clipped:
         against = reasons_against(estimate, [recording for recording, _ in fitted])
     return Objections((*wrong, *against), reasons_in_length(estimate, seconds))
+
+
+def _require_measurable(recording: Recording, seen: Quality) -> None:
+    for joint in seen.joints:
+        for what, (low, high) in (("position", joint.position), ("torque", joint.torque)):
+            if (most := max(-low, high)) > _LARGEST:
+                reason = f"the {what} of {joint.name} reaches {most:.3g}, which no sensor measures; correct or cut that"
+                raise RecordingError(recording.path, reason)
 
 
 def _config(config: ArmConfig, request: Request) -> ArmConfig:

@@ -318,7 +318,7 @@ WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
     "backwards": (backwards, {}, "wrong sign"),
     "geared": (geared, {}, "wrong sign at lwr_2_joint"),
     "turned zero": (turned_zero, {}, "lwr_1_joint"),
-    "velocities": (velocities, {}, "lwr_1_joint moves 0.* rad between two samples"),
+    "velocities": (velocities, {}, "the torque, or the position, may have the wrong sign"),
     "coarse": (coarse, {}, "lwr_0_joint moves 0.05 rad between two samples"),
     "copied": (copied, {}, "more than 30 %"),
     "reordered": (reordered, {}, "more than 30 %"),
@@ -386,15 +386,13 @@ NO_RESULT: dict[str, tuple[Change, dict[str, Any], str]] = {
         {"gravity": [0, 0, -9810]},
         r"arm\.yaml:\d+:1: gravity: 9810 m/s\^2 is more than any planet has; in mm/s\^2\? gravity is \[0, 0, -9",
     ),
-    "far": (far, {}, r"lwr_2_joint is recorded from -1\.\d+ to 3\.4e\+38 rad, farthest outside its limits"),
-    "infinite": (infinite, {}, r"lwr_0_joint reaches 2\.\d+e\+300, 1\.\d+e\+298 times its limit of 176"),
+    "far": (far, {}, r"the position of lwr_2_joint reaches 3\.4e\+38, which no sensor measures"),
+    "infinite": (infinite, {}, r"the torque of lwr_0_joint reaches 2\.\d+e\+300, which no sensor measures"),
 }
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [*list(NO_RESULT)[:3], *(pytest.param(one, marks=pytest.mark.campaign) for one in ("far", "infinite"))]
-)
+@pytest.mark.parametrize("name", NO_RESULT)
 def test_the_command_names_what_no_estimate_is_made_of(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
