@@ -163,7 +163,8 @@ def identify_files(
         if all(joint.torque[0] == joint.torque[1] for joint in seen.joints):
             reason = "the torque of every joint is always the same; were other columns meant, or was it not recorded?"
             raise RecordingError(recording.path, reason)
-        if all(joint.standstill > _AT_REST for joint in seen.joints):
+        # At lower rates the time is in another unit, which `require_motion` tells.
+        if seen.rate_hz > _SLOWEST and all(joint.standstill > _AT_REST for joint in seen.joints):
             reason = "no joint moves: each is slower than 0.005 rad/s or m/s over 20 ms; record a motion"
             raise RecordingError(recording.path, reason)
     warnings = opened.remarks
@@ -220,6 +221,7 @@ def identify_files(
 
 CUSTOM = ("constraints", "custom")
 _LARGEST = 1e15  # of a position or torque in any unit; its fourth power is still finite
+_SLOWEST = 5.0  # Hz; nobody samples an arm more slowly
 _AT_REST = 0.99  # share of the time at standstill of a recording that shows nothing
 
 
