@@ -292,7 +292,6 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
 
 @pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_rehearsal_elsewhere_ends_with_the_key_here(
     state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,7 +331,6 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
     state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
