@@ -514,10 +514,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
     state = writable_state_folder(arguments)
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
-    require_writable(path.parent)
     if arguments.confirm not in (None, config.name):
         raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
     arm, model = make_arm(config), arm_model(config)
+    require_writable(path.parent)
     lease, stopping = requested_lease(arguments, config), StopOnSignal()
     # `ident stop` finds this process as the one that moves the arm, and ends the preflight. A person's Ctrl-C
     # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.

@@ -215,6 +215,58 @@ def test_a_correction_that_cannot_be_written(place: Path, ident: Ident) -> None:
     refused(place, ident, words, 2, f"{place / 'nowhere' / 'c.json'}: cannot be written: No such file or directory")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "correct {place}/p.json --out {file}/c.json",
+        "compare {run} {run} --out {file}/c.json",
+        "compare {run} {run} --out {file}/c",
+        "preview planar2 --out {file}/p",
+        "identify {run}/identification.mcap --arm {arm} --out {file}/out",
+        "simulate {arm} --out {file}/run",
+        "new {run}/identified.urdf --out {file}/a.yaml",
+        "backup {file}/b.tar",
+    ],
+)
+def test_a_file_in_the_place_of_a_folder_above(place: Path, quick: Commissioned, ident: Ident, words: str) -> None:
+    file = place / "file"
+    file.write_text("a file")
+    (place / "p.json").write_text(json.dumps(TABLE))
+    assert ident("runs").code == 0  # a registry to back up
+    given = words.format(place=place, file=file, run=quick.folder, arm=quick.arm).split()
+    refused(place, ident, tuple(given), 2, str(file))
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["runs", "stop", "stop planar2", "recover planar2", "preflight planar2", "simulate planar2", "finish planar2"],
+)
+def test_a_file_in_the_place_of_the_state_folder(place: Path, ident: Ident, words: str) -> None:
+    file = place / "file"
+    file.write_text("a file")
+    refused(place, ident, (*words.split(), "--state", file), 2, f"{file}: is a file, not a folder; --state or $IDENT")
+
+
+def test_a_preflight_that_is_refused_leaves_no_folder_of_the_arm(place: Path, ident: Ident, state: Path) -> None:
+    refused(place, ident, ("preflight", "wam7"), 2, "wam7: the arm has no driver section")
+    assert not state.exists()
+
+
+def test_a_range_that_is_none_is_told_from_a_missing_file(place: Path, quick: Commissioned, ident: Ident) -> None:
+    file = quick.folder / "identification.mcap"
+    wrong = file.with_name("identification.mcap@-5:2")
+    words = f"{wrong}: no such file; a range of {file} is {file}@START:END, in seconds from 0"
+    refused(place, ident, identify(place, quick, wrong), 2, words)
+
+
+def test_a_file_without_a_certificate_says_what_makes_one(place: Path, ident: Ident) -> None:
+    path = place / "p.json"
+    path.write_text(json.dumps(TABLE))
+    ended = ident("verify", path)
+    assert (ended.code, ended.out.count("\n")) == (3, 1)
+    assert "there is no certificate in it; `ident feasible` tests it, `ident project` writes one" in ended.out
+
+
 def test_conditions_that_contradict_each_other(place: Path, ident: Ident) -> None:
     arm = quick_arm(place, ("body: {center_of_mass", "body: {mass: [5, 6], center_of_mass"))
     path = place / "p.json"
