@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.cli import parser
+from ident_service.cli.arguments import LOCAL_ONLY
 
 ROOT = Path(__file__).resolve().parents[1]
 DECISIONS = ROOT / "docs" / "decisions"
@@ -41,6 +42,11 @@ def links(text: str) -> list[str]:
     """Targets of links, in the text or below it; those to other sites are left out."""
     found = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r"(?m)^\[[^\]]+\]: (\S+)$", text)
     return [link for link in found if "://" not in link]
+
+
+def test_what_no_daemon_does_is_listed_for_programmers() -> None:
+    text = (ROOT / "docs" / "programming.md").read_text(encoding="utf-8")
+    assert [word for word in LOCAL_ONLY if f"`{word}`" not in text] == []
 
 
 def citing_files() -> list[Path]:

@@ -27,7 +27,7 @@ from ident_service.cli.arguments import LOCAL_ONLY, Parser
 from ident_service.cli.output import lines_of
 from ident_service.cli.remote import follow, table
 from ident_service.client import IdentClient
-from ident_service.errors import ArmError
+from ident_service.errors import ArmError, UnknownId, UsageError
 from ident_service.registry.state_folder import fault_file
 
 RUN = "20260101T000000Z-quick"
@@ -153,6 +153,20 @@ def test_a_stop_tells_arms_and_jobs_apart() -> None:
     assert said(["a", "b"], ["j1"]) == "stop requested of a, b; cancelled: job j1\n"
     assert said([], ["j1", "j2"]) == "cancelled: job j1, job j2\n"
     assert said([], []) == "no arm is moving there\n"
+
+
+def test_a_stop_of_a_name_that_is_no_arm_is_an_error() -> None:
+    class Refusing(IdentClient):
+        url = "http://x"
+
+        def __init__(self) -> None:
+            pass
+
+        def post(self, *_: object, **__: object) -> Any:
+            raise UnknownId("no arm 'planr2' is known")
+
+    with pytest.raises(UsageError, match="planr2: the daemon has no arm of this name, so nothing was stopped"):
+        table()["stop"][0](Refusing(), parser().parse_args(["stop", "planr2", "--server", "x"]))
 
 
 class _Evil(IdentClient):
