@@ -26,7 +26,16 @@ from ident_service.cli.arguments import (
     weight,
     workers,
 )
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
+from ident_service.cli.output import (
+    DONE,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    print_to_person,
+    state_folder,
+    tell,
+    writable_state_folder,
+)
 from ident_service.cli.progress import step_of
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -238,7 +247,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name)
     result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
-    sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
+    print_to_person("".join(f"ident: {line}\n" for line in result.warnings))
     text = summary(estimate, result.objections.reasons, result.torque, result.warnings)
     text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}

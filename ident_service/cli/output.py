@@ -70,6 +70,11 @@ def _print_json(document: dict[str, Any]) -> None:
     write(sys.stdout, json.dumps(document, allow_nan=False) + "\n")
 
 
+def person_types() -> bool:
+    """Return whether standard input is a terminal, so that a person can be asked; it may be closed."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 def tell(arguments: argparse.Namespace, line: str) -> None:
     """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
     bar = getattr(arguments, "progress", None)

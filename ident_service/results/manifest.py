@@ -39,7 +39,7 @@ def require_place(folder: Path) -> None:
         place = place.parent
     if not place.is_dir():
         raise UsageError(f"{place}: is a file, not a folder")
-    if not os.access(place, os.W_OK | os.X_OK) or str(place.resolve()).startswith("/proc"):
+    if not os.access(place, os.W_OK | os.X_OK) or place.resolve().is_relative_to("/proc"):
         raise UsageError(f"{folder}: cannot be written: no permission in {place}")
 
 

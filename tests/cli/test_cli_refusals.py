@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over, quick_arm
+from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over, quick_arm, run_main
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, plain_mistake
@@ -235,6 +236,30 @@ def test_a_file_in_the_place_of_a_folder_above(place: Path, quick: Commissioned,
     assert ident("runs").code == 0  # a registry to back up
     given = words.format(place=place, file=file, run=quick.folder, arm=quick.arm).split()
     refused(place, ident, tuple(given), 2, str(file))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("supported planar2", "confirm that the arm is supported by its name"),
+        ("run planar2 --hold-to-run", "there is no terminal at which to hold the space bar"),
+        ("preflight planar2 --scale", "--scale needs a person at a terminal"),
+    ],
+)
+def test_a_closed_standard_input_is_nobody_to_ask(
+    place: Path, ident: Ident, monkeypatch: pytest.MonkeyPatch, words: str, message: str
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    refused(place, ident, tuple(words.split()), 2, message)
+
+
+@pytest.mark.slow
+def test_a_closed_stderr_changes_no_result(
+    place: Path, quick: Commissioned, ident: Ident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    assert run_main("design", "planar2", "--postures", 3, "--out", place / "motion") == 2
+    assert run_main(*identify(place, quick, quick.folder / "identification.mcap")) == 0
 
 
 @pytest.mark.parametrize(
