@@ -158,7 +158,8 @@ def load_payload(path: str | Path) -> Payload:
 
 def _load_section(model: type[_Described], path: Path, what: str) -> _Described:
     if not path.is_file():
-        raise UsageError(f"{path}: no such file; expected a YAML file {what}")
+        why = "is a folder" if path.is_dir() else "no such file"
+        raise UsageError(f"{path}: {why}; expected a YAML file {what}")
     return _validated(model, read_tree(path), path)
 
 
