@@ -44,6 +44,14 @@ def links(text: str) -> list[str]:
     return [link for link in found if "://" not in link]
 
 
+def test_messages_that_troubleshooting_quotes_are_the_program_s() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8").partition("## By fault code")[0]
+    quoted = re.findall(r"(?m)^\| `([^`]+)`", page)
+    sources = [path.read_text() for place in ("ident_service", "drivers") for path in (ROOT / place).rglob("*.py")]
+    assert len(quoted) > 3
+    assert [words for words in quoted if not any(words in text for text in sources)] == []
+
+
 def test_what_no_daemon_does_is_listed_for_programmers() -> None:
     text = (ROOT / "docs" / "programming.md").read_text(encoding="utf-8")
     assert [word for word in LOCAL_ONLY if f"`{word}`" not in text] == []
