@@ -62,8 +62,12 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
     """
     path = find_arm(str(arm))
     tree = read_tree(path, upload=upload)
-    config = _validated(ArmConfig, tree, path, {UPLOAD: path.resolve().parent} if upload else None)
-    problems = [tree.problem(where, message, path) for where, message in _disagreements(config)]
+    unlike = first_problems([tree.problem(("joints",), words, path) for words in _unlike_joints(tree.value)])
+    try:
+        config = _validated(ArmConfig, tree, path, {UPLOAD: path.resolve().parent} if upload else None)
+    except ConfigError as error:
+        raise ConfigError([*error.problems, *unlike]) from None
+    problems = [*unlike, *(tree.problem(where, message, path) for where, message in _disagreements(config))]
     if problems:
         raise ConfigError(first_problems(problems))
     return config
@@ -441,19 +445,21 @@ def _where(loc: tuple[int | str, ...], value: Any, keys: dict[int, list[str]]) -
     return tuple(where)
 
 
+def _unlike_joints(value: Any) -> Iterator[str]:
+    """Yield what is wrong with the names of joints, of a file whose sections may have mistakes of their own."""
+    configured = value.get("joints")
+    for key in ("kinematics", "dh", "joints"):
+        value = value.get(key) if isinstance(value, dict) else None
+    if isinstance(configured, dict) and configured and isinstance(value, dict) and list(configured) != list(value):
+        yield (
+            f"joints: {', '.join(configured)} are not those of kinematics.dh: {', '.join(value)}; give the same names "
+            "in the same order"
+        )
+
+
 def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
     """Yield the mistakes that only show when two sections of a description are compared."""
     names = _joint_names(config.kinematics.dh, config)
-    if (
-        config.kinematics.dh is not None
-        and config.joints
-        and tuple(config.joints) != tuple(config.kinematics.dh.joints)
-    ):
-        yield (
-            ("joints",),
-            f"joints: {', '.join(config.joints)} are not those of kinematics.dh: {', '.join(names)}; give the same"
-            " names in the same order",
-        )
     for label, motion in (("identification", config.motions.identification), ("validation", config.motions.validation)):
         if isinstance(motion, FourierMotion) and names and tuple(motion.joints) != names:
             yield ("motions", label, "joints"), f"motions.{label}.joints: must be {', '.join(names)}, in this order"
