@@ -118,6 +118,8 @@ def named_files(folder: Path) -> Mapping[str, str]:
         UsageError: no such folder, or no manifest in it.
         ParameterError: the manifest is torn or foreign, or names something outside its folder.
     """
+    if folder.is_file():
+        raise UsageError(f"{folder}: is a file; give its folder")
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give one that `ident identify` or `ident simulate` made")
     path = folder / MANIFEST
