@@ -277,6 +277,14 @@ def test_a_preflight_that_is_refused_leaves_no_folder_of_the_arm(place: Path, id
     assert not state.exists()
 
 
+@pytest.mark.parametrize("more", [("--prior", "entropic"), ("--bootstrap", 5)])
+def test_what_is_about_the_constrained_estimate_needs_one(
+    place: Path, quick: Commissioned, ident: Ident, more: tuple[object, ...]
+) -> None:
+    words = (*identify(place, quick, quick.folder / "identification.mcap"), "--feasible-set", "none", *more)
+    refused(place, ident, words, 2, "are about the constrained estimate; leave out the feasible set none")
+
+
 def test_a_range_that_is_none_is_told_from_a_missing_file(place: Path, quick: Commissioned, ident: Ident) -> None:
     file = quick.folder / "identification.mcap"
     wrong = file.with_name("identification.mcap@-5:2")
