@@ -20,7 +20,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, arm_schema_file, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
-from ident_service.errors import ConfigError, Problem, UsageError, plain_mistake
+from ident_service.errors import BOUNDS, ConfigError, Problem, UsageError, plain_mistake
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -351,12 +351,6 @@ _WANTED = {
     "model_type": "a mapping of keys to values",
     "model_attributes_type": "a mapping of keys to values",
 }
-_BOUNDS = {
-    "greater_than": ("greater than", "gt"),
-    "greater_than_equal": ("at least", "ge"),
-    "less_than": ("less than", "lt"),
-    "less_than_equal": ("at most", "le"),
-}
 
 
 def _mistake_words(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -> tuple[str, str]:
@@ -367,8 +361,8 @@ def _mistake_words(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree
         if kind in ("float_type", "int_type") and isinstance(value, str) and _is_number(value):
             return "sentence", f"{str(value)!r} is text, and {_WANTED[kind]} is needed; leave out the quotes"
         return "wanted", _WANTED[kind] + (f" [{unit}]" if unit and "number" in _WANTED[kind] else "")
-    if kind in _BOUNDS:
-        words, key = _BOUNDS[kind]
+    if kind in BOUNDS:
+        words, key = BOUNDS[kind]
         unit = known.unit(where, tree.value)
         return "sentence", f"must be {words} {context[key]:.10g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
     if kind in ("literal_error", "enum"):
