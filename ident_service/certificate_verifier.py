@@ -797,9 +797,7 @@ def verify(content: str, arm: Arm | None = None) -> Verification:
 def _verify(document: dict[str, object], arm: Arm | None) -> Verification:
     if document.get("format") != "ident-parameters" or document.get("version") != "1":
         raise VerificationError("not a parameter file: format is not ident-parameters, version 1")
-    if "feasibility" not in document:
-        raise VerificationError("there is no certificate in it; `ident feasible` tests it, `ident project` writes one")
-    feasibility = _as_object(document["feasibility"], "feasibility")
+    feasibility = _as_object(document.get("feasibility"), "feasibility")
     certificate = _as_object(feasibility.get("certificate"), "feasibility.certificate")
     kind, claimed = certificate.get("kind"), feasibility.get("feasible")
     margin, about = feasibility.get("margin"), None if arm is None else arm.name

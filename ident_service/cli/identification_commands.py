@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -663,6 +664,9 @@ def _verify(arguments: argparse.Namespace) -> Answer:
     result = verify_file(arguments.file, arguments.arm)
     if result.verdict == "failed" and result.message.startswith("not a parameter file"):
         raise ParameterError(f"{arguments.file}: {result.message}")
+    if result.message == "feasibility: missing or not an object":
+        words = "there is no certificate in it; `ident feasible` tests it, `ident project` writes one"
+        result = replace(result, message=words)
     document = {
         "file": str(arguments.file),
         "arm": result.arm,
