@@ -10,7 +10,7 @@ READY  := $(VENV)/.ready
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test unit coverage collected lint types bench bench-design bench-canopen bench-serve bench-stops bench-viewers bench-realtime bench-peers bench-fleet campaign \
-	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest lock screenshots clean
+	docs docs-figures docs-pictures walk mutants test-socketcan test-foreign test-latest test-pythons lock screenshots clean
 
 demo: $(READY)
 	@echo "commissioning a simulated arm: about a minute on an idle machine"
@@ -95,7 +95,7 @@ bench-fleet: $(READY)
 	$(BIN)/python -m benchmarks.fleet $(FLEET)
 
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
-campaign: test-socketcan
+campaign: test-socketcan test-pythons
 	$(BIN)/pytest -m campaign --timeout 7200
 	$(TESTS) -m "not campaign and not realtime" --hypothesis-profile campaign --timeout 7200
 
@@ -117,6 +117,11 @@ LATEST := .venv-latest
 test-latest:
 	rm -rf $(LATEST)
 	$(MAKE) test VENV=$(LATEST) LOCK=
+
+# Libraries differ from one version of Python to the next: the unit tests with each further one, in environments of their own.
+PYTHONS := 3.12 3.13
+test-pythons:
+	for version in $(PYTHONS); do $(MAKE) unit VENV=.venv-$$version PYTHON=python$$version || exit; done
 
 # One lock for all Python versions and machines, with the newest of everything.
 lock: $(READY)

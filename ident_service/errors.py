@@ -130,12 +130,26 @@ _FORMS: tuple[tuple[str, str], ...] = (
 )
 
 
+# By pydantic's type of a mistake: what a number must be, and the name of the bound.
+BOUNDS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "greater_than": ("greater than", "gt"),
+        "greater_than_equal": ("at least", "ge"),
+        "less_than": ("less than", "lt"),
+        "less_than_equal": ("at most", "le"),
+    }
+)
+
+
 def plain_mistake(mistake: Mapping[str, Any]) -> str:
     """Return the message of one mistake that pydantic found, without the pattern of a text, which is for programs.
 
     Args:
         mistake: of `ValidationError.errors()`: `type`, `msg`, `input` and `ctx`.
     """
+    if mistake["type"] in BOUNDS:
+        words, key = BOUNDS[mistake["type"]]
+        return f"must be {words} {mistake['ctx'][key]:.10g}, not {str(mistake['input'])[:60]}"
     if mistake["type"] != "string_pattern_mismatch":
         return str(mistake["msg"]).removeprefix("Value error, ")
     pattern = str(mistake.get("ctx", {}).get("pattern", ""))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.cli import parser
+from ident_service.cli.arguments import LOCAL_ONLY
 
 ROOT = Path(__file__).resolve().parents[1]
 DECISIONS = ROOT / "docs" / "decisions"
@@ -41,6 +42,19 @@ def links(text: str) -> list[str]:
     """Targets of links, in the text or below it; those to other sites are left out."""
     found = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r"(?m)^\[[^\]]+\]: (\S+)$", text)
     return [link for link in found if "://" not in link]
+
+
+def test_messages_that_troubleshooting_quotes_are_the_program_s() -> None:
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8").partition("## By fault code")[0]
+    quoted = re.findall(r"(?m)^\| `([^`]+)`", page)
+    sources = [path.read_text() for place in ("ident_service", "drivers") for path in (ROOT / place).rglob("*.py")]
+    assert len(quoted) > 3
+    assert [words for words in quoted if not any(words in text for text in sources)] == []
+
+
+def test_what_no_daemon_does_is_listed_for_programmers() -> None:
+    text = (ROOT / "docs" / "programming.md").read_text(encoding="utf-8")
+    assert [word for word in LOCAL_ONLY if f"`{word}`" not in text] == []
 
 
 def citing_files() -> list[Path]:

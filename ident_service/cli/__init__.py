@@ -154,7 +154,7 @@ def _answer_of(verb: Callable[[argparse.Namespace], Answer], arguments: argparse
         cause = error.__context__
         if isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT):
             raise DiskFull(str(error)) from None
-        if isinstance(error, ModelError) and (mistakes := _mistakes(arguments)) is not None:
+        if isinstance(error, ModelError | ParameterError) and (mistakes := _mistakes(arguments)) is not None:
             raise mistakes from None
         motion = getattr(arguments, "motion", None)
         if isinstance(motion, Path) and motion.is_file() and "motion" in str(error) and str(motion) not in str(error):

@@ -12,7 +12,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
-from ident_service.cli.output import USAGE, Answer, styled
+from ident_service.cli.output import USAGE, Answer, print_to_person, styled
 from ident_service.errors import UsageError
 
 FEASIBLE_SETS = ("pseudo_inertia", "inertia")
@@ -58,9 +58,6 @@ LOCAL_ONLY: dict[str, str] = {
 }
 """Verbs that no daemon does, each with the reason; they have no option `--server`."""
 
-ANSWERLESS = frozenset({"completion"})
-"""Verbs whose answer is no JSON object; they have no option `--json`."""
-
 
 class ArgumentsError(SystemExit):
     """Exit after arguments that no verb understands; the reason is on stderr already."""
@@ -93,6 +90,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(formatter_class=_Help, **rest)
         self.shown: dict[str, str] = {}
         self.absent: dict[str, str] = {}
+        self._intermixing = False  # while arguments are parsed again, options first
 
     def error(self, message: str) -> NoReturn:
         """Print the message and where help is, and raise.
@@ -103,15 +101,31 @@ class Parser(argparse.ArgumentParser):
         if message.endswith("required: VERB"):
             message = f"a verb is needed: {', '.join(self.shown)}" if self.shown else message
         head = styled(sys.stderr, f"{self.prog}: error:", "error")
-        sys.stderr.write(f"{head} {message}\nhelp: {self.prog} --help\n")
+        print_to_person(f"{head} {message}\nhelp: {self.prog} --help\n")
         raise ArgumentsError(message)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Parse arguments; refuse what this verb does not know in its own name, not in that of `ident`."""
+        """Parse arguments; refuse what this verb does not know in its own name, not in that of `ident`.
+
+        Before Python 3.12.7, argparse alone takes a positional argument that may be left out only before options.
+        """
         found, rest = super().parse_known_args(args, namespace)
+        if self._intermixing:
+            return found, rest
+        if rest and self._subparsers is None and not any(word.startswith("-") for word in rest):
+            self._intermixing = True
+            try:
+                found, rest = self.parse_known_intermixed_args(args, namespace)
+            finally:
+                self._intermixing = False
         if rest:
             self.error(self._unknown(rest[0]))
         return found, rest
+
+    def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
+        if action.type is Path and not arg_string:
+            raise argparse.ArgumentError(action, "a name is needed; an empty one would be the working directory")
+        return super()._get_value(action, arg_string)
 
     def _unknown(self, word: str) -> str:
         option = word.partition("=")[0]
@@ -175,7 +189,7 @@ class TopParser(Parser):
             ArgumentsError: always.
         """
         if message.endswith("required: VERB"):
-            self.print_help(sys.stderr)
+            print_to_person(self.format_help())
             message = "a verb is needed"
         super().error(message)
 
@@ -292,10 +306,7 @@ def _describe(parser: Parser, word: str, text: str, more: str, examples: Sequenc
 
 def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answer]) -> None:
     """Add the options that a verb shares with others, and what is to be run."""
-    if word in ANSWERLESS:
-        parser.absent["--json"] = "its output is no answer"
-    else:
-        parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
     if word in LOCAL_ONLY:
         parser.absent["--server"] = LOCAL_ONLY[word]
     else:

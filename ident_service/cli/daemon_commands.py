@@ -74,7 +74,8 @@ def add(verbs: VerbList) -> None:
 def _completion(arguments: argparse.Namespace) -> Answer:
     script, path = install_completion(arguments.shell, install=arguments.install)
     text = script if path is None else f"{path}: written; a new {arguments.shell} completes `ident`\n"
-    return DONE, text, {}
+    document = {"shell": arguments.shell, "script": script, "file": None if path is None else str(path)}
+    return DONE, text, document
 
 
 def _serve(arguments: argparse.Namespace) -> Answer:

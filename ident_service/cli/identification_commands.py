@@ -9,6 +9,7 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -26,7 +27,16 @@ from ident_service.cli.arguments import (
     weight,
     workers,
 )
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, state_folder, tell, writable_state_folder
+from ident_service.cli.output import (
+    DONE,
+    VERDICT_NO,
+    Answer,
+    StopOnSignal,
+    print_to_person,
+    state_folder,
+    tell,
+    writable_state_folder,
+)
 from ident_service.cli.progress import step_of
 from ident_service.errors import ParameterError, UsageError
 from ident_service.model.notation import NOTATIONS
@@ -238,7 +248,7 @@ def _identify(arguments: argparse.Namespace) -> Answer:
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), load_arm(arguments.arm).name)
     result = identify_files(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     estimate = result.estimate
-    sys.stderr.write("".join(f"ident: {line}\n" for line in result.warnings))
+    print_to_person("".join(f"ident: {line}\n" for line in result.warnings))
     text = summary(estimate, result.objections.reasons, result.torque, result.warnings)
     text += f"\nfiles: {folder}\n" + "".join(f"  {name}\n" for name in result.files)
     document = {"folder": str(folder), "files": list(result.files), "warnings": list(result.warnings)}
@@ -654,6 +664,9 @@ def _verify(arguments: argparse.Namespace) -> Answer:
     result = verify_file(arguments.file, arguments.arm)
     if result.verdict == "failed" and result.message.startswith("not a parameter file"):
         raise ParameterError(f"{arguments.file}: {result.message}")
+    if result.message == "feasibility: missing or not an object":
+        words = "there is no certificate in it; `ident feasible` tests it, `ident project` writes one"
+        result = replace(result, message=words)
     document = {
         "file": str(arguments.file),
         "arm": result.arm,

@@ -31,6 +31,7 @@ from ident_service.cli.output import (
     Answer,
     StopOnSignal,
     interrupting,
+    person_types,
     state_folder,
     tell,
     writable_state_folder,
@@ -286,7 +287,7 @@ def require_terminal(arguments: argparse.Namespace) -> int:
     Raises:
         UsageError: a program is asking, or standard input is no terminal.
     """
-    if arguments.json or not sys.stdin.isatty():
+    if arguments.json or not person_types():
         raise UsageError(
             "there is no terminal at which to hold the space bar; `ident run --speed 0.2` "
             "moves the arm without; have `ident stop` ready in another terminal"
@@ -514,10 +515,10 @@ def _check(arguments: argparse.Namespace) -> Answer:
     state = writable_state_folder(arguments)
     path, faults = ticket_path(state, config.name), fault_file(state, config.name)
     faults.require_none(faults.latched())
-    require_writable(path.parent)
     if arguments.confirm not in (None, config.name):
         raise UsageError(f"--confirm {arguments.confirm}: the arm is {config.name}; nothing has moved")
     arm, model = make_arm(config), arm_model(config)
+    require_writable(path.parent)
     lease, stopping = requested_lease(arguments, config), StopOnSignal()
     # `ident stop` finds this process as the one that moves the arm, and ends the preflight. A person's Ctrl-C
     # or SIGTERM ends it at once, a question too, with torque off; a program's signal waits for the next cycle.
@@ -552,7 +553,7 @@ def _scale(arguments: argparse.Namespace, config: ArmConfig) -> Answer:
     """Check the position scale of each joint that a person turns by hand; nothing is energised."""
     from ident_service.operations.arm_checks import FILE, check_scale
 
-    if arguments.json or not sys.stdin.isatty():
+    if arguments.json or not person_types():
         raise UsageError("--scale needs a person at a terminal who turns each joint by hand")
     found = check_scale(config, writable_state_folder(arguments), lambda question: ask(arguments, f"{question} "))
     lines = [f"{'ok' if one.good else 'WRONG':<6} {one.words}" for one in found]

@@ -20,6 +20,7 @@ from ident_service.errors import ArmFault, IdentError, MotionRefused, PositionUn
 
 _COMMAND = re.compile(r"`ident ([^`]+)`")
 _FOR_ARM = re.compile(r"(`ident [^`\n]*?)\bARM\b")
+_WITHOUT_ARM = frozenset({"design", "preview", "simulate"})  # nothing is to be recovered after these
 WHY = "WHY"
 """Stands for a reason that only a person can give."""
 
@@ -96,6 +97,10 @@ def next_after_error(arguments: argparse.Namespace, error: IdentError) -> str:
     if arm is not None and isinstance(error, PositionUnknown):
         return f"next: {command(arguments, ['set-home', str(arm)])}\n"
     if arm is None or not isinstance(error, ArmFault | MotionRefused):
+        return ""
+    if "a motion needs joints." in str(error):  # the description lacks them
+        return f"next: {command(arguments, ['config', 'check', str(arm)])}\n"
+    if arguments.word in _WITHOUT_ARM:
         return ""
     words = ["recover", str(arm)]
     if "preflight" in str(error) and not isinstance(error, ArmFault):

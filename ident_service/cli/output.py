@@ -70,6 +70,11 @@ def _print_json(document: dict[str, Any]) -> None:
     write(sys.stdout, json.dumps(document, allow_nan=False) + "\n")
 
 
+def person_types() -> bool:
+    """Return whether standard input is a terminal, so that a person can be asked; it may be closed."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 def tell(arguments: argparse.Namespace, line: str) -> None:
     """Print a progress line while a verb works; a line that cannot be written ends nothing, least of all a motion."""
     bar = getattr(arguments, "progress", None)
@@ -124,16 +129,18 @@ def state_folder(arguments: argparse.Namespace) -> Path:
     """Return the state folder, where results go by default: `--state`, `$IDENT_STATE`, or the user's XDG folder.
 
     Raises:
-        UsageError: `--state` without a name.
+        UsageError: `--state` without a name; or a file has this name.
     """
-    if arguments.state is not None:
-        if not arguments.state:
-            raise UsageError("--state needs the name of a folder")
-        return Path(arguments.state)
-    if given := os.environ.get("IDENT_STATE"):
-        return Path(given)
-    base = os.environ.get("XDG_STATE_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "state") / "ident"
+    if arguments.state == "":
+        raise UsageError("--state needs the name of a folder")
+    if given := arguments.state or os.environ.get("IDENT_STATE"):
+        state = Path(given)
+    else:
+        base = os.environ.get("XDG_STATE_HOME")
+        state = (Path(base) if base else Path.home() / ".local" / "state") / "ident"
+    if state.is_file():
+        raise UsageError(f"{state}: is a file, not a folder; --state or $IDENT_STATE names the state folder")
+    return state
 
 
 def writable_state_folder(arguments: argparse.Namespace) -> Path:

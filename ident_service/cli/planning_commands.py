@@ -153,7 +153,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
     unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
     if unfinished:
-        sys.stderr.write(f"ident: {unfinished}\n")
+        print_to_person(f"ident: {unfinished}\n")
     teaches = bool(np.isfinite(seen.deviations).any())
     binding = "".join(f"  {line}\n" for line in designed.binding)
     binding = f"limits that restrict the motion\n{binding}\n" if binding else ""
@@ -172,7 +172,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
 def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
     """Return a callback that shows the progress of a search: a bar on a terminal, else a line every 10 s."""
-    step, terminal = step_of(arguments), sys.stderr.isatty() and not arguments.json
+    step, terminal = step_of(arguments), sys.stderr is not None and sys.stderr.isatty() and not arguments.json
     last = [-10.0]
 
     def show(progress: Progress) -> None:

@@ -17,6 +17,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
+from ident_service.cli.output import person_types
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -212,6 +214,6 @@ def typed(arguments: argparse.Namespace, question: str) -> str:
     """Return what `--confirm` says, or else what a person at the terminal types; empty where nobody can be asked."""
     if arguments.confirm is not None:
         return str(arguments.confirm)
-    if arguments.json or not sys.stdin.isatty():
+    if arguments.json or not person_types():
         return ""
     return ask(arguments, f"{question.rstrip()} ").strip()

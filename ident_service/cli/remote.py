@@ -250,8 +250,10 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     try:
         answer = client.post("/api/v1/stop" if arm is None else f"/api/v1/arms/{word_of_address(arm)}/stop")
     except UnknownId:
-        text = f"{arm}: the daemon has no arm of this name; `ident stop --server {client.url}` stops all\n"
-        return USAGE, text, {"arms": [], "jobs": []}
+        raise UsageError(
+            f"{arm}: the daemon has no arm of this name, so nothing was stopped; `ident stop --server {client.url}` "
+            "stops all"
+        ) from None
     parts = [f"stop requested of {', '.join(answer['arms'])}"] if answer["arms"] else []
     parts += [f"cancelled: {', '.join(f'job {job}' for job in answer['jobs'])}"] if answer["jobs"] else []
     names = "; ".join(parts)

@@ -10,6 +10,7 @@ import argparse
 import re
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,7 @@ from ident_service.cli.remote import (
     typed_name,
     word_of_address,
 )
-from ident_service.errors import UsageError
+from ident_service.errors import ConfigError, UsageError
 
 if TYPE_CHECKING:
     from ident_service.client import IdentClient
@@ -80,16 +81,18 @@ def named_files(path: Path) -> dict[str, str]:
 
 
 def _words(value: Any) -> Iterator[str]:
-    """Yield every text among JSON values."""
+    """Yield every text among values of a description."""
     if isinstance(value, str):
         yield value
-    elif isinstance(value, dict | list):
+    elif isinstance(value, dict | tuple):
         for part in value.values() if isinstance(value, dict) else value:
             yield from _words(part)
 
 
 def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     """Send a description file to be checked; any other word is the name of an arm that the daemon knows."""
+    from ident_service.registry.arms import ARM_FILE
+
     path = Path(arguments.file)
     if not path.is_file():
         return job_verb(_known, with_answer_lines)(client, arguments)
@@ -97,8 +100,13 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"{path}: cannot be read as text: {error}") from None
-    found = client.post(f"{_API}/descriptions/check", {"description": text, "files": named_files(path)})
-    return DONE if found["good"] else VERDICT_NO, found["text"], found
+    try:
+        found = client.post(f"{_API}/descriptions/check", {"description": text, "files": named_files(path)})
+    except ConfigError as error:  # the daemon has a name of its own for it
+        problems = [replace(one, path=path) if str(one.path) == ARM_FILE else one for one in error.problems]
+        raise ConfigError(problems) from None
+    told = re.sub(rf"(?m)^( *){re.escape(ARM_FILE)}(?=:)", lambda at: f"{at[1]}{path}", found["text"])
+    return DONE if found["good"] else VERDICT_NO, told, found
 
 
 def _run(client: IdentClient, arguments: argparse.Namespace) -> Answer:

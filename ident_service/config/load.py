@@ -20,7 +20,7 @@ from ident_service.config.recording import RecordingFormat
 from ident_service.config.simulation import SimulatedDriver
 from ident_service.config.yaml_source import MOST_PROBLEMS, KeyPath, Tree, arm_schema_file, first_problems, read_tree
 from ident_service.config.yaml_source import shipped_arms as shipped_arms
-from ident_service.errors import ConfigError, Problem, UsageError, plain_mistake
+from ident_service.errors import BOUNDS, ConfigError, Problem, UsageError, plain_mistake
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -62,8 +62,12 @@ def load_arm(arm: str | Path, *, upload: bool = False) -> ArmConfig:
     """
     path = find_arm(str(arm))
     tree = read_tree(path, upload=upload)
-    config = _validated(ArmConfig, tree, path, {UPLOAD: path.resolve().parent} if upload else None)
-    problems = [tree.problem(where, message, path) for where, message in _disagreements(config)]
+    unlike = first_problems([tree.problem(("joints",), words, path) for words in _unlike_joints(tree.value)])
+    try:
+        config = _validated(ArmConfig, tree, path, {UPLOAD: path.resolve().parent} if upload else None)
+    except ConfigError as error:
+        raise ConfigError([*error.problems, *unlike]) from None
+    problems = [*unlike, *(tree.problem(where, message, path) for where, message in _disagreements(config))]
     if problems:
         raise ConfigError(first_problems(problems))
     return config
@@ -158,7 +162,8 @@ def load_payload(path: str | Path) -> Payload:
 
 def _load_section(model: type[_Described], path: Path, what: str) -> _Described:
     if not path.is_file():
-        raise UsageError(f"{path}: no such file; expected a YAML file {what}")
+        why = "is a folder" if path.is_dir() else "no such file"
+        raise UsageError(f"{path}: {why}; expected a YAML file {what}")
     return _validated(model, read_tree(path), path)
 
 
@@ -346,12 +351,6 @@ _WANTED = {
     "model_type": "a mapping of keys to values",
     "model_attributes_type": "a mapping of keys to values",
 }
-_BOUNDS = {
-    "greater_than": ("greater than", "gt"),
-    "greater_than_equal": ("at least", "ge"),
-    "less_than": ("less than", "lt"),
-    "less_than_equal": ("at most", "le"),
-}
 
 
 def _mistake_words(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree: Tree) -> tuple[str, str]:
@@ -362,8 +361,8 @@ def _mistake_words(mistake: ErrorDetails, where: KeyPath, known: KnownKeys, tree
         if kind in ("float_type", "int_type") and isinstance(value, str) and _is_number(value):
             return "sentence", f"{str(value)!r} is text, and {_WANTED[kind]} is needed; leave out the quotes"
         return "wanted", _WANTED[kind] + (f" [{unit}]" if unit and "number" in _WANTED[kind] else "")
-    if kind in _BOUNDS:
-        words, key = _BOUNDS[kind]
+    if kind in BOUNDS:
+        words, key = BOUNDS[kind]
         unit = known.unit(where, tree.value)
         return "sentence", f"must be {words} {context[key]:.10g}{f' [{unit}]' if unit else ''}, not {_value(value)}"
     if kind in ("literal_error", "enum"):
@@ -440,19 +439,21 @@ def _where(loc: tuple[int | str, ...], value: Any, keys: dict[int, list[str]]) -
     return tuple(where)
 
 
+def _unlike_joints(value: Any) -> Iterator[str]:
+    """Yield what is wrong with the names of joints, of a file whose sections may have mistakes of their own."""
+    configured = value.get("joints")
+    for key in ("kinematics", "dh", "joints"):
+        value = value.get(key) if isinstance(value, dict) else None
+    if isinstance(configured, dict) and configured and isinstance(value, dict) and list(configured) != list(value):
+        yield (
+            f"joints: {', '.join(configured)} are not those of kinematics.dh: {', '.join(value)}; give the same names "
+            "in the same order"
+        )
+
+
 def _disagreements(config: ArmConfig) -> Iterator[tuple[KeyPath, str]]:
     """Yield the mistakes that only show when two sections of a description are compared."""
     names = _joint_names(config.kinematics.dh, config)
-    if (
-        config.kinematics.dh is not None
-        and config.joints
-        and tuple(config.joints) != tuple(config.kinematics.dh.joints)
-    ):
-        yield (
-            ("joints",),
-            f"joints: {', '.join(config.joints)} are not those of kinematics.dh: {', '.join(names)}; give the same"
-            " names in the same order",
-        )
     for label, motion in (("identification", config.motions.identification), ("validation", config.motions.validation)):
         if isinstance(motion, FourierMotion) and names and tuple(motion.joints) != names:
             yield ("motions", label, "joints"), f"motions.{label}.joints: must be {', '.join(names)}, in this order"

@@ -109,19 +109,30 @@ def read_tree(path: Path, _chain: tuple[Path, ...] = (), *, upload: bool = False
         near = did_you_mean(Path(parent).stem, shipped_arms()) or f"; shipped are {', '.join(shipped_arms())}"
         raise ConfigError([tree.problem(("extends",), f"extends: no such file: {base_path}{near}", path)])
     base = read_tree(base_path, (*_chain, path))
-    merged = _merge(base.value, tree.value)
-    return Tree(merged, base.places | tree.places)
+    replaced: set[KeyPath] = set()
+    merged = _merge(base.value, tree.value, (), replaced)
+    # Of what was replaced nothing is left, and so no mistake has its place there.
+    left = {
+        where: place
+        for where, place in base.places.items()
+        if not any(where[:length] in replaced for length in range(1, len(where) + 1))
+    }
+    return Tree(merged, left | tree.places)
 
 
-def _merge(base: Any, over: Any) -> Any:
+def _merge(base: Any, over: Any, where: KeyPath, replaced: set[KeyPath]) -> Any:
+    """Return a value with another one over it, and add the places of values that are replaced to `replaced`."""
     # A different kind of thing (another driver, another motion) replaces the old one instead of inheriting its keys.
     if (
         not isinstance(base, dict)
         or not isinstance(over, dict)
         or ("kind" in over and over["kind"] != base.get("kind"))
     ):
+        replaced.add(where)
         return over
-    return base | {key: _merge(base[key], value) if key in base else value for key, value in over.items()}
+    return base | {
+        key: _merge(base[key], value, (*where, key), replaced) if key in base else value for key, value in over.items()
+    }
 
 
 def read_without_base(path: Path) -> Tree:

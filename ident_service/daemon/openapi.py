@@ -75,7 +75,7 @@ FAILURES: Final[dict[int, tuple[str, str]]] = {
     409: ("MotionRefused", "wam7_sim: a motion needs a fresh challenge of this arm"),
     413: ("TooLarge", "a request has 65536 bytes at most"),
     421: ("WrongHost", "wrong host name; use the address or name that the service was started with"),
-    422: ("ConfigError", "arm.yaml:3:11: control.rate: Input should be greater than 0"),
+    422: ("ConfigError", "arm.yaml:3:11: control.rate: must be greater than 0 [Hz], not -1"),
     429: ("TooManyRequests", "ten failed logins in a minute; try again in 42 s"),
     503: ("RegistryBusy", "another process has locked the registry; try again"),
     507: ("DiskFull", "the disk of the state folder is full; free space, then try again"),

@@ -55,6 +55,7 @@ REDUCED = 0.7
 PIECE_BYTES: Final = 256 * 2**20  # of a file, beyond which it is cut into pieces of time
 MEMORY: Final = "500MiB"  # of an embedded worker, at which Dask starts it anew
 _ALIKE: Final = ("numpy", "scipy")  # packages whose other version may change the last bits of a result
+_ADDRESS: Final = re.compile(r"inproc://\S+|(\w+://)?[^/\s]+:\d+")  # Dask answers others with a traceback of its own
 _CONNECT_S: Final = 10.0
 _LOOKED_AFTER_S = 3.0  # between looks at workers that Dask may have paused
 _WAITING: Final = 16  # tasks a worker that the scheduler knows of; more would be its memory, not its speed
@@ -142,9 +143,11 @@ def connected(request: FleetRequest, tell: Tell) -> Iterator[Client]:
 
     Raises:
         Unavailable: no scheduler answers there, or it has no worker.
-        UsageError: a worker has another version of this package.
+        UsageError: no address of a scheduler; a worker has another version of this package.
     """
     if request.scheduler is not None:
+        if not _ADDRESS.fullmatch(request.scheduler):
+            raise UsageError(f"--scheduler {request.scheduler}: give its address, such as tcp://HOST:8786")
         try:
             client = Client(request.scheduler, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:

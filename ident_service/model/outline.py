@@ -141,7 +141,7 @@ def read_source(path: Path, convention: str | None = None) -> Source:
         ConfigError: mistakes in a DH table.
     """
     if not path.is_file():
-        raise UsageError(f"{path}: no such file")
+        raise UsageError(f"{path}: {'is a folder, not a file' if path.is_dir() else 'no such file'}")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise UsageError(f"{path}: larger than {MAX_FILE_BYTES} bytes")
     try:

@@ -37,6 +37,8 @@ TERM_SYMBOLS: dict[JointTerm, str] = {
 _TERM_ORDER: tuple[JointTerm, ...] = tuple(TERM_SYMBOLS)
 # [rad/s or m/s] With this velocity there is no Stribeck friction.
 NO_STRIBECK = 1e-6
+INERTIAL_UNITS = ("kg m^2",) * 6 + ("kg m",) * 3 + ("kg",)
+"""Units of the ten inertial parameters of a link."""
 _REVOLUTE_UNITS = {
     "Ia": "kg m^2",
     "fv": "N m s/rad",
@@ -139,11 +141,10 @@ class Layout:
     @cached_property
     def units(self) -> tuple[str, ...]:
         """Return the unit of each parameter."""
-        inertial = ("kg m^2",) * 6 + ("kg m",) * 3 + ("kg",)
         units: list[str] = []
         for revolute in self.revolute:
             table = _REVOLUTE_UNITS if revolute else _PRISMATIC_UNITS
-            units += [*inertial, *(table[TERM_SYMBOLS[term]] for term in self.terms)]
+            units += [*INERTIAL_UNITS, *(table[TERM_SYMBOLS[term]] for term in self.terms)]
         return tuple(units)
 
     def inertial(self, link: int) -> slice:

@@ -33,15 +33,17 @@ def make_arm(config: ArmConfig, clock: Clock | None = None) -> Arm:
         clock: the loop's clock; by default the one the driver section asks for.
 
     Raises:
-        UsageError: the description has no driver section.
-        DriverError: nothing is registered under its kind.
+        UsageError: the description has no driver section, or nothing is registered under its kind.
     """
     if config.driver is None:
         raise UsageError(f"{config.name}: the arm has no driver section, so it cannot be moved")
     found = entry_points(group=GROUP, name=config.driver.kind)
     if not found:
         known = ", ".join(sorted(entry.name for entry in entry_points(group=GROUP)))
-        raise DriverError(f"{config.name}: no driver is called {config.driver.kind!r}; installed: {known}")
+        raise UsageError(
+            f"{config.name}: no driver is called {config.driver.kind!r}; installed: {known}; `ident config check ARM` "
+            "shows where it stands"
+        )
     return cast(Arm, next(iter(found)).load()(config, clock))
 
 

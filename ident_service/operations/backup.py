@@ -128,7 +128,8 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
             raise _full(file) from None
         raise UsageError(f"{file}: cannot be written: {error.strerror or error}") from None
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # after the replacement there is none
+            partial.unlink()
     return Backup(str(file), len(hashes), size, created, recordings)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 from drivers.can.bus_load import Budget
 from ident_service.config.arm import ArmConfig, Joint
-from ident_service.config.load import config_error, load_arm, located
+from ident_service.config.load import load_arm, located
 from ident_service.config.motion_limits import NEEDED, motion_limits
 from ident_service.config.quantities import ParameterTable, did_you_mean
 from ident_service.errors import ConfigError, ModelError, MotionRefused, ParameterError, Problem
@@ -74,17 +75,22 @@ def check_description(arm: str | Path, *, upload: bool = False) -> CheckedDescri
             not installed, and for a bus budget that does not fit.
     """
     config = load_arm(arm, upload=upload)
-    _require_driver(arm, config)
+    problems, model = [*_driver_problems(arm, config), *_mass_problems(arm, config)], None
     try:
         model = arm_model(config)
+        names = model.layout.names
     except ParameterError as error:
-        _require_names(arm, arm_model(config.model_copy(update={"prior": None, "payload": None})), config, ("prior",))
-        raise config_error(arm, ("prior",), str(error)) from None
+        names = arm_model(config.model_copy(update={"prior": None, "payload": None})).layout.names
+        unknown = list(_name_problems(arm, names, config, ("prior",)))
+        problems += unknown or [located(arm, ("prior",), f"prior: {error}")]
     except ModelError as error:
-        raise config_error(arm, _place(str(error)), _NAMED.sub("", str(error), count=1)) from None
+        message = _NAMED.sub("", str(error), count=1)
+        where = _place(str(error))
+        raise ConfigError([*problems, located(arm, where, f"{'.'.join(where)}: {message}")]) from None
     for where in (("driver", "truth"), ("driver", "emulation", "truth")):
-        _require_names(arm, model, config, where)
-    _require_masses(arm, config)
+        problems += _name_problems(arm, names, config, where)
+    if problems or model is None:
+        raise ConfigError(problems)
     budget, cut_off = _bus(arm, config)
     warnings = (*cut_off, *remarks_on_angles(base_parameters(model.chain, model.layout)))
     if missing := _missing(arm, model):
@@ -139,15 +145,16 @@ def _bus(arm: str | Path, config: ArmConfig) -> tuple[Budget | None, tuple[str, 
     return require_budget(arm, config), tuple(cut_sheets(config))
 
 
-def _require_driver(arm: str | Path, config: ArmConfig) -> None:
-    """Refuse a kind of driver that nothing registers on this computer."""
+def _driver_problems(arm: str | Path, config: ArmConfig) -> Iterator[Problem]:
+    """Yield what is wrong with a kind of driver that nothing registers on this computer."""
     if config.driver is None:
         return
     kinds = sorted(entry.name for entry in entry_points(group=GROUP))
     if config.driver.kind not in kinds:
         near = did_you_mean(config.driver.kind, kinds) or "; install the package that brings it, or take one of these"
         known = ", ".join(kinds)
-        raise config_error(arm, ("driver", "kind"), f"no driver is called {config.driver.kind!r}; known: {known}{near}")
+        words = f"driver.kind: no driver is called {config.driver.kind!r}; known: {known}{near}"
+        yield located(arm, ("driver", "kind"), words)
 
 
 def _place(message: str) -> tuple[str, ...]:
@@ -163,42 +170,27 @@ def _place(message: str) -> tuple[str, ...]:
     return (next((key for words, key in about.items() if words in message), "kinematics"),)
 
 
-def _require_masses(arm: str | Path, config: ArmConfig) -> None:
-    """Refuse masses of the prior that no body has, each at its place."""
+def _mass_problems(arm: str | Path, config: ArmConfig) -> Iterator[Problem]:
+    """Yield masses of the prior that no body has, each at its place."""
     table = config.prior
-    named = () if table is None else zip(table.names, table.values, strict=True)
-    if problems := [
-        located(
-            arm,
-            ("prior", name),
-            f"prior.{name}: a link's mass is above 0, not {value:g} kg; give the masses of CAD, or no prior",
-        )
-        for name, value in named
-        if _MASS.fullmatch(name) and not value > 0.0
-    ]:
-        raise ConfigError(problems)
+    for name, value in () if table is None else zip(table.names, table.values, strict=True):
+        if _MASS.fullmatch(name) and not value > 0.0:
+            words = f"prior.{name}: a link's mass is above 0, not {value:g} kg; give the masses of CAD, or no prior"
+            yield located(arm, ("prior", name), words)
 
 
-def _require_names(arm: str | Path, model: ArmModel, config: ArmConfig, where: tuple[str, ...]) -> None:
-    """Refuse names in a table of parameters that this arm does not have, each at its place."""
+def _name_problems(
+    arm: str | Path, known: Sequence[str], config: ArmConfig, where: tuple[str, ...]
+) -> Iterator[Problem]:
+    """Yield names in a table of parameters that are not among the known ones of this arm, each at its place."""
     section: Any = config
     for key in where:
         section = getattr(section, key, None)
-    if not isinstance(section, ParameterTable):
-        return
-    known = model.layout.names
-    problems = [
-        located(
-            arm,
-            (*where, name),
-            f"{'.'.join(where)}: parameters this arm does not have: {name}"
-            + (did_you_mean(name, known) or f"; it has {known[0]} ... {known[-1]}"),
-        )
-        for name in section.names
-        if name not in known
-    ]
-    if problems:
-        raise ConfigError(problems)
+    for name in section.names if isinstance(section, ParameterTable) else ():
+        if name not in known:
+            near = did_you_mean(name, known) or f"; it has {known[0]} ... {known[-1]}"
+            words = f"{'.'.join(where)}: parameters this arm does not have: {name}{near}"
+            yield located(arm, (*where, name), words)
 
 
 def description_document(checked: CheckedDescription) -> dict[str, Any]:

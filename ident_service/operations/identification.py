@@ -275,6 +275,10 @@ def _config(config: ArmConfig, request: Request) -> ArmConfig:
     if request.cut_standstill:
         form = config.recording.model_copy(update={"standstill": "cut"})
         config = config.model_copy(update={"recording": form})
+    if request.set_name == "none" and (request.replicates or request.prior not in (None, "none")):
+        raise UsageError(
+            "a prior and the bootstrap are about the constrained estimate; leave out the feasible set none"
+        )
     options = config.identification
     pull = options.prior
     if request.prior is not None:

@@ -106,6 +106,13 @@ class PriorData:
     recordings: tuple[Path, ...] = ()
 
 
+# Keys of `design` that say nothing about a motion of each kind.
+_OF_OTHERS = {
+    "fourier": frozenset({"postures", "way", "dwell"}),
+    "postures": frozenset({"base_frequency", "harmonics", "periods", "ramp"}),
+}
+
+
 @dataclass(frozen=True)
 class DesignRequest:
     """Request to design a motion.
@@ -153,6 +160,9 @@ def design_files(
         raise UsageError(f"{folder / MOTION}: exists already; give another folder")
     model = known_model(request.arm, request.knowledge)
     design = _changed(model.config.design, request.changes)
+    if unused := sorted(request.changes.keys() & _OF_OTHERS[design.motion]):
+        options = ", ".join(f"--{key.replace('_', '-')}" for key in unused)
+        raise UsageError(f"{options}: not for a motion of the kind {design.motion}; see --motion")
     if request.length is not None:
         design = _of_length(design, request.length, frozenset(request.changes))
     noise = known_noise(model, request.knowledge)

@@ -38,6 +38,7 @@ from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.operations.commissioning import require_clear_from_home
 from ident_service.preflight.stability import LEAST_GAIN_MARGIN, delay_of, stability
 from ident_service.recordings.files import write_atomically
+from ident_service.results.manifest import require_place
 
 RATE = 500.0  # Hz, at which most arms' gains are stable and a simulation is quick
 CLEARANCE = 0.02  # m
@@ -272,15 +273,18 @@ def new_description(
     read = read_source(source, convention)
     if read.kind == "dh" and (base or tip):
         raise UsageError(f"{source}: --base and --tip are of URDF and MJCF; a DH table lists the joints that move")
+    if read.kind != "dh" and convention is not None:
+        raise UsageError(f"{source}: --convention is of DH tables; a URDF or MJCF says where its frames are")
     called = _plain(source.stem if name is None else name)
     path = Path(f"{called}.yaml") if out is None else out
     if path.exists() and path.samefile(source):
         path = path.with_name(f"{path.stem}-arm.yaml")
     beside = None if read.kind == "dh" else path.parent / source.name
-    for there in (path, beside):
-        if there is None or not there.exists() or (there == beside and there.read_bytes() == source.read_bytes()):
-            continue
-        raise UsageError(f"{there}: exists already; give --out another folder")
+    require_place(path.parent)
+    if path.exists():
+        raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'exists already'}; give another file by --out")
+    if beside is not None and beside.exists() and beside.read_bytes() != source.read_bytes():
+        raise UsageError(f"{beside}: exists already, and differs from {source}; give --out a file in another folder")
     part: dict[str, Any] = {read.kind: source.name, **arm_part(read.outline, source.name, base, tip)} if beside else {}
     if read.table is not None:
         part = {"dh": read.table.model_dump(mode="json")}

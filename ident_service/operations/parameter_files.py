@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ident_service.certificate_verifier import INERTIAL, split_name
 from ident_service.config.arm import Constraints, FeasibleSetName
 from ident_service.config.load import load_arm
 from ident_service.errors import ParameterError, UsageError
@@ -26,6 +27,7 @@ from ident_service.estimation.fit import gather
 from ident_service.estimation.payload import KnownArm, Payload, identify_payload
 from ident_service.model.arm_model import arm_model
 from ident_service.model.notation import Notation
+from ident_service.model.parameter_layout import INERTIAL_UNITS, Layout
 from ident_service.operations.recordings import open_together, require_no_fault
 from ident_service.operations.verify import custom_note
 from ident_service.recordings.adapters import overlap
@@ -49,6 +51,13 @@ from ident_service.results.payload_file import (
     write_payload,
 )
 from ident_service.results.run_folder import ARM, MANIFEST, PARAMETERS, URDF, VERIFIER, write_manifest, write_verifier
+
+# What a file says of values that a correction replaces: keys of the document, and of its base parameters.
+_OF_THE_FIT = ("fit", "information", "validation", "bootstrap", "essential", "custom", "second_opinion")
+_OF_THE_VALUES = (
+    *("unconstrained_values", "standard_deviations", "white_standard_deviations", "noise_standard_deviations"),
+    *("degrees_of_freedom", "covariance", "constrained_intervals", "negligible", "verdicts"),
+)
 
 
 @dataclass(frozen=True)
@@ -86,7 +95,7 @@ def check_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions, notes = _read(path, kind, arm, notation)
+    file, conditions, notes, _ = _read(path, kind, arm, notation)
     certified = file.content.get("feasibility", {}).get("certificate", {}).get("kind") in ("witness", "dual")
     return CheckedFile(conditions.kind, feasibility_test(file.values, file.base, conditions), notes, certified)
 
@@ -116,27 +125,25 @@ def correct_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
         SolverError: the solver stopped without an optimum.
     """
-    file, conditions, notes = _read(path, kind, arm, notation)
+    file, conditions, notes, layout = _read(path, kind, arm, notation)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
     ).centred(file.base, conditions)
     content = deepcopy(file.content)
-    for stale in ("fit", "information", "validation", "custom", "second_opinion"):
+    for stale in _OF_THE_FIT:
         content.pop(stale, None)
     table = content["base_parameters"]
-    for stale in (
-        "unconstrained_values",
-        "standard_deviations",
-        "white_standard_deviations",
-        "degrees_of_freedom",
-        "covariance",
-        "verdicts",
-    ):
+    for stale in _OF_THE_VALUES:
         table.pop(stale, None)
     table["values"] = result.beta.tolist()
     content["method"] = "correction"
     content["feasible_set"] = conditions.kind
-    content["link_parameters"] = {"names": list(file.base.names), "values": result.delta.tolist()}
+    units = _link_units(file, layout)
+    content["link_parameters"] = {
+        "names": list(file.base.names),
+        **({"units": [units[name] for name in file.base.names]} if units.keys() >= set(file.base.names) else {}),
+        "values": result.delta.tolist(),
+    }
     proof = certify(result.beta, file.base, conditions, result.delta, expressions=table["expressions"])
     content["feasibility"] = {
         "feasible": proof.verdict == "feasible",
@@ -145,6 +152,19 @@ def correct_file(
     }
     write_parameters(out, content)
     return CorrectedFile(conditions.kind, result, notes)
+
+
+def _link_units(file: ParameterFile, layout: Layout | None) -> dict[str, str]:
+    """Return the units of link parameters by name: those of the arm, else of the file, else of all inertial ones."""
+    if layout is not None:
+        return dict(zip(layout.names, layout.units, strict=True))
+    printed = file.content.get("link_parameters", {})
+    inertial = {
+        name: INERTIAL_UNITS[INERTIAL.index(symbol)]
+        for name in file.base.names
+        if (symbol := split_name(name)[0]) in INERTIAL
+    }
+    return inertial | dict(zip(printed.get("names", ()), printed.get("units", ()), strict=False))
 
 
 def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
@@ -158,12 +178,12 @@ def _covariance(path: Path, file: ParameterFile) -> NDArray[np.float64]:
 
 def _read(
     path: Path, kind: FeasibleSetName | None, arm: str | None, notation: Notation | None
-) -> tuple[ParameterFile, FeasibleSet, tuple[str, ...]]:
-    config, names = None, None
+) -> tuple[ParameterFile, FeasibleSet, tuple[str, ...], Layout | None]:
+    config, layout = None, None
     if arm is not None:
         model = arm_model(load_arm(arm))
-        config, names = model.config, model.layout.names
-    file = read_parameters(path, names, notation)
+        config, layout = model.config, model.layout
+    file = read_parameters(path, None if layout is None else layout.names, notation)
     if config is not None and (claimed := file.content.get("arm")) is not None and claimed["name"] != config.name:
         joints = list(model.chain.names)
         if claimed["joints"] != joints:
@@ -171,7 +191,7 @@ def _read(
     claimed_set: FeasibleSetName = "inertia" if file.feasible_set == "inertia" else "pseudo_inertia"
     conditions = feasible_set(kind or claimed_set, file.base.names, config, positive=Constraints().positive)
     custom = () if config is None or config.constraints.custom is None else (custom_note(config.constraints.custom),)
-    return file, conditions, (*file.notes, *custom)
+    return file, conditions, (*file.notes, *custom), layout
 
 
 DOCUMENT, TEXT, PAGE = "comparison.json", "comparison.txt", "comparison.html"

@@ -7,6 +7,7 @@ import math
 import os
 import re
 import secrets
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -40,6 +41,9 @@ def require_file(path: Path) -> None:
         why = "is a folder, not a recording" if path.is_dir() else "no such file"
         partial = path.with_name(f"{path.name}.partial")
         hint = f" (there is {partial.name}, left by an interrupted recording)" if partial.is_file() else ""
+        file = path.with_name(path.name.rpartition("@")[0] or path.name)
+        if file != path and file.is_file():
+            hint = f"; a range of {file} is {file}@START:END, in seconds from 0, such as {file}@5:60"
         raise UsageError(f"{path}: {why}{hint}")
 
 
@@ -93,5 +97,5 @@ def write_atomically(path: Path, text: str) -> None:
     except OSError as error:
         raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
     finally:
-        # After the replacement there is none.
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):  # after the replacement there is none
+            partial.unlink()

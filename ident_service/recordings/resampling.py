@@ -159,8 +159,9 @@ def _grid(recording: Recording, fmt: RecordingFormat) -> Grid:
         repeats += block.repeats
     if samples < 2:
         cause = f"after trimming {fmt.trim[0]:g} s and {fmt.trim[1]:g} s " if any(fmt.trim) else ""
-        held = "one sample" if samples else "no samples"
-        raise RecordingError(recording.path, f"holds {held} {cause}".rstrip() + "; record the motion again")
+        raise RecordingError(
+            recording.path, f"holds fewer than two samples {cause}".rstrip() + "; record the motion again"
+        )
     if steps.none:  # no two samples without one between them that was left out
         for pair in lost:
             steps.add(np.array(pair, np.int64))

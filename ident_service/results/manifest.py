@@ -39,7 +39,7 @@ def require_place(folder: Path) -> None:
         place = place.parent
     if not place.is_dir():
         raise UsageError(f"{place}: is a file, not a folder")
-    if not os.access(place, os.W_OK | os.X_OK) or str(place.resolve()).startswith("/proc"):
+    if not os.access(place, os.W_OK | os.X_OK) or place.resolve().is_relative_to("/proc"):
         raise UsageError(f"{folder}: cannot be written: no permission in {place}")
 
 
@@ -69,8 +69,7 @@ def staging_beside(folder: Path) -> Iterator[Path]:
     Raises:
         UsageError: the folder's place cannot be written, or is a file.
     """
-    if folder.exists() and not folder.is_dir():
-        raise UsageError(f"{folder}: is a file, not a folder")
+    require_place(folder)
     place = folder.resolve()  # a link to a folder stays one, and "." has a name
     staging = place.with_name(f".{place.name}.{secrets.token_hex(4)}.partial")
     try:
@@ -119,6 +118,8 @@ def named_files(folder: Path) -> Mapping[str, str]:
         UsageError: no such folder, or no manifest in it.
         ParameterError: the manifest is torn or foreign, or names something outside its folder.
     """
+    if folder.is_file():
+        raise UsageError(f"{folder}: is a file; give its folder")
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give one that `ident identify` or `ident simulate` made")
     path = folder / MANIFEST
@@ -199,12 +200,12 @@ def require_replaceable(folder: Path) -> None:
     """Refuse a folder that results may not be written to.
 
     Raises:
-        UsageError: it is a file, or holds what is no earlier result; with what it is, and the remedy.
+        UsageError: it is a file, lies where nothing can be written, or holds what is no earlier result; with what it
+            is, and the remedy.
     """
+    require_place(folder)
     if not folder.exists():
         return
-    if not folder.is_dir():
-        raise UsageError(f"{folder}: is a file, not a folder")
     if not (others := _others(folder)):
         return
     names = ", ".join(others[:_NAMED]) + (f" and {len(others) - _NAMED} more" if len(others) > _NAMED else "")

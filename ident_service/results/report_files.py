@@ -65,11 +65,9 @@ def read_reported(folder: Path) -> Results:
     """Read a folder that a report can be made of.
 
     Raises:
-        UsageError: it is a file, or holds a payload, which has no report.
+        UsageError: it holds a payload, which has no report.
         UsageError, ParameterError, ConfigError: it is not what its manifest names.
     """
-    if folder.is_file():
-        raise UsageError(f"{folder}: is a file; give its folder")
     if (folder / _PAYLOAD).is_file() and not (folder / EVIDENCE).is_file():
         found = f"{_COMPARISON} shows it" if (folder / _COMPARISON).is_file() else "see payload.txt"
         raise UsageError(f"{folder}: holds a payload, which has no report; {found}")

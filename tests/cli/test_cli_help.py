@@ -6,6 +6,7 @@ import argparse
 import re
 import shlex
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from cli.conftest import Ident
@@ -74,8 +75,7 @@ def test_a_verb_has_the_shared_options_only_where_they_mean_something(words: tup
         return
     options = {option for action in sub._actions for option in action.option_strings}
     assert ("--server" in options) == (word not in LOCAL_ONLY)
-    assert ("--json" in options) == (word != "completion")
-    assert "--state" in options
+    assert {"--json", "--state"} <= options
 
 
 MEANT = [
@@ -104,9 +104,44 @@ def test_a_mistake_is_answered_with_what_was_meant_and_no_hidden_word(
     assert ended.err.count("\n") == 2
 
 
-def test_json_where_it_means_nothing_is_refused_in_json(ident: Ident) -> None:
-    words = ident("completion", "bash", "--json").json["error"]["message"]
-    assert words.startswith("--json is not for `ident completion`")
+def test_completion_answers_a_program_too(ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script = ident("completion", "bash").out
+    assert ident("completion", "bash", "--json").json == {
+        "shell": "bash",
+        "script": script,
+        "file": None,
+        "exit_code": 0,
+    }
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    written = ident("completion", "fish", "--install", "--json").json
+    assert Path(written["file"]).read_text(encoding="utf-8") == written["script"]
+
+
+@pytest.mark.parametrize("words", ["run planar2 m.json --speed 0.5", "identify a.mcap b.mcap --arm wam7"])
+def test_arguments_may_stand_behind_options(words: str) -> None:
+    first, *rest = words.split()
+    place = next(i for i, word in enumerate(rest) if word.startswith("--"))
+    mixed = [first, *rest[: place - 1], *rest[place:], rest[place - 1]]
+    found, meant = vars(TOP.parse_args(mixed)), vars(TOP.parse_args(words.split()))
+    assert found == meant
+
+
+def test_an_argument_too_many_is_refused_wherever_it_stands(ident: Ident) -> None:
+    for words in (("run", "planar2", "--speed", "0.5", "m.json", "n.json"), ("stop", "--state", "s", "planar2", "x")):
+        ended = ident(*words)
+        assert (ended.code, ended.err.splitlines()[0]) == (
+            2,
+            f"ident {words[0]}: error: unexpected argument '{words[-1]}'",
+        )
+
+
+def test_an_empty_name_is_not_the_working_directory(
+    ident: Ident, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = ident("preview", "planar2", "--out", "")
+    assert ended.code == 2
+    assert "argument --out: a name is needed" in ended.err
 
 
 def test_options_before_the_verb_of_a_noun_count() -> None:

@@ -187,7 +187,7 @@ IDENTIFY_LOADS = {
     "mcap",  # recordings; of CSV its numbers of records alone
     *("pinocchio", "coal"),  # the URDF that was made is read back
     # Clarabel takes LAPACK from scipy.linalg.
-    *("scipy", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),
+    *("scipy", "scipy._external", "scipy._lib", "scipy.linalg", "scipy.special", "scipy.version", "scipy.__config__"),
     *("scipy._cyutility", "scipy._distributor_init", "scipy._distributor_init_local"),
     "cython_runtime",  # scipy's
     *("cmeel_pth", "sitecustomize", "usercustomize", "distutils-precedence"),  # of environments

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over, quick_arm
+from cli.conftest import COARSE, Commissioned, Ended, Ident, Samples, left_over, quick_arm, run_main
 
 from ident_service.config.load import load_arm
 from ident_service.errors import ArmError, plain_mistake
@@ -213,6 +214,88 @@ def test_a_correction_that_cannot_be_written(place: Path, ident: Ident) -> None:
     path.write_text(json.dumps(TABLE))
     words = ("correct", path, "--out", place / "nowhere" / "c.json")
     refused(place, ident, words, 2, f"{place / 'nowhere' / 'c.json'}: cannot be written: No such file or directory")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "correct {place}/p.json --out {file}/c.json",
+        "compare {run} {run} --out {file}/c.json",
+        "compare {run} {run} --out {file}/c",
+        "identify {run}/identification.mcap --arm {arm} --out {file}/out",
+        "new {run}/identified.urdf --out {file}/a.yaml",
+        "backup {file}/b.tar",
+    ],
+)
+def test_a_file_in_the_place_of_a_folder_above(place: Path, quick: Commissioned, ident: Ident, words: str) -> None:
+    file = place / "file"
+    file.write_text("a file")
+    (place / "p.json").write_text(json.dumps(TABLE))
+    assert ident("runs").code == 0  # a registry to back up
+    given = words.format(place=place, file=file, run=quick.folder, arm=quick.arm).split()
+    refused(place, ident, tuple(given), 2, str(file))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("supported planar2", "confirm that the arm is supported by its name"),
+        ("run planar2 --hold-to-run", "there is no terminal at which to hold the space bar"),
+        ("preflight planar2 --scale", "--scale needs a person at a terminal"),
+    ],
+)
+def test_a_closed_standard_input_is_nobody_to_ask(
+    place: Path, ident: Ident, monkeypatch: pytest.MonkeyPatch, words: str, message: str
+) -> None:
+    monkeypatch.setattr(sys, "stdin", None)
+    refused(place, ident, tuple(words.split()), 2, message)
+
+
+@pytest.mark.slow
+def test_a_closed_stderr_changes_no_result(
+    place: Path, quick: Commissioned, ident: Ident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", None)
+    assert run_main("design", "planar2", "--postures", 3, "--out", place / "motion") == 2
+    assert run_main(*identify(place, quick, quick.folder / "identification.mcap")) == 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["runs", "stop", "stop planar2", "recover planar2", "preflight planar2", "simulate planar2", "finish planar2"],
+)
+def test_a_file_in_the_place_of_the_state_folder(place: Path, ident: Ident, words: str) -> None:
+    file = place / "file"
+    file.write_text("a file")
+    refused(place, ident, (*words.split(), "--state", file), 2, f"{file}: is a file, not a folder; --state or $IDENT")
+
+
+def test_a_preflight_that_is_refused_leaves_no_folder_of_the_arm(place: Path, ident: Ident, state: Path) -> None:
+    refused(place, ident, ("preflight", "wam7"), 2, "wam7: the arm has no driver section")
+    assert not state.exists()
+
+
+@pytest.mark.parametrize("more", [("--prior", "entropic"), ("--bootstrap", 5)])
+def test_what_is_about_the_constrained_estimate_needs_one(
+    place: Path, quick: Commissioned, ident: Ident, more: tuple[object, ...]
+) -> None:
+    words = (*identify(place, quick, quick.folder / "identification.mcap"), "--feasible-set", "none", *more)
+    refused(place, ident, words, 2, "are about the constrained estimate; leave out the feasible set none")
+
+
+def test_a_range_that_is_none_is_told_from_a_missing_file(place: Path, quick: Commissioned, ident: Ident) -> None:
+    file = quick.folder / "identification.mcap"
+    wrong = file.with_name("identification.mcap@-5:2")
+    words = f"{wrong}: no such file; a range of {file} is {file}@START:END, in seconds from 0"
+    refused(place, ident, identify(place, quick, wrong), 2, words)
+
+
+def test_a_file_without_a_certificate_says_what_makes_one(place: Path, ident: Ident) -> None:
+    path = place / "p.json"
+    path.write_text(json.dumps(TABLE))
+    ended = ident("verify", path)
+    assert (ended.code, ended.out.count("\n")) == (3, 1)
+    assert "there is no certificate in it; `ident feasible` tests it, `ident project` writes one" in ended.out
 
 
 def test_conditions_that_contradict_each_other(place: Path, ident: Ident) -> None:

@@ -61,7 +61,14 @@ def test_a_folder_without_evidence_says_what_to_do(folder: Path, ident: Ident) -
 
 
 def test_what_is_no_folder_of_an_identification_says_what_it_is(folder: Path, ident: Ident, tmp_path: Path) -> None:
-    for verb in (("report",), ("figures", "--out", tmp_path / "figures")):
+    verbs = (
+        ("report",),
+        ("figures", "--out", tmp_path / "figures"),
+        ("export",),
+        ("accept", "--note", "x"),
+        ("import",),
+    )
+    for verb in verbs:
         ended = ident(*verb, folder / "parameters.json")
         assert (ended.code, ended.err) == (2, f"ident: {folder / 'parameters.json'}: is a file; give its folder\n")
     page = tmp_path / "nowhere" / "page.html"

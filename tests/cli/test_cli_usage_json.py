@@ -46,6 +46,18 @@ def test_the_reason_is_printed_as_json_too(ident: Ident, words: tuple[str, ...],
     assert re.fullmatch(r"help: ident.* --help", help_line)
 
 
+@pytest.mark.parametrize("stderr", ["closed", "full"])
+@pytest.mark.parametrize("words", [("fly",), (), ("design", "planar2", "--seed", "-1")])
+def test_wrong_words_are_exit_code_2_although_nobody_reads_why(
+    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], stderr: str
+) -> None:
+    with open("/dev/full", "w") as full:  # noqa: PTH123 - a device
+        monkeypatch.setattr(sys, "stderr", full if stderr == "full" else None)
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+    assert ended.value.code == 2
+
+
 def test_json_among_the_words_counts_wherever_it_stands(ident: Ident) -> None:
     assert ident("--json", "base", "planar2").json["error"]["kind"] == "UsageError"
     assert ident("base", "--js").json["error"]["message"] == "the following arguments are required: ARM"

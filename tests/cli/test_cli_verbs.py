@@ -296,6 +296,33 @@ def test_more_delay_in_the_driver_is_more_delay_in_the_check(ident: Ident, tmp_p
     assert far == pytest.approx(near - 19e-3, abs=1e-6)
 
 
+def test_a_correction_keeps_nothing_that_was_said_of_the_values_before(
+    quick: Commissioned, ident: Ident, tmp_path: Path
+) -> None:
+    given, corrected = quick.folder / "parameters.json", tmp_path / "corrected.json"
+    assert ident("correct", given, "--out", corrected).code == 0
+    before, after = (json.loads(path.read_text(encoding="utf-8")) for path in (given, corrected))
+    assert after["base_parameters"].keys() == {"expressions", "units", "values"}
+    assert before.keys() - after.keys() == {"fit", "information", "validation"}
+    assert after["link_parameters"]["units"] == before["link_parameters"]["units"]
+
+
+@pytest.mark.parametrize(("arm", "units"), [((), None), (("--arm", "planar2"), "N m s/rad")])
+def test_link_values_have_units_where_they_are_known(
+    ident: Ident, tmp_path: Path, arm: tuple[str, ...], units: str | None
+) -> None:
+    # Without an arm nobody knows whether the joint turns.
+    for names, known in ((["Lzz1", "lx1", "m1"], True), (["Lzz1", "fv1"], units is not None)):
+        path = table(tmp_path, {"expressions": names, "values": [1.0] * len(names)})
+        assert ident("correct", path, *arm, "--out", tmp_path / "c.json").code == 0
+        links = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["link_parameters"]
+        assert ("units" in links) == known
+        if known:
+            found = dict(zip(links["names"], links["units"], strict=True))
+            assert [found[name] for name in ("Lzz1", "lx1", "m1")] == ["kg m^2", "kg m", "kg"]
+            assert found.get("fv1") == units
+
+
 @pytest.mark.slow
 def test_correction_in_the_metric_of_the_covariance(quick: Commissioned, ident: Ident, tmp_path: Path) -> None:
     free = tmp_path / "free"

@@ -420,8 +420,35 @@ def test_what_is_there_is_not_written_over(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "panda.urdf").write_text(PANDA)
     (tmp_path / "panda.yaml").write_text("mine")
     assert main(["new", str(tmp_path / "panda.urdf"), "--out", str(tmp_path / "panda.yaml")]) == 2
-    assert "exists already" in capsys.readouterr().err
+    assert "panda.yaml: exists already; give another file by --out" in capsys.readouterr().err
     assert (tmp_path / "panda.yaml").read_text() == "mine"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "panda.urdf").write_text("mine")
+    assert main(["new", str(tmp_path / "panda.urdf"), "--out", str(tmp_path / "other" / "a.yaml")]) == 2
+    assert "give --out a file in another folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("other",), "other: is a folder, not a file"),
+        (("panda.urdf", "--out", "other"), "other: is a folder; give another file by --out"),
+        (("panda.urdf", "--convention", "modified"), "--convention is of DH tables"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(
+    words: tuple[str, ...],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "panda.urdf").write_text(PANDA)
+    (tmp_path / "other").mkdir()
+    assert main(["new", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["other", "panda.urdf"]
 
 
 @pytest.mark.parametrize(

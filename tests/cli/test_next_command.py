@@ -126,6 +126,9 @@ ERRORS: list[tuple[str, IdentError, str]] = [
     ("run planar2", MotionRefused("active faults"), "next: ident recover planar2\n"),
     ("run planar2", ArmFault("lease_lost", "x"), "next: ident recover planar2\n"),
     ("run planar2", UsageError("exists"), ""),
+    ("run kuka_lwr4", MotionRefused("kuka_lwr4: a motion needs joints.a.kp"), "next: ident config check kuka_lwr4\n"),
+    ("design planar2", MotionRefused("the position margin leaves nothing"), ""),
+    ("simulate planar2", ArmFault("following_error", "x"), ""),
     ("watch my.yaml", PositionUnknown("not zeroed"), "next: ident set-home my.yaml\n"),
     ("reidentify planar2", UsageError("planar2: nothing has been accepted yet"), "next: ident preflight planar2\n"),
 ]

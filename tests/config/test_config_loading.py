@@ -62,6 +62,28 @@ def test_extending_replaces_lists_as_a_whole(base_file: Path, tmp_path: Path) ->
     assert child.joints["one"].position == (-3, 4)
 
 
+@pytest.mark.parametrize(
+    ("base", "text", "message"),
+    [
+        (BASE, "gravity: [0, 0]", "gravity: must be a list of 3, not 2"),
+        (
+            BASE.replace("harmonics: 4", "harmonics: 4, joints: {}"),
+            "motions: {identification: {kind: fourier, base_frequency: 0.1}}",
+            "'joints' is missing; add it",
+        ),
+    ],
+)
+def test_a_mistake_in_what_was_replaced_has_its_place_in_the_file_that_replaces_it(
+    base_file: Path, tmp_path: Path, base: str, text: str, message: str
+) -> None:
+    base_file.write_text(base)
+    with pytest.raises(ConfigError) as mistakes:
+        written(tmp_path, f"extends: base.yaml\n{text}\n")
+    (problem,) = mistakes.value.problems
+    assert message in problem.message
+    assert (problem.path, problem.line) == (tmp_path / "arm.yaml", 2)
+
+
 def test_a_section_of_the_same_kind_inherits(base_file: Path, tmp_path: Path) -> None:
     child = written(
         tmp_path,

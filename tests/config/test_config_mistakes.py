@@ -64,6 +64,14 @@ def spoiled(old: str, new: str) -> str:
     return GOOD.replace(old, new)
 
 
+def test_joints_of_other_names_are_told_beside_mistakes_of_their_own(tmp_path: Path) -> None:
+    text = spoiled("  one: {position: [-1, 1], velocity: 2, home: 0}", "  won: {position: [-1, 1], velocity: -2}")
+    velocity, joints = problems_of(tmp_path, text)
+    assert velocity.message.startswith("joints.won.velocity: must be greater than 0")
+    assert joints.message.startswith("joints: won, two are not those of kinematics.dh: one, two")
+    assert (joints.line, joints.column) == place_of(text, "joints:\n  won")
+
+
 def test_the_description_that_the_others_spoil_is_good(tmp_path: Path) -> None:
     path = tmp_path / "arm.yaml"
     path.write_text(GOOD)

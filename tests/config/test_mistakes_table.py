@@ -264,6 +264,26 @@ def test_what_cannot_move_is_never_called_good(
     assert not any(line.endswith("good") for line in told)
 
 
+def test_mistakes_of_several_sections_are_told_at_once(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wrong = GOOD.replace("m1: 2.0", "m1: -2.0, m9: 1").replace("truth: {", "truth: {Lzz7: 1, ")
+    lines = [
+        "13:20: prior.m1: a link's mass is above 0, not -2 kg; give the masses of CAD, or no prior",
+        "13:30: prior: parameters this arm does not have: m9; it has Lxx1 ... fo2",
+        "16:35: driver.truth: parameters this arm does not have: Lzz7; did you mean 'Lzz2'?",
+    ]
+    code, told = answer(wrong, folder, capsys)
+    assert (code, [line.removeprefix("arm.yaml:") for line in told]) == (2, lines)
+    code, told = answer(wrong.replace("kind: simulated", "kind: simulatd"), folder, capsys)
+    assert code == 2
+    assert [line.removeprefix("arm.yaml:")[:20] for line in told] == [
+        "16:10: driver.kind: ",
+        *(one[:20] for one in lines[:2]),
+    ]
+    # Verbs that make a model of it tell the same places.
+    assert main(["base-parameters", "arm.yaml"]) == 2
+    assert capsys.readouterr().err.count("arm.yaml:") == 3
+
+
 def test_a_mesh_that_no_clearance_can_be_computed_from_is_reported_before_preflight(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

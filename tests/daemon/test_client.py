@@ -143,7 +143,6 @@ def test_a_computation_that_fails_is_an_error_of_the_tree(client: IdentClient, t
     assert client.wait(begun.id).state == "cancelled"
 
 
-@pytest.mark.timeout(300)
 def test_a_run_is_watched_and_kept_alive_to_its_end(client: IdentClient) -> None:
     with client.arm("quick").run(confirm="quick") as job:
         with pytest.raises(UsageError, match="has not ended"):
@@ -158,7 +157,6 @@ def test_a_run_is_watched_and_kept_alive_to_its_end(client: IdentClient) -> None
     assert job.ended.run in [run["id"] for run in client.runs(arm="quick")]
 
 
-@pytest.mark.timeout(300)
 def test_an_exception_stops_the_arm(client: IdentClient, state: Path) -> None:
     job = client.arm("patient").run(confirm="patient")
     with pytest.raises(ZeroDivisionError):  # noqa: PT012, SIM117 - it is raised within the block of the motion
@@ -169,7 +167,6 @@ def test_an_exception_stops_the_arm(client: IdentClient, state: Path) -> None:
     assert not in_use(control_path(state, "patient"))
 
 
-@pytest.mark.timeout(300)
 def test_a_stop_elsewhere_ends_the_block(client: IdentClient) -> None:
     with pytest.raises(Stopped, match=r"owner asked for a stop \(job \S+-run-"):  # noqa: PT012, SIM117 - at the block's end
         with client.arm("patient").run(confirm="patient") as job:
@@ -181,7 +178,6 @@ def test_a_stop_elsewhere_ends_the_block(client: IdentClient) -> None:
     assert "stop" in job.ended.detail
 
 
-@pytest.mark.timeout(300)
 def test_a_stop_of_ones_own_is_no_error(client: IdentClient) -> None:
     with client.arm("patient").run(confirm="patient") as job:
         next(job.live())
@@ -202,7 +198,6 @@ def test_a_motion_that_is_refused_raises_at_the_end_of_its_block(client: IdentCl
     assert check.ended.state == "refused"
 
 
-@pytest.mark.timeout(300)
 def test_a_motion_that_ends_in_a_fault_raises_it(client: IdentClient, state: Path) -> None:
     # Later than its preflight ends, and in the midst of its motion.
     text = quick_text("faulty", 16).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)
@@ -215,7 +210,6 @@ def test_a_motion_that_ends_in_a_fault_raises_it(client: IdentClient, state: Pat
     assert caught.value.code in [fault["code"] for fault in client.arm("faulty").faults()]
 
 
-@pytest.mark.timeout(300)
 def test_a_daemon_that_ends_says_what_becomes_of_the_motion(tmp_path: Path) -> None:
     state = tmp_path / "state"
     checked_before(state, patient_text())

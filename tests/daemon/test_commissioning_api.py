@@ -51,7 +51,6 @@ def patient(daemon: Asked) -> str:
     return known_arm(daemon, patient_text(ARM))
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     "asked",
     [
@@ -121,7 +120,6 @@ def test_a_job_whose_arm_is_held_shows_no_progress(state: Path, held: bool) -> N
     assert (answer.progress.fraction, answer.progress.remaining) == ((None, None) if held else (0.99, 0.0))
 
 
-@pytest.mark.timeout(300)
 def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, state: Path, commissioned: Path) -> None:
     answer = daemon.post("/api/v1/arms", {"description": quick_text(ARM)})
     assert answer.status_code == 201, answer.text
@@ -175,7 +173,6 @@ def test_from_an_upload_to_accepted_parameters_and_back(daemon: Asked, state: Pa
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(300)
 def test_check_run_identify(daemon: Asked, arm: str) -> None:
     # Without a ticket the run is refused, by the same words as at a terminal.
     early = daemon.begin({"kind": "run", "arm": ARM}, confirmed=True)
@@ -259,7 +256,6 @@ def test_why_an_arm_could_not_be_read_stands_on_its_page(daemon: Asked, arm: str
     assert "It could not be read" not in daemon.get(f"/arms/{arm}").text
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("how", ["cancel", "stop", "silence", "shutdown"])
 def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
     factor = 0.5 if how == "silence" else 15.0
@@ -298,7 +294,6 @@ def test_a_motion_ends_with_its_arm_at_rest(state: Path, how: str) -> None:
         assert how == "silence" or "before the arm was energised" in ended["detail"]
 
 
-@pytest.mark.timeout(300)
 def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
     with serving(state) as daemon:
         for name in (ARM, "other"):
@@ -325,7 +320,6 @@ def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
         daemon.follow(blocker["id"])
 
 
-@pytest.mark.timeout(300)
 def test_the_services_own_lease_carries_a_run_that_nobody_watches(daemon: Asked, arm: str) -> None:
     checked_before(daemon.service.state, quick_text(ARM))
     row = daemon.service.engine.create(Run(kind="run", arm=ARM), "service", own_lease=True)

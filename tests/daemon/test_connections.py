@@ -154,7 +154,6 @@ def test_a_busy_service_answers_stops_and_leases_alone(state: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_ten_stops_at_once_while_everything_waits(tmp_path: Path) -> None:
     measured = stops.measure(tmp_path, 3)
     # A tenth of a second on a machine that does nothing else (`make bench-stops`); tests have company.
@@ -165,7 +164,6 @@ def test_ten_stops_at_once_while_everything_waits(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_line_without_a_request_is_closed(state: Path) -> None:
     with daemon_process(state) as (_, client):
         parts = urlsplit(client.url)
@@ -191,7 +189,6 @@ def test_a_line_without_a_request_is_closed(state: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_handshakes_that_do_not_go_on_have_a_time_too(state: Path, tmp_path: Path) -> None:
     pem = tmp_path / "pem"
     words = "req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -addext subjectAltName=IP:127.0.0.1"

@@ -131,7 +131,6 @@ def kill_once(state: Path, seed: int) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("seed", [1, 5, pytest.param(8, marks=pytest.mark.campaign)])
 def test_a_daemon_that_is_killed(state: Path, seed: int) -> None:
     assert kill_once(state, seed)
@@ -145,7 +144,6 @@ def test_thirty_kills(state: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_by_the_next(
     state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,7 +205,6 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_terminated_daemon_stops_its_arm_first(state: Path) -> None:
     checked_before(state, patient_text(ARM))
     with daemon_process(state) as (process, client):

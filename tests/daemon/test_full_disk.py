@@ -256,7 +256,6 @@ def wait_for(found: Callable[[], Any]) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_reported_while_it_is_held(small: Path) -> None:
     state = small  # the log of the daemon lies beside it, on another disk
     checked_before(state, held_text())
@@ -297,7 +296,6 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_reported_while_i
 
 @pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_fault_of_an_arm_that_is_held_is_reported_before_it_is_supported(
     state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

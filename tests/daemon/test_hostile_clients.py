@@ -154,7 +154,6 @@ def test_a_body_that_comes_late_finds_the_service_busy(state: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_hundreds_of_streams_keep_no_stop_of_their_address_out(state: Path) -> None:
     with daemon_process(state) as (_, client), ExitStack() as lines:
         parts = urlsplit(client.url)
@@ -173,7 +172,6 @@ def test_hundreds_of_streams_keep_no_stop_of_their_address_out(state: Path) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_crumbs_and_bodies_of_strangers_delay_no_stop(state: Path) -> None:
     # Before, one connection's 256 kB of crumbs took the event loop's time for a second, and a body's 16 MiB another.
     head = b"POST /api/v1/motions HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
@@ -278,7 +276,6 @@ def test_every_stream_ends_with_its_token() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_revoked_token_gets_nothing_more(state: Path) -> None:
     with daemon_process(state) as (_, client), Database(state) as db:
         told, ended = list[str](), threading.Event()
@@ -423,7 +420,6 @@ PAGES = [
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @settings(max_examples=300, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     route=st.sampled_from(PAGES),

@@ -22,7 +22,7 @@ from daemon.test_daemon_killed import ARM, begin, checked, excited
 from ident_service.motion.command_channel import in_use
 from ident_service.registry.state_folder import control_path
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 
 class Manager:

@@ -117,7 +117,6 @@ def test_the_registry_is_its_owners_whatever_the_umask_and_the_past(tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_what_a_daemon_and_its_jobs_write_is_its_owners_alone(entered: Path) -> None:
     entered.mkdir(mode=0o700)  # as the service manager does
     with daemon_process(entered) as (_, client):

@@ -26,8 +26,9 @@ from ident_service.cli import main, parser
 from ident_service.cli.arguments import LOCAL_ONLY, Parser
 from ident_service.cli.output import lines_of
 from ident_service.cli.remote import follow, table
+from ident_service.cli.remote_watching import named_files
 from ident_service.client import IdentClient
-from ident_service.errors import ArmError
+from ident_service.errors import ArmError, ConfigError, Problem, UnknownId, UsageError
 from ident_service.registry.state_folder import fault_file
 
 RUN = "20260101T000000Z-quick"
@@ -153,6 +154,49 @@ def test_a_stop_tells_arms_and_jobs_apart() -> None:
     assert said(["a", "b"], ["j1"]) == "stop requested of a, b; cancelled: job j1\n"
     assert said([], ["j1", "j2"]) == "cancelled: job j1, job j2\n"
     assert said([], []) == "no arm is moving there\n"
+
+
+def test_a_stop_of_a_name_that_is_no_arm_is_an_error() -> None:
+    class Refusing(IdentClient):
+        url = "http://x"
+
+        def __init__(self) -> None:
+            pass
+
+        def post(self, *_: object, **__: object) -> Any:
+            raise UnknownId("no arm 'planr2' is known")
+
+    with pytest.raises(UsageError, match="planr2: the daemon has no arm of this name, so nothing was stopped"):
+        table()["stop"][0](Refusing(), parser().parse_args(["stop", "planr2", "--server", "x"]))
+
+
+def test_mistakes_in_a_description_that_was_sent_have_its_own_name(tmp_path: Path) -> None:
+    mistakes = [Problem(Path("arm.yaml"), 8, 1, "gravity: wrong"), Problem(Path("base.yaml"), 1, 2, "name: wrong")]
+
+    class Judging(IdentClient):
+        def __init__(self) -> None:
+            pass
+
+        def post(self, *_: object, **__: object) -> Any:
+            if mistakes:
+                raise ConfigError(mistakes)
+            return {"good": False, "text": "arm.yaml: bench: CANNOT MOVE\n  arm.yaml:3:1: joints: wrong\n"}
+
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("name: bench\n")
+    words = parser().parse_args(["config", "check", str(mine), "--server", "x"])
+    with pytest.raises(ConfigError) as told:
+        table()["config check"][0](Judging(), words)
+    assert str(told.value) == f"{mine}:8:1: gravity: wrong\nbase.yaml:1:2: name: wrong"
+    mistakes.clear()
+    code, text, _ = table()["config check"][0](Judging(), words)
+    assert (code, text) == (3, f"{mine}: bench: CANNOT MOVE\n  {mine}:3:1: joints: wrong\n")
+
+
+def test_files_that_a_list_names_are_sent_too(tmp_path: Path) -> None:
+    (tmp_path / "drive.eds").write_text("[FileInfo]")
+    (tmp_path / "arm.yaml").write_text("driver: {drives: [{node: 1, eds: drive.eds}], profiles: [none.yaml]}\n")
+    assert named_files(tmp_path / "arm.yaml") == {"drive.eds": "[FileInfo]"}
 
 
 class _Evil(IdentClient):
@@ -292,7 +336,6 @@ def test_a_zeroing_that_nobody_asks_for_any_more_is_not_done(
 
 @pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_rehearsal_elsewhere_ends_with_the_key_here(
     state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,7 +375,6 @@ def test_a_rehearsal_elsewhere_ends_with_the_key_here(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
     state: Path, commissioned: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

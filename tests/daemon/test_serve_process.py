@@ -28,7 +28,7 @@ from ident_service.operations.run_archive import import_run
 from ident_service.registry.database import Database
 from ident_service.registry.state_folder import control_path
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 
 def ident(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:

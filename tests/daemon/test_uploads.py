@@ -316,7 +316,6 @@ def test_a_backup_without_recordings_has_none_of_ones_own(daemon: Asked, tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_an_upload_outlives_torn_lines_and_kills(state: Path) -> None:
     content = (TABLE + b"0.01,0,0,0,0\n" * 240_000)[:3_000_000]
     with daemon_process(state) as (process, client):
@@ -344,7 +343,6 @@ def test_an_upload_outlives_torn_lines_and_kills(state: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_failed_upload_names_the_file_and_no_id(state: Path, tmp_path: Path) -> None:
     content = os.urandom(100_000)
     (tmp_path / "mine.csv").write_bytes(content)
@@ -368,7 +366,6 @@ def test_a_failed_upload_names_the_file_and_no_id(state: Path, tmp_path: Path) -
 
 @pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_parameters_are_identified_from_ones_own_data(
     table: Path, state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

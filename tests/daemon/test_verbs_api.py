@@ -20,7 +20,7 @@ from ident_service.registry.arms import known_arm, resources
 from ident_service.registry.database import audit_log
 from ident_service.registry.tokens import add_token
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 
 def test_what_is_made_of_a_run_is_listed_and_fetched(daemon: Asked, state: Path, commissioned: Path) -> None:

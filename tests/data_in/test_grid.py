@@ -89,7 +89,7 @@ def test_what_is_trimmed_is_not_judged() -> None:
     assert found.regular
     assert not found.gaps
     assert (found.first_ns, found.last_ns, found.samples) == (10**8, 10**8 + 499 * 10**6, 500)
-    with pytest.raises(RecordingError, match=r"holds no samples after trimming 1 s and 0\.3 s; record"):
+    with pytest.raises(RecordingError, match=r"holds fewer than two samples after trimming 1 s and 0\.3 s; record"):
         grid(moving(stamps), RecordingFormat(trim=(1.0, 0.3)))
 
 

@@ -75,9 +75,9 @@ REFUSED: dict[str, tuple[Callable[[str], str | bytes], str]] = {
     ),
     "letter of Fortran": (rows(lambda lines: [f"{line}d0" for line in lines]), "d0', not a number"),
     "nothing": (lambda text: "", "is empty; record again, or give another file"),
-    "header alone": (lambda text: f"{HEADER}\n", "holds no samples"),
+    "header alone": (lambda text: f"{HEADER}\n", "holds fewer than two samples"),
     "zeros of a full disk": (lambda text: f"{text}{4096 * chr(0)}", "is neither MCAP nor CSV (plain or gzip)"),
-    "one row": (rows(lambda lines: lines[:1]), "holds one sample; record the motion again"),
+    "one row": (rows(lambda lines: lines[:1]), "holds fewer than two samples; record the motion again"),
     "end cut off": (
         lambda text: text[:-30],
         "line 51: has 3 fields but the header has 5; the row is torn or malformed, remove it",

@@ -141,6 +141,15 @@ def test_a_scheduler_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pyt
         pass
 
 
+def test_what_is_no_address_of_a_scheduler_is_refused(tmp_path: Path) -> None:
+    request = reduction.FleetRequest("planar2", ("x",), str(tmp_path), scheduler="cluster")
+    with (
+        pytest.raises(UsageError, match=r"^--scheduler cluster: give its address, such as tcp://HOST:8786$"),
+        reduction.connected(request, lambda _: None),
+    ):
+        pass
+
+
 def _fill(share: float) -> None:
     """Hold so much of this worker's memory limit from now on."""
     worker = get_worker()

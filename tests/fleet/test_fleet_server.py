@@ -18,7 +18,6 @@ RECORDINGS, SINCE = 6, 3
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(300)
 def test_the_registry_of_a_daemon_is_a_fleet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     of, state = kind(rate=100.0, seconds=12.0), tmp_path / "state"
     with daemon_process(state) as (_, client):

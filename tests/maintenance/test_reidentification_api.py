@@ -42,7 +42,6 @@ def followed(daemon: Asked, name: str) -> dict[str, Any]:
     return seen
 
 
-@pytest.mark.timeout(300)
 def test_what_is_due_waits_for_a_person_who_types_the_name(daemon: Asked, viewer: str) -> None:
     assert daemon.post("/api/v1/schedules", {"arm": ARM, "maintenance": True}).status_code == 201
     assert daemon.post(f"/api/v1/arms/{ARM}/maintenance", {"what": "belt changed"}).status_code == 201
@@ -61,7 +60,6 @@ def test_what_is_due_waits_for_a_person_who_types_the_name(daemon: Asked, viewer
     assert daemon.get("/api/v1/reidentifications").json() == []
 
 
-@pytest.mark.timeout(300)
 def test_an_allowed_arm_does_it_by_itself_and_stops_when_it_is_told_to(daemon: Asked) -> None:
     upload(daemon, description(seed=32, unattended="allowed"))
     assert daemon.post("/api/v1/schedules", {"arm": ARM, "maintenance": True}).status_code == 201
@@ -89,7 +87,6 @@ def test_an_allowed_arm_does_it_by_itself_and_stops_when_it_is_told_to(daemon: A
     assert len(daemon.get("/api/v1/due").json()) == 1  # nothing was found out, so it is due still
 
 
-@pytest.mark.timeout(300)
 def test_a_lease_that_nobody_renews_ends_it(daemon: Asked) -> None:
     daemon.service.engine.live.lease_factor = 0.1  # of two seconds
     body = {"arm": ARM, "confirm": {"name": ARM, "challenge": daemon.challenge(ARM)}}
@@ -100,7 +97,6 @@ def test_a_lease_that_nobody_renews_ends_it(daemon: Asked) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.timeout(300)
 def test_a_person_asks_by_the_command_and_a_drier_joint_is_found(
     accepted: str, state: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -170,7 +166,6 @@ def test_a_person_asks_by_the_command_and_a_drier_joint_is_found(
         assert (code, "lease_lost" in out + err) == (5, True)
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     "step", ["run", *(pytest.param(step, marks=pytest.mark.campaign) for step in ("check", "identify"))]
 )

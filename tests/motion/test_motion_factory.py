@@ -30,5 +30,5 @@ def test_an_arm_without_a_driver_cannot_be_made() -> None:
 
 
 def test_an_unknown_kind_is_named_with_what_is_installed() -> None:
-    with pytest.raises(DriverError, match=r"'hydraulic'.*simulated"):
+    with pytest.raises(UsageError, match=r"'hydraulic'.*simulated.*`ident config check ARM` shows where"):
         make_arm(bench_config(driver={"kind": "hydraulic", "hose": 3}))

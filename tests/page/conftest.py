@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from daemon.served import Reached, listening
 from helpers.browser import FEWER_FEATURES, chromium_program
-from playwright.sync_api import Browser, Error, Page, sync_playwright
+from playwright.sync_api import Browser, Error, Page, expect, sync_playwright
+
+# For what hangs, as the tests' own limit is: a busy machine draws a page in tens of seconds, and starts a browser in a
+# minute.
+_PATIENCE = 120_000.0
+expect.set_options(timeout=_PATIENCE)
 
 
 @pytest.fixture
@@ -43,7 +49,7 @@ def chromium() -> Iterator[Browser]:
     # SwiftShader for WebGL alone, which `--use-angle=swiftshader` would have put all pages together with.
     switches = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", FEWER_FEATURES]
     with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=path, args=switches)
+        found = playwright.chromium.launch(executable_path=path, args=switches, timeout=_PATIENCE)
         yield found
         found.close()
 
@@ -58,15 +64,18 @@ def browser(chromium: Browser) -> Iterator[Browser]:
             page.goto("about:blank", timeout=5_000)
 
 
+def fresh_page(browser: Browser, **options: Any) -> Page:
+    """A page of a browser that has seen nothing yet."""
+    page = browser.new_context(viewport={"width": 1280, "height": 900}, **options).new_page()
+    page.set_default_timeout(_PATIENCE)
+    return page
+
+
 def log_in(
     browser: Browser, reached: Reached, token: str | None = None, *, scripts: bool = True, zone: str | None = None
 ) -> Page:
     """A fresh browser, logged in through the page, in a time zone."""
-    context = browser.new_context(
-        java_script_enabled=scripts, viewport={"width": 1280, "height": 900}, timezone_id=zone
-    )
-    page = context.new_page()
-    page.set_default_timeout(60_000)
+    page = fresh_page(browser, java_script_enabled=scripts, timezone_id=zone)
     page.goto(f"{reached.url}/login?next=/audit")  # where nothing is drawn
     page.get_by_label("Token").fill(token or reached.token)
     page.get_by_role("button", name="Log in").click()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from page.conftest import Reached
+from page.conftest import Reached, fresh_page
 from playwright.sync_api import Browser, ConsoleMessage, Request, expect
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(200)
 def test_the_api_can_be_browsed_without_network_or_token(browser: Browser, reached: Reached) -> None:
-    page = browser.new_context(viewport={"width": 1280, "height": 900}).new_page()
+    page = fresh_page(browser)
     said, asked = list[str](), list[str]()
 
     def hear(message: ConsoleMessage) -> None:
@@ -24,7 +23,7 @@ def test_the_api_can_be_browsed_without_network_or_token(browser: Browser, reach
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", see)
     page.goto(f"{reached.url}/api/docs")
-    expect(page.get_by_text("Stop all arms, under control").first).to_be_visible(timeout=60_000)
+    expect(page.get_by_text("Stop all arms, under control").first).to_be_visible()
     expect(page.get_by_text("Identify from a run").first).to_be_attached()
     for width, height in ((1280, 860), (400, 800)):
         page.set_viewport_size({"width": width, "height": height})

@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Route, expect
 
 COLUMNS = "columns: {t: stamp, q1: q1, q2: q2, tau1: tau1, tau2: tau2}"
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 
 def test_a_file_goes_up_in_pieces_and_can_be_identified_from(

@@ -17,7 +17,7 @@ from ident_service.operations.description_process import _drawn_document
 from ident_service.operations.run_archive import import_run
 from ident_service.registry.arms import add_arm
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(200)]
+pytestmark = pytest.mark.slow
 ARM = "quick"
 NO_WEBGL = """
 const asked = HTMLCanvasElement.prototype.getContext;

@@ -21,7 +21,7 @@ from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.conftest import commissioned as commissioned
 from helpers.examples import NIGHT
 from helpers.meshes import threelink
-from page.conftest import Reached, listening, log_in
+from page.conftest import Reached, fresh_page, listening, log_in
 from playwright.sync_api import Browser, ConsoleMessage, Page, Response, expect
 
 from ident_service.client.client import IdentClient
@@ -228,7 +228,7 @@ def test_the_report_has_no_findings_with_all_unfolded(browser: Browser, story: S
 
 def test_pages_without_a_login_are_whole(browser: Browser, state: Path) -> None:
     with listening(state) as reached:
-        page = browser.new_context().new_page()
+        page = fresh_page(browser)
         told = heard(page)
         page.goto(f"{reached.url}/login")
         found = complaints(page, "login", told)
@@ -363,7 +363,7 @@ def test_a_urdf_becomes_an_arm(browser: Browser, story: Story, tmp_path: Path) -
     expect(page.get_by_label("Name of the arm")).to_have_value("threelink")
     page.get_by_label("Name of the arm").fill("crane")
     page.get_by_role("button", name="Describe").click()
-    expect(page.locator("#describe-status")).to_contain_text("Described", timeout=60_000)
+    expect(page.locator("#describe-status")).to_contain_text("Described")
     assert "name: crane" in page.locator("#description").input_value()
     expect(page.locator("#with-files")).to_contain_text("threelink.urdf, column.stl, arm.obj, boom.dae")
     page.get_by_role("button", name="Add", exact=True).click()

@@ -23,7 +23,7 @@ from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
 from ident_service.model.regressor import joint_regressor
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.slow
 
 HERE = Path(__file__).resolve().parent
 # By instruction set; OpenBLAS takes a kernel by name and ends the process where the processor lacks its instructions.

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ident_service.errors import UsageError
-from ident_service.results.manifest import atomic_folder, write_atomically
+from ident_service.results.manifest import atomic_folder, require_place, write_atomically
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -69,6 +69,13 @@ def test_a_missing_folder_is_a_usage_error(tmp_path: Path) -> None:
         write_atomically(tmp_path / "nowhere" / "a.json", "new")
 
 
+def test_proc_alone_is_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match=r"^/proc/x: cannot be written: no permission in /proc$"):
+        require_place(Path("/proc/x"))
+    monkeypatch.setattr(Path, "resolve", lambda _: Path("/processing"))
+    require_place(tmp_path)
+
+
 def test_a_folder_appears_at_the_end(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "run"
     with atomic_folder(folder) as staging:
@@ -125,6 +132,6 @@ def test_a_file_in_the_folder_s_place_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="is a file, not a folder"), atomic_folder(tmp_path / "run"):
         pytest.fail("the block was entered")
     (tmp_path / "deep").write_text("a file")
-    with pytest.raises(UsageError, match="cannot be written"), atomic_folder(tmp_path / "deep" / "run"):
+    with pytest.raises(UsageError, match="deep: is a file, not a folder"), atomic_folder(tmp_path / "deep" / "run"):
         pytest.fail("the block was entered")
     assert everything_in(tmp_path) == ["deep", "run"]

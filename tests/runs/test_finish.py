@@ -54,7 +54,6 @@ def ran(arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], *words: s
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_run_ends_early_with_what_it_is_for(
     long_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -81,7 +80,6 @@ def test_a_run_ends_early_with_what_it_is_for(
 
 @pytest.mark.campaign
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_target_that_is_not_reached_lets_the_run_go_on_to_its_end(
     virtual_arm: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

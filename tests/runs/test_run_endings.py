@@ -308,7 +308,6 @@ def test_an_arm_without_brakes_is_held_until_a_person_confirms(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_held_arm_does_not_fall_with_whoever_requested_the_motion(loose: list[str], tmp_path: Path) -> None:
     control = control_path(tmp_path / "state", "planar2")
     command = [sys.executable, "-m", "ident_service", *loose]

@@ -249,12 +249,15 @@ def _read(kind: Any, content: Any, place: tuple[str, str] = ("", "")) -> Any:
         return tuple(
             _read(one, each) for one, each in zip(repeat(of[0]) if of[-1] is ... else of, content, strict=False)
         )
-    if get_origin(kind) is np.ndarray:
-        if place in _PACKED:
-            return unpacked(content, _PACKED[place])
-        if kind == Mask:
-            return unpacked_mask(content, content["bits"])
-        return np.array(content, np.int64) if kind == NDArray[np.int64] else _numbers(content)
+    # Compared whole: what NDArray is an alias of depends on the version of Python.
+    if place in _PACKED:
+        return unpacked(content, _PACKED[place])
+    if kind == Mask:
+        return unpacked_mask(content, content["bits"])
+    if kind == NDArray[np.int64]:
+        return np.array(content, np.int64)
+    if kind == Array:
+        return _numbers(content)
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return content
     hints, name = get_type_hints(kind), kind.__name__
