@@ -17,18 +17,20 @@ a kind that an arm's description can hold (`_FORMS`), and names are link paramet
 expressions are those of an arm can only be told by `verify` with an `Arm`, made from a description that the reader
 trusts. Without one, the answer is about the file: it is consistent with its own conditions.
 
-All decimals count as they are printed. Printed link parameters are rounded: they are held against the conditions
-exactly, and must give the base parameters up to rounding.
+All decimals count as they are printed. Printed link parameters are rounded as doubles are: they are held against the
+conditions exactly, and must give the base parameters up to that. An arm's expressions may differ from the file's in
+their last decimal, as processors do; no proof may depend on it.
 """
 
 from __future__ import annotations
 
 import argparse
+import errno
 import hashlib
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -41,26 +43,41 @@ Matrix = list[list[Fraction]]
 INERTIAL = ("Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz", "lx", "ly", "lz", "m")
 JOINT_TERMS = ("Ia", "fv", "fc", "fo", "fs", "fq", "fa")
 
-MAX_FILE_CHARACTERS = 64 * 2**20
+MAX_FILE_CHARACTERS = 4 * 2**20
 MAX_NUMBER_CHARACTERS = 2000  # those of a real proof have tens
 MAX_EXPRESSION_CHARACTERS = 100_000
+MAX_EXPRESSIONS = 1000
+MAX_CHARACTERS = 2**18  # of all expressions
 MAX_DEPTH = 50
 MAX_LINKS = 200
 MAX_BLOCKS = 5000
 MAX_SIZE = 20
 _MAX_DIGITS = 400  # of a coefficient in an expression; more than any float has
 # Hostile numbers and tables end in an error and not in hours.
-_MAX_BITS = 100_000
+_MAX_BITS = 20_000
 _MAX_STEPS = 20_000_000
 _PRIME = 2**61 - 1
-_PRINTED_TOLERANCE = Fraction(1, 10**6)
+_PRINTED_TOLERANCE = Fraction(1, 10**12)
 _EXPRESSION_TOLERANCE = Fraction(1, 10**10)  # coefficients of an arm's expressions are rounded to eleven decimals
+_ROUNDING = Fraction(1, 10**8)  # share of the largest base parameter that this rounding may decide about
 _LEAST_ASSUMED = 100  # kg and kg m^2
+
+UNITS = {
+    **dict.fromkeys(("Lxx", "Lxy", "Lxz", "Lyy", "Lyz", "Lzz"), frozenset({"kg m^2"})),
+    **dict.fromkeys(("lx", "ly", "lz"), frozenset({"kg m"})),
+    "m": frozenset({"kg"}),
+    "Ia": frozenset({"kg m^2", "kg"}),
+    **dict.fromkeys(("fv", "fa"), frozenset({"N m s/rad", "N s/m"})),
+    **dict.fromkeys(("fc", "fo", "fs"), frozenset({"N m", "N"})),
+    "fq": frozenset({"N m s^2/rad^2", "N s^2/m^2"}),
+}
 
 _NUMBER = re.compile(r"-?(?:\d+/\d+|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)", re.ASCII)
 _NAME = re.compile(f"({'|'.join((*INERTIAL, *JOINT_TERMS))})([1-9][0-9]{{0,2}})")
-_SPACE = re.compile(r"\s*")
-_WORD = re.compile(r"(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?)|(?P<name>[A-Za-z_]\w*)|(?P<sign>[+*()-]))")
+_SPACE = re.compile(r"[ \t\r\n]*")
+_WORD = re.compile(
+    r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)|(?P<name>[A-Za-z_]\w*)|(?P<sign>[+*()-])"
+)
 
 
 class VerificationError(ValueError):
@@ -100,16 +117,35 @@ def rational_text(value: Fraction) -> str:
         while rest % prime == 0:
             rest, power = rest // prime, power + 1
         places = max(places, power)
-    if rest != 1:
-        return f"{value.numerator}/{value.denominator}"
-    digits = str(abs(value.numerator) * 10**places // value.denominator)
     sign = "-" if value < 0 else ""
-    if places == 0:
-        return sign + digits
-    if places > len(digits) + 4:
-        return f"{sign}{digits}e-{places}"
-    digits = digits.rjust(places + 1, "0")
-    return f"{sign}{digits[:-places]}.{digits[-places:]}"
+    if rest != 1 or places >= 1000:
+        text = f"{value.numerator}/{value.denominator}"
+    else:
+        digits = str(abs(value.numerator) * 10**places // value.denominator)
+        if places == 0:
+            text = sign + digits
+        elif places > len(digits) + 4:
+            text = f"{sign}{digits}e-{places}"
+        else:
+            digits = digits.rjust(places + 1, "0")
+            text = f"{sign}{digits[:-places]}.{digits[-places:]}"
+    if len(text) > MAX_NUMBER_CHARACTERS:
+        raise VerificationError(f"a number needs more than {MAX_NUMBER_CHARACTERS} characters")
+    return text
+
+
+def exact_sum(terms: Iterable[Fraction]) -> Fraction:
+    """Add up.
+
+    Raises:
+        VerificationError: numbers grow beyond what a real proof needs.
+    """
+    result = Fraction(0)
+    for term in terms:
+        result += term
+        if result.denominator.bit_length() > _MAX_BITS:
+            raise VerificationError("a sum needs more digits than a proof may have")
+    return result
 
 
 def split_name(name: str) -> tuple[str, int]:
@@ -311,7 +347,7 @@ class Affine:
 
     def at(self, values: Mapping[str, Fraction]) -> Fraction:
         """Return its value; KeyError where a parameter has none."""
-        return self.constant + sum((c * values[name] for name, c in self.coefficients.items()), Fraction(0))
+        return exact_sum((self.constant, *(c * values[name] for name, c in self.coefficients.items())))
 
     def __str__(self) -> str:
         text = "" if not self.constant and self.coefficients else rational_text(self.constant)
@@ -554,6 +590,7 @@ class Arm:
         K: per base parameter the coefficients of its expression.
         blocks: conditions beside the set, which must be positive.
         equalities: lists of numbers that must be zero.
+        joints: their names in the order of the links; empty where no file can name them.
     """
 
     name: str
@@ -563,6 +600,7 @@ class Arm:
     K: tuple[Row, ...]
     blocks: tuple[ExactBlock, ...]
     equalities: tuple[ExactBlock, ...]
+    joints: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -609,11 +647,13 @@ def read_claim(document: dict[str, object], certificate: dict[str, object]) -> C
         )
     table = _as_object(document.get("base_parameters"), "base_parameters")
     expressions = _as_list(table.get("expressions"), "base_parameters.expressions")
-    K = tuple(parse_expression(_as_text(text, "base_parameters.expressions")) for text in expressions)
-    values = _as_list(table.get("values"), "base_parameters.values")
-    if (wrong := next((k for k, value in enumerate(values, 1) if not isinstance(value, _Number)), None)) is not None:
-        raise VerificationError(f"base_parameters.values: number {wrong} is not a number")
-    beta = tuple(_as_number(value, "base_parameters.values") for value in values)
+    texts = [_as_text(text, "base_parameters.expressions") for text in expressions]
+    if len(texts) > MAX_EXPRESSIONS or sum(map(len, texts)) > MAX_CHARACTERS:
+        raise VerificationError(
+            f"base_parameters: more than {MAX_EXPRESSIONS} expressions, or {MAX_CHARACTERS} characters in them"
+        )
+    K = tuple(map(parse_expression, texts))
+    beta = tuple(_as_plain_numbers(table.get("values"), "base_parameters.values"))
     if not K or len(K) != len(beta):
         raise VerificationError(f"base_parameters: {len(K)} expressions but {len(beta)} values")
     links = tuple(sorted({_link(number) for number in _as_list(certificate.get("links"), "certificate.links")}))
@@ -677,8 +717,12 @@ def _block(item: object) -> ExactBlock:
     return ExactBlock(name, int(size), tuple(entries))
 
 
-def load(content: str) -> dict[str, object]:
+def load(content: str, what: str = "a parameter file") -> dict[str, object]:
     """Read the file's objects and lists, its numbers as the texts they are written as.
+
+    Args:
+        content: the text.
+        what: it ought to be, for the message.
 
     Raises:
         VerificationError: not JSON, nested too deeply, too long, or a key that stands twice in one object.
@@ -690,19 +734,19 @@ def load(content: str) -> dict[str, object]:
             content, parse_float=_Number, parse_int=_Number, parse_constant=_refuse, object_pairs_hook=_without_repeats
         )
     except RecursionError:
-        raise VerificationError("not a parameter file: nested too deeply") from None
-    except VerificationError:
-        raise
+        raise VerificationError(f"not {what}: nested too deeply") from None
+    except VerificationError as error:
+        raise VerificationError(f"not {what}: {error}") from None
     except ValueError as error:
-        raise VerificationError(f"not a parameter file: not JSON: {error}") from None
-    return _as_object(document, "not a parameter file: its content")
+        raise VerificationError(f"not {what}: not JSON: {error}") from None
+    return _as_object(document, f"not {what}: its content")
 
 
 def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
     # Readers differ in which of two they take; a proof must not depend on that.
     result = dict(pairs)
     if len(result) != len(pairs):
-        raise VerificationError("not a parameter file: a key stands twice in one object")
+        raise VerificationError("a key stands twice in one object")
     return result
 
 
@@ -742,6 +786,14 @@ def _as_numbers(value: object, where: str) -> list[Fraction]:
     return [_as_number(item, where) for item in _as_list(value, where)]
 
 
+def _as_plain_numbers(value: object, where: str) -> list[Fraction]:
+    """Read numbers that are none of them a text, as every reader of a parameter file does."""
+    listed = _as_list(value, where)
+    if (wrong := next((k for k, one in enumerate(listed, 1) if not isinstance(one, _Number)), None)) is not None:
+        raise VerificationError(f"{where}: number {wrong} is not a number")
+    return _as_numbers(listed, where)
+
+
 def _as_numbers_by_name(value: object, where: str) -> Row:
     return {name: _as_number(item, where) for name, item in _as_object(value, where).items()}
 
@@ -755,7 +807,11 @@ def _link(value: object) -> int:
 
 def clean(text: str) -> str:
     """Make one printable line of at most 500 characters: a file may hold anything, and a terminal gets it."""
-    return "".join(character if character.isprintable() else "?" for character in text)[:500]
+    return _printable(text)[:500]
+
+
+def _printable(text: str) -> str:
+    return "".join(character if character.isprintable() else "?" for character in text)
 
 
 # The proof
@@ -795,7 +851,8 @@ def verify(content: str, arm: Arm | None = None) -> Verification:
 
 
 def _verify(document: dict[str, object], arm: Arm | None) -> Verification:
-    if document.get("format") != "ident-parameters" or document.get("version") != "1":
+    version = document.get("version")
+    if document.get("format") != "ident-parameters" or version != "1" or not isinstance(version, _Number):
         raise VerificationError("not a parameter file: format is not ident-parameters, version 1")
     feasibility = _as_object(document.get("feasibility"), "feasibility")
     certificate = _as_object(feasibility.get("certificate"), "feasibility.certificate")
@@ -818,16 +875,18 @@ def _verify(document: dict[str, object], arm: Arm | None) -> Verification:
     claim = read_claim(document, certificate)
     printed = _printed(document)
     _require_links(document, claim, printed)
+    _require_known_units(document, claim)
+    rows = claim.K
     if arm is not None:
-        _require_arm(document, claim, printed, arm)
+        rows = _require_arm(document, claim, printed, arm)
     elif feasible:
         # Infeasible without a condition is infeasible with it.
         _require_joint_conditions(claim, printed)
     if feasible:
-        return _witness(certificate, claim, printed, about)
+        return _witness(certificate, claim, printed, rows, about)
     if printed:
         raise VerificationError("link_parameters: stand beside a proof that no body has these base parameters")
-    return _dual(certificate, claim, about)
+    return _dual(certificate, claim, rows, about)
 
 
 def _printed(document: dict[str, object]) -> Row:
@@ -836,7 +895,7 @@ def _printed(document: dict[str, object]) -> Row:
         return {}
     table = _as_object(document["link_parameters"], "link_parameters")
     names = [_as_text(name, "link_parameters.names") for name in _as_list(table.get("names"), "link_parameters.names")]
-    numbers = _as_numbers(table.get("values"), "link_parameters.values")
+    numbers = _as_plain_numbers(table.get("values"), "link_parameters.values")
     if not names or len(names) != len(numbers) or len(set(names)) != len(names):
         raise VerificationError("link_parameters: names and values do not match")
     return dict(zip(names, numbers, strict=True))
@@ -851,10 +910,28 @@ def _require_links(document: dict[str, object], claim: Claim, printed: Row) -> N
                 f"the file is about an arm of {len(joints)} joints, "
                 f"but its certificate has conditions for the links {', '.join(map(str, claim.links)) or 'of none'}"
             )
-    for name in sorted(printed):
+    for name in sorted(claim.names | printed.keys()):
         symbol, link = split_name(name)
-        if symbol in INERTIAL and link not in claim.links:
-            raise VerificationError(f"link_parameters: no condition covers {name}: the certificate has no link {link}")
+        if link not in claim.links and ("arm" in document or symbol in INERTIAL):
+            raise VerificationError(f"no condition covers {name}: the certificate has no link {link}")
+
+
+def _require_known_units(document: dict[str, object], claim: Claim) -> None:
+    """Refuse units that a parameter cannot have: kg, m and rad are what the conditions mean."""
+    for key in ("base_parameters", "link_parameters"):
+        table = document.get(key)
+        if not isinstance(table, dict) or "units" not in table:
+            continue
+        units = _as_list(table["units"], f"{key}.units")
+        named = [{name} for name in table["names"]] if key == "link_parameters" else [set(row) for row in claim.K]
+        if len(units) != len(named):
+            raise VerificationError(f"{key}.units: {len(units)} for {len(named)} values")
+        for number, (unit, names) in enumerate(zip(units, named, strict=True), 1):
+            known = {one for name in names for one in UNITS[split_name(name)[0]]}
+            if unit not in ("", *known):
+                raise VerificationError(
+                    f"{key}.units: number {number} is {clean(str(unit))[:40]!r}, not {' or '.join(sorted(known))}"
+                )
 
 
 def _require_joint_conditions(claim: Claim, printed: Row) -> None:
@@ -873,8 +950,8 @@ def _require_joint_conditions(claim: Claim, printed: Row) -> None:
             )
 
 
-def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: Arm) -> None:
-    """Refuse a file whose expressions or conditions are not those of the arm.
+def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: Arm) -> tuple[Row, ...]:
+    """Refuse a file whose expressions or conditions are not those of the arm; return its rows in the file's order.
 
     Raises:
         VerificationError: what differs.
@@ -885,6 +962,11 @@ def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: A
             f"the file was made for another description than that of {arm.name}: it names the hash "
             f"{clean(str(told['sha256']))[:12]}..., not {arm.sha256[:12]}..."
         )
+    for key, label in (("name", arm.name), ("joints", list(arm.joints))):
+        if label and told.get(key, label) != label:
+            raise VerificationError(
+                f"arm.{key}: not as the description of {arm.name} has it: {clean(str(told[key]))[:100]}"
+            )
     links = tuple(sorted(link for symbol, link in map(split_name, arm.names) if symbol == "m"))
     if claim.links != links:
         raise VerificationError(f"the certificate's links are not the {len(links)} of {arm.name}")
@@ -892,8 +974,8 @@ def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: A
         raise VerificationError(f"{arm.name} has no parameter {min(foreign)}")
     if printed and (missing := set(arm.names) - printed.keys()):
         raise VerificationError(f"link_parameters: no value for {min(missing)} of {arm.name}")
-    _require_units(document, arm)
-    _require_expressions(claim, arm)
+    rows = _require_expressions(claim, arm)
+    _require_units(document, rows, arm)
     for own, listed in ((arm.blocks, claim.blocks[len(claim.links) :]), (arm.equalities, claim.equalities)):
         described = {block.name: block for block in own}
         found = {block.name: block for block in listed if not is_assumed(block.name)}
@@ -903,19 +985,23 @@ def _require_arm(document: dict[str, object], claim: Claim, printed: Row, arm: A
             raise VerificationError(f"the description of {arm.name} has no such condition: {added[0]}")
         if changed := sorted(name for name, block in found.items() if block != described[name]):
             raise VerificationError(f"not as the description of {arm.name} has it: {_described(found[changed[0]])}")
+    return rows
 
 
-def _require_units(document: dict[str, object], arm: Arm) -> None:
-    table = document.get("link_parameters")
-    if not arm.units or not isinstance(table, dict) or "units" not in table:
-        return
-    units = dict(zip(arm.names, arm.units, strict=True))
-    if table["units"] != [units[name] for name in table["names"]]:
-        raise VerificationError(f"link_parameters.units: not those of {arm.name}")
+def _require_units(document: dict[str, object], rows: Sequence[Row], arm: Arm) -> None:
+    units = dict(zip(arm.names, arm.units, strict=True)) if arm.units else {}
+    for key in ("link_parameters", "base_parameters"):
+        table = document.get(key)
+        if not units or not isinstance(table, dict) or "units" not in table:
+            continue
+        # A base parameter has the unit of the first link parameter in it.
+        names = table["names"] if key == "link_parameters" else [min(row, key=arm.names.index) for row in rows]
+        if table["units"] != [units[name] for name in names]:
+            raise VerificationError(f"{key}.units: not those of {arm.name}")
 
 
-def _require_expressions(claim: Claim, arm: Arm) -> None:
-    left = list(arm.K)
+def _require_expressions(claim: Claim, arm: Arm) -> tuple[Row, ...]:
+    left, rows = list(arm.K), []
     for number, row in enumerate(claim.K, 1):
         same = [other for other in left if _rows_agree(row, other)]
         if not same:
@@ -923,9 +1009,11 @@ def _require_expressions(claim: Claim, arm: Arm) -> None:
                 f"expression {number} is no base parameter of {arm.name}; `ident base-parameters` prints them"
             )
         left.remove(same[0])
+        rows.append(same[0])
     if left:
         terms = Affine(left[0])
         raise VerificationError(f"a base parameter of {arm.name} is missing: {str(terms)[:200]}")
+    return tuple(rows)
 
 
 def _rows_agree(a: Row, b: Row) -> bool:
@@ -941,7 +1029,20 @@ def _require_met(values: Row, claim: Claim, where: str) -> None:
             raise VerificationError(f"not zero at {where}: {block.name}")
 
 
-def _witness(certificate: dict[str, object], claim: Claim, printed: Row, arm: str | None) -> Verification:
+def _require_rounding(values: Row, claim: Claim, rows: Sequence[Row], where: str) -> None:
+    """Refuse a body so large that the last decimals of the file's expressions, which are not the arm's, decide."""
+    allowed = _ROUNDING * max(map(abs, claim.beta))
+    for number, (row, own) in enumerate(zip(claim.K, rows, strict=True), 1):
+        if abs(exact_sum((row[name] - own[name]) * values[name] for name in row)) > allowed:
+            raise VerificationError(
+                f"{where}: so large that base parameter {number} depends on the last decimals of its expression, "
+                "which are not those of the arm's"
+            )
+
+
+def _witness(
+    certificate: dict[str, object], claim: Claim, printed: Row, rows: Sequence[Row], arm: str | None
+) -> Verification:
     delta = _as_numbers_by_name(certificate.get("delta"), "certificate.delta")
     _require_names(frozenset(delta), claim.names, "certificate.delta")
     if assumed := [block.name for block in claim.blocks if is_assumed(block.name)]:
@@ -950,9 +1051,11 @@ def _witness(certificate: dict[str, object], claim: Claim, printed: Row, arm: st
         if Affine(row).at(delta) != value:
             raise VerificationError(f"base parameter {number} is not what its expression gives for the witness")
     _require_met(delta, claim, "the witness")
+    _require_rounding(delta, claim, rows, "the witness")
     checked = [_described(block) for block in claim.blocks] + [_described(block, "=") for block in claim.equalities]
     if printed:
         _check_printed(printed, claim)
+        _require_rounding(printed, claim, rows, "link_parameters")
         checked.append(
             "link_parameters: as printed they meet all of these conditions and belong to the base parameters"
         )
@@ -971,8 +1074,7 @@ def _witness(certificate: dict[str, object], claim: Claim, printed: Row, arm: st
 
 def _check_printed(printed: Row, claim: Claim) -> None:
     """Hold printed link parameters, which are rounded, against the set exactly, and against beta up to rounding."""
-    if missing := claim.names - printed.keys():
-        raise VerificationError(f"link_parameters: no value for {min(missing)}")
+    _require_names(frozenset(printed), claim.names, "link_parameters")
     for block in claim.blocks:
         if not block.is_positive(printed):
             raise VerificationError(f"link_parameters: not positive as printed: {block.name}")
@@ -981,11 +1083,11 @@ def _check_printed(printed: Row, claim: Claim) -> None:
             raise VerificationError(f"link_parameters: not zero as printed: {block.name}")
     for number, (row, value) in enumerate(zip(claim.K, claim.beta, strict=True), 1):
         terms = [coefficient * printed[name] for name, coefficient in row.items()]
-        if abs(sum(terms, -value)) > _PRINTED_TOLERANCE * sum(map(abs, terms), abs(value)):
+        if abs(exact_sum((*terms, -value))) > _PRINTED_TOLERANCE * exact_sum(map(abs, (*terms, value))):
             raise VerificationError(f"link_parameters: base parameter {number} is another one")
 
 
-def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Verification:
+def _dual(certificate: dict[str, object], claim: Claim, rows: Sequence[Row], arm: str | None) -> Verification:
     if "body" not in certificate:
         raise VerificationError(
             "certificate.body: missing; it is a body that meets the conditions alone, without which they may "
@@ -1001,8 +1103,8 @@ def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Veri
     table = _as_object(certificate.get("multipliers"), "certificate.multipliers")
     if unknown := table.keys() - {block.name for block in (*claim.blocks, *claim.equalities)}:
         raise VerificationError(f"certificate.multipliers: no condition is called {min(unknown)!r}")
-    left: Row = {}
-    value = sum((factor * beta for factor, beta in zip(y, claim.beta, strict=True)), Fraction(0))
+    left: dict[str, list[Fraction]] = {}
+    parts = [factor * beta for factor, beta in zip(y, claim.beta, strict=True)]
     weights: dict[str, Fraction] = {}
     for block in (*claim.blocks, *claim.equalities):
         if block.name not in table:
@@ -1014,20 +1116,28 @@ def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Veri
             weights[block.name] = _weight(block, Z)
         twice = [1] * len(Z) if block.size == 0 else [1 if i == j else 2 for i, j in triangle(block.size)]
         for entry, factor in zip(block.entries, (n * z for n, z in zip(twice, Z, strict=True)), strict=True):
-            value += factor * entry.constant
+            parts.append(factor * entry.constant)
             for name, coefficient in entry.coefficients.items():
-                left[name] = left.get(name, Fraction(0)) + factor * coefficient
-    for row, factor in zip(claim.K, y, strict=True):
+                left.setdefault(name, []).append(factor * coefficient)
+    rounding: dict[str, list[Fraction]] = {}
+    for row, own, factor in zip(claim.K, rows, y, strict=True):
         for name, coefficient in row.items():
-            left[name] = left.get(name, Fraction(0)) - factor * coefficient
-    if unbalanced := sorted(name for name, rest in left.items() if rest):
+            left.setdefault(name, []).append(-factor * coefficient)
+            rounding.setdefault(name, []).append(factor * (coefficient - own[name]))
+    if unbalanced := sorted(name for name, terms in left.items() if exact_sum(terms)):
         raise VerificationError(f"the dual matrices do not cancel {unbalanced[0]}")
+    value = exact_sum(parts)
     if value > 0:
         raise VerificationError("the dual matrices prove nothing: their value is positive")
-    total = sum(weights.values(), Fraction(0))
-    if total == 0 and value == 0:
+    if value > -_far(claim) * exact_sum(abs(exact_sum(terms)) for terms in rounding.values()):
+        raise VerificationError(
+            "the dual matrices prove nothing about the arm: they depend on the last decimals of the file's "
+            "expressions, which are not those of the arm's"
+        )
+    weight_of_all = exact_sum(weights.values())
+    if weight_of_all == 0 and value == 0:
         raise VerificationError("the dual matrices prove nothing: all are zero")
-    shares = sorted(((weight / total, name) for name, weight in weights.items() if weight), reverse=True)
+    shares = sorted(((weight / weight_of_all, name) for name, weight in weights.items() if weight), reverse=True)
     described = {block.name: _described(block) for block in claim.blocks}
     checked = [f"{float(100 * share):.3g} %: {described[name]}" for share, name in shares]
     used = [block for block in claim.equalities if block.name in table]
@@ -1040,10 +1150,14 @@ def _dual(certificate: dict[str, object], claim: Claim, arm: str | None) -> Veri
 
 def _require_far_bounds(claim: Claim) -> None:
     """Refuse assumed bounds that an arm with these base parameters could come near to."""
-    least = _LEAST_ASSUMED * max([Fraction(1), *map(abs, claim.beta)])
     for block in claim.blocks:
-        if is_assumed(block.name) and block.entries[0].constant < least:
+        if is_assumed(block.name) and block.entries[0].constant < _far(claim):
             raise VerificationError(f"{block.name}: is less than {_LEAST_ASSUMED} times the largest base parameter")
+
+
+def _far(claim: Claim) -> Fraction:
+    """Return a size that no link parameter of an arm with these base parameters comes near to."""
+    return _LEAST_ASSUMED * max([Fraction(1), *map(abs, claim.beta)])
 
 
 def _disproof(claim: Claim, value: Fraction, names: Sequence[str], equalities: int) -> str:
@@ -1084,9 +1198,11 @@ def read_file(path: Path) -> str:
     """Read a text of bounded size.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: it cannot be read, or is a device or pipe, which may never end.
         VerificationError: it is longer, or not UTF-8.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "not a file", str(path))
     with path.open("rb") as file:
         content = file.read(MAX_FILE_CHARACTERS + 1)
     if len(content) > MAX_FILE_CHARACTERS:
@@ -1105,7 +1221,7 @@ def require_folder(folder: Path) -> None:
         VerificationError: a file is not what the manifest names, or the parameters are about another arm.
     """
     if (folder / "manifest.json").is_file():
-        files = _as_object(load(read_file(folder / "manifest.json")).get("files"), "manifest.json: files")
+        files = _as_object(load(read_file(folder / "manifest.json"), "a manifest").get("files"), "manifest.json: files")
         for name, digest in files.items():
             if Path(name).name != name or name in (".", ".."):
                 raise VerificationError(f"manifest.json: {name[:60]!r} is no name of a file in the folder")
@@ -1126,7 +1242,12 @@ def require_folder(folder: Path) -> None:
 
 
 def _without_space(text: str) -> str:
-    """Drop the white space between the words of a JSON text, which is how an arm's hash is made."""
+    """Drop the white space between the words of a JSON text, which is how an arm's hash is made.
+
+    Raises:
+        VerificationError: not a JSON object.
+    """
+    load(text, "a description of an arm")
     return "".join(re.findall(r'"(?:[^"\\]|\\.)*"|[^\s"]+', text))
 
 
@@ -1156,7 +1277,8 @@ def answer_text(path: Path, answer: Verification) -> str:
     """
     word = answer.verdict
     head = f"{word}: {answer.message}" if answer.arm or word in ("failed", "undecided") else answer.message
-    return "".join(f"{line}\n" for line in (f"{path}: {head}", *(f"  {line}" for line in answer.checked)))
+    lines = (f"{path}: {head}", *(f"  {line}" for line in answer.checked))
+    return "".join(f"{_printable(line)}\n" for line in lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -1177,9 +1299,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         answer = verify_path(path)
     except OSError as error:
-        sys.stderr.write(f"{path}: {error.strerror or error}\n")
+        sys.stderr.write(f"{_printable(str(error.filename or path))}: {error.strerror or error}\n")
         return 2
-    sys.stdout.write(answer_text(path, answer))
+    # A terminal may not have every letter of a file.
+    encoding = sys.stdout.encoding or "utf-8"
+    sys.stdout.write(answer_text(path, answer).encode(encoding, "backslashreplace").decode(encoding))
     return 0 if answer.verdict == "feasible" else 3
 
 

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from ident_service.config.canopen import CanopenDriver
 
 BUILT_IN_KINDS = ("simulated", "canopen", "barrett")
+_LARGEST_GRAVITY = 30.0  # m/s^2; Jupiter has 25
 
 
 class PluginDriver(Section):
@@ -523,6 +524,13 @@ class ArmConfig(ExtendedSection):
     unattended_motion: Literal["refused", "allowed"] = "refused"
     """Permission for a scheduled re-identification to move the arm with nobody there. `allowed` is for the simulator,
     and for a cell whose fence and interlock take the drives' power away as soon as a person can reach in."""
+
+    @field_validator("gravity")
+    @classmethod
+    def _of_a_planet(cls, value: Vector3) -> Vector3:
+        if (size := sum(part * part for part in value) ** 0.5) > _LARGEST_GRAVITY:
+            raise ValueError(f"{size:g} m/s^2 is more than any planet has; in mm/s^2? gravity is [0, 0, -9.81]")
+        return value
 
     @property
     def can_buses(self) -> tuple[CanBus, ...]:

@@ -539,6 +539,7 @@ def certificate_arm(
     conditions: FeasibleSet,
     *,
     units: Sequence[str] = (),
+    joints: Sequence[str] = (),
     expressions: Sequence[str] | None = None,
 ) -> Arm:
     """Return the data of an arm that its certificate has to be about, in the decimals that a file holds.
@@ -549,6 +550,7 @@ def certificate_arm(
         base: grouping of its link parameters.
         conditions: from its description, of either set.
         units: of its link parameters, shape (parameters,).
+        joints: their names in the order of the links.
         expressions: as they are printed, where these are not `base.expressions` letter by letter.
 
     Raises:
@@ -565,6 +567,7 @@ def certificate_arm(
         tuple(parse_exactly(text) for text in texts),
         tuple(block for block in blocks if block not in implied),
         tuple(exact_block(block, conditions.names) for block in conditions.equalities),
+        tuple(joints),
     )
 
 

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ident_service.config.arm import Method
+from ident_service.errors import RecordingError
 from ident_service.estimation import instrumental_variables as instruments
 from ident_service.estimation import robust_regression
 from ident_service.estimation.choices import Choice, best_choice, held_out_error
@@ -195,7 +196,15 @@ def _with_velocity(
     # Through the same filter, so that the same torque is predicted.
     filtered = usual.config.identification.smoothing
     own = with_chosen_cutoff(of("measured", cutoff=filtered.cutoff, decimate=filtered.decimate), recordings)
-    ways = {name: gather(recordings, one, base) for name, one in (("position", usual), ("measured", own))}
+    ways = {"position": gather(recordings, usual, base)}
+    try:
+        ways["measured"] = gather(recordings, own, base)
+    except RecordingError as error:
+        reason = (
+            "its positions show a motion that its velocities do not: correct or leave out the columns dq1 ... dqN, or"
+            " set identification.smoothing.velocity: position"
+        )
+        raise RecordingError(recordings[0].path, reason) from error
     weights = weighted_least_squares(ways["position"].total).weights
     errors = {name: held_out_error(found.blocks, weights) for name, found in ways.items()}
     choice = best_choice("smoothing.velocity", errors)

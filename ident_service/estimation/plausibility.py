@@ -41,6 +41,8 @@ _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
 # Gravity alone may hold a torque on one side of zero, but seldom of so many joints at almost nothing.
 _JOINTS_WITH_SIGN, _NEARLY_NOTHING = 4, 0.01  # and share of a joint's largest torque
+_CLIPPED, _CLIPPED_ERROR = 0.05, 10.0  # share of the samples, and percent of the joint's torque, only together
+_WEAKEST = 0.005  # of its limit, that the torque of some joint reaches in every motion
 _AT_REST = 0.9  # share of the time at standstill from which a joint need not feel a changing torque
 
 
@@ -126,12 +128,36 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
         for index, seen in enumerate(joints)
         for reason in _of_joint(model.chain.names[index], seen, model, revolute=model.chain.revolute[index])
     ]
-    return (*found, *(f"{recording}: {reason}" for reason in (*_weight(joints, model), *_without_sign(joints))))
+    together = (*_weight(joints, model), *_without_sign(joints), *_nearly_none(joints, model))
+    return (*found, *(f"{recording}: {reason}" for reason in together))
 
 
 def torque_missing(seen: JointQuality) -> bool:
     """Return whether a joint's torque never changes although it moves: what was recorded is not its torque."""
     return seen.torque[0] == seen.torque[1] and seen.standstill < _AT_REST
+
+
+def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQuality]]) -> tuple[str, ...]:
+    """Return the reasons why torques must have been cut off at a value: they stay there, and the model misses them.
+
+    Of a drive that gives its largest torque, what is recorded is its torque, and the model predicts it.
+
+    Args:
+        estimate: to judge.
+        recordings: what was seen of the joints of each that it was fitted to.
+    """
+    errors = estimate.candidates[estimate.chosen].moving.joint_relative_percent
+    found = []
+    for index, name in enumerate(estimate.model.chain.names):
+        seen = max((joints[index] for joints in recordings), key=lambda joint: joint.clipped)
+        if seen.clipped > _CLIPPED and errors[index] > _CLIPPED_ERROR:
+            low, high = seen.torque
+            found.append(
+                f"the torque of {name} stays at exactly {low:.4g} or {high:.4g} in {100.0 * seen.clipped:.2g} % of the"
+                f" samples while it moves, and its torque error is {errors[index]:.0f} %: it was cut off there; record"
+                " it within the range of its sensor, or leave those times out"
+            )
+    return tuple(found)
 
 
 def remarks_on_limits(recording: str, joints: Sequence[JointQuality], model: ArmModel) -> tuple[str, ...]:
@@ -290,7 +316,7 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     speed = None if described is None else described.velocity
     if speed is not None and seen.speed > _TOO_FAST * speed:
         yield (
-            f"{name} moves {seen.largest_step:.3g} {unit} between two samples, {seen.speed / speed:.0f} times its"
+            f"{name} moves {seen.largest_step:.3g} {unit} between two samples, {_times(seen.speed / speed)} its"
             f" largest velocity: cut or correct the samples {seen.where:.4g} s after the first"
         )
     elif seen.largest_step > max(_LEAST_JUMP, _JUMP * seen.usual_step) and seen.steps > _SAMPLES_OF_A_JUMP:
@@ -306,9 +332,13 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     torque, most = (None if described is None else described.torque), max(-seen.torque[0], seen.torque[1])
     if torque is not None and most > _TOO_STRONG * torque:
         yield (
-            f"the torque of {name} reaches {most:.4g}, {most / torque:.0f} times its limit of {torque:g}: is it in"
+            f"the torque of {name} reaches {most:.4g}, {_times(most / torque)} its limit of {torque:g}: is it in"
             " other units, or of another joint?"
         )
+
+
+def _times(factor: float) -> str:
+    return f"{factor:.0f} times" if factor < 1e6 else f"{factor:.3g} times"
 
 
 def _without_sign(joints: Sequence[JointQuality]) -> Iterator[str]:
@@ -317,6 +347,22 @@ def _without_sign(joints: Sequence[JointQuality]) -> Iterator[str]:
     turning = [seen for seen in moving if seen.torque[0] <= _NEARLY_NOTHING * seen.torque[1]]
     if len(turning) >= _JOINTS_WITH_SIGN and all(seen.torque[0] >= 0.0 for seen in moving):
         yield "no joint's torque is ever negative: were magnitudes recorded? The model needs their signs"
+
+
+def _nearly_none(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:
+    """Yield a reason where all torques are far too small for the drives: friction alone is more than that."""
+    shares = []
+    for name, seen in zip(model.chain.names, joints, strict=True):
+        described = model.config.joints.get(name)
+        limit = None if described is None else described.torque
+        if limit is None or torque_missing(seen):
+            return
+        shares.append(max(-seen.torque[0], seen.torque[1]) / limit)
+    if max(shares) < _WEAKEST:
+        yield (
+            f"no torque is ever more than {100.0 * max(shares):.2g} % of its joint's limit, less than its friction:"
+            " are they in other units, or without gears (transmission, recording.columns)?"
+        )
 
 
 def _weight(joints: Sequence[JointQuality], model: ArmModel) -> Iterator[str]:

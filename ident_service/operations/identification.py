@@ -27,6 +27,7 @@ from ident_service.estimation.plausibility import (
     reasons_in_length,
     reasons_in_recording,
     remarks_on_limits,
+    torque_clipped,
     torque_missing,
 )
 from ident_service.model.arm_model import arm_model
@@ -158,8 +159,13 @@ def identify_files(
     for count, recording in enumerate(opened.recordings):
         step(f"looking at {recording.path.name}", 0.1 + 0.1 * count / len(opened.recordings))
         found.append((recording, seen := recording_quality(recording, model)))
+        _require_measurable(recording, seen)
         if all(joint.torque[0] == joint.torque[1] for joint in seen.joints):
             reason = "the torque of every joint is always the same; were other columns meant, or was it not recorded?"
+            raise RecordingError(recording.path, reason)
+        # At lower rates the time is in another unit, which `require_motion` tells.
+        if seen.rate_hz > _SLOWEST and all(joint.standstill > _AT_REST for joint in seen.joints):
+            reason = "no joint moves: each is slower than 0.005 rad/s or m/s over 20 ms; record a motion"
             raise RecordingError(recording.path, reason)
     warnings = opened.remarks
     warnings += tuple(f"{recording.path}: {line}" for recording, seen in found for line in seen.warnings())
@@ -180,11 +186,11 @@ def identify_files(
         )
     except CustomError as error:
         raise config_error(request.arm, CUSTOM, str(error)) from error
-    except SolverError as error:
-        # Values too large or small for the solver come from the recording; the error then names the reason.
+    except (RecordingError, SolverError) as error:
+        # Values too large or small for filter or solver come from the recording; the error then names the reason.
         for recording, seen in found:
             for reason in reasons_in_recording(recording.path.name, seen.joints, model):
-                raise RecordingError(recording.path, reason) from error
+                raise RecordingError(recording.path, reason.removeprefix(f"{recording.path.name}: ")) from error
         raise
     for recording, seen in found:
         warnings += remarks_on_limits(recording.path.name, seen.joints, model)
@@ -214,6 +220,9 @@ def identify_files(
 
 
 CUSTOM = ("constraints", "custom")
+_LARGEST = 1e15  # of a position or torque in any unit; its fourth power is still finite
+_SLOWEST = 5.0  # Hz; nobody samples an arm more slowly
+_AT_REST = 0.99  # share of the time at standstill of a recording that shows nothing
 
 
 def custom_of(arm: str, config: ArmConfig) -> CustomFunction | None:
@@ -245,8 +254,19 @@ def unusable_because(estimate: Estimate, found: Sequence[tuple[Recording, Qualit
     wrong = (reason for reasons in seen for reason in reasons)
     # Without a joint's torque every reading of the others is as wrong.
     known = not any(torque_missing(joint) for _, one in fitted for joint in one.joints)
-    against = reasons_against(estimate, [recording for recording, _ in fitted]) if known else ()
+    clipped = torque_clipped(estimate, [one.joints for _, one in fitted])
+    against = clipped
+    if known and not clipped:
+        against = reasons_against(estimate, [recording for recording, _ in fitted])
     return Objections((*wrong, *against), reasons_in_length(estimate, seconds))
+
+
+def _require_measurable(recording: Recording, seen: Quality) -> None:
+    for joint in seen.joints:
+        for what, (low, high) in (("position", joint.position), ("torque", joint.torque)):
+            if (most := max(-low, high)) > _LARGEST:
+                reason = f"the {what} of {joint.name} reaches {most:.3g}, which no sensor measures; correct or cut that"
+                raise RecordingError(recording.path, reason)
 
 
 def _config(config: ArmConfig, request: Request) -> ArmConfig:

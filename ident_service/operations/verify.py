@@ -60,7 +60,9 @@ def _arm(arm: str, file: Path) -> tuple[Arm, str | None]:
     model = arm_model(config)
     base = base_parameters(model.chain, model.layout)
     conditions = feasible_set("pseudo_inertia", base.names, config)
-    stated = certificate_arm(config.name, _sha256(config, file), base, conditions, units=model.layout.units)
+    stated = certificate_arm(
+        config.name, _sha256(config, file), base, conditions, units=model.layout.units, joints=model.chain.names
+    )
     return stated, config.constraints.custom
 
 

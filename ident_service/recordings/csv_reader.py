@@ -82,6 +82,8 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     names = tuple(name.strip() for name in header.split(","))
     if not header.strip():
         raise RecordingError(path, "is empty; expected a header t,q1..qN,tau1..tauN")
+    if "\r" in header.strip():
+        raise RecordingError(path, "lines end in a carriage return alone; save it with line feeds")
     if len(names) > _MOST_COLUMNS:
         raise RecordingError(path, f"line 1: {len(names)} columns; a recording has {_MOST_COLUMNS} at most")
     if wrong := _no_header(header, names):
@@ -141,6 +143,10 @@ def _no_header(header: str, names: Sequence[str]) -> str:
         return "is numbers; put a line with the names of the columns above it: t,q1..qN,tau1..tauN"
     if header.lstrip().startswith(("#", "%")):
         return "is a comment; remove what stands before the names of the columns"
+    if header.lstrip().startswith("<"):
+        return "is HTML or XML, a page and no recording; download the file itself"
+    if any(name.startswith(('"', "'")) for name in names):
+        return "names are in quotation marks; write names and numbers without them"
     separators = {";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
     if len(names) == 1:
         for separator, words in separators.items():
@@ -320,10 +326,13 @@ class CsvRecording:
         bad = ~(np.abs(times) < _MAX_SECONDS * 1e9 / float(columns.nanoseconds))
         if bad.any():
             index = int(np.argmax(bad))
+            # The unit in which it is a time of this century.
+            size = abs(float(times[index])) / _MAX_SECONDS
+            unit = "ms" if size < 1e3 else "us" if size < 1e6 else "ns"
             raise RecordingError(
                 self.path,
                 f"line {first + index}: time t is {self._words(text)[index].strip()}; not in seconds? "
-                "Name its unit: recording.columns: {t: {column: NAME, unit: ns}}",
+                f"Name its unit: recording.columns: {{t: {{column: NAME, unit: {unit}}}}}",
             )
         nanoseconds = times * float(columns.nanoseconds)
         whole = np.rint(nanoseconds)
@@ -345,10 +354,15 @@ class CsvRecording:
                 raise RecordingError(self.path, f"line {line}: is empty; a row is missing, remove the line")
             fields = row.decode("utf-8", errors="replace").split(",")
             if len(fields) != len(names):
+                # A whole number has no comma.
+                twice = len(names) < len(fields) <= 2 * len(names) and len(fields) > 1.5 * len(names)
+                what = (
+                    "are decimals written with commas? Write points"
+                    if twice
+                    else "the row is torn or malformed, remove it if it is the last one"
+                )
                 raise RecordingError(
-                    self.path,
-                    f"line {line}: has {len(fields)} fields but the header has {len(names)}; "
-                    "the row is torn or malformed, remove it if it is the last one",
+                    self.path, f"line {line}: has {len(fields)} fields but the header has {len(names)}; {what}"
                 )
             for index, (name, field) in enumerate(zip(names, fields, strict=True)):
                 missing = _is_missing(field) and index != self._columns.time

@@ -36,8 +36,9 @@ class JointQuality:
 
     Attributes:
         name: of the joint, or its number from 1.
-        saturated: share of samples at the torque limit; where none is known, share of samples that sit exactly at the
-            extreme torque five times in a row or more.
+        saturated: share of samples at the torque limit, or, where that is more, `clipped`.
+        clipped: share of samples that sit exactly at the extreme torque five times in a row or more while the joint
+            moves.
         standstill: share of the time that the joint is slower than 0.005 rad/s or m/s over 20 ms.
         position: smallest and largest [rad or m].
         position_at: when it is there [s] after the first sample.
@@ -63,6 +64,7 @@ class JointQuality:
     usual_step: float = 0.0
     steps: int = 0
     position_at: tuple[float, float] = (0.0, 0.0)
+    clipped: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -198,8 +200,7 @@ class _Joints:
         self._at_limit = np.zeros(joints)
         self._still, self._pairs = np.zeros(joints), 0
         self._timing = ArrivalTest(stamps)
-        # Where no limit is known.
-        self._plateaus = {int(joint): (_Plateau(), _Plateau()) for joint in np.flatnonzero(np.isnan(limit))}
+        self._plateaus = [(_Plateau(), _Plateau()) for _ in range(joints)]
 
     def add(self, block: Block) -> None:
         """Add the next samples to the statistics."""
@@ -214,9 +215,6 @@ class _Joints:
         self._torque = _wider(self._torque, torque)
         self._timing.add(block)
         self._at_limit += (np.abs(torque) >= SATURATED * self._limit).sum(axis=0)
-        for joint, (top, bottom) in self._plateaus.items():
-            top.add(torque[:, joint])
-            bottom.add(-torque[:, joint])
         run = block if self._tail is None else join([self._tail, block])
         fresh = len(run.stamp_ns) - len(block.stamp_ns)
         steps = np.abs(np.diff(run.position[max(0, fresh - 1) :], axis=0))
@@ -230,6 +228,11 @@ class _Joints:
         speed = np.abs(run.position[begin + lag :] - run.position[begin:-lag]) / elapsed[:, None]
         self._still += (speed[whole] < STANDSTILL).sum(axis=0)
         self._pairs += int(whole.sum())
+        moves = np.zeros(torque.shape, np.bool_)
+        moves[len(moves) - len(whole) :] = whole[:, None] & (speed >= STANDSTILL)
+        for joint, (top, bottom) in enumerate(self._plateaus):
+            top.add(torque[:, joint], moves[:, joint])
+            bottom.add(-torque[:, joint], moves[:, joint])
         self._tail = cut(run, max(0, len(run.stamp_ns) - lag), len(run.stamp_ns))
 
     def _usual(self, joint: int) -> float:
@@ -262,14 +265,12 @@ class _Joints:
         samples = self._stamps.samples
         found = []
         for k, name in enumerate(self._names):
-            at_limit = self._at_limit[k]
-            if k in self._plateaus:
-                varies = self._torque[0][k] < self._torque[1][k]
-                at_limit = sum(side.samples() for side in self._plateaus[k]) if varies else 0
+            varies = self._torque[0][k] < self._torque[1][k]
+            clipped = sum(side.samples() for side in self._plateaus[k]) if varies else 0
             found.append(
                 JointQuality(
                     name=name,
-                    saturated=float(at_limit / samples),
+                    saturated=float(max(self._at_limit[k], clipped) / samples),
                     standstill=float(self._still[k] / self._pairs) if self._pairs else 0.0,
                     position=(float(self._position[0][k]), float(self._position[1][k])),
                     torque=(float(self._torque[0][k]), float(self._torque[1][k])),
@@ -280,6 +281,7 @@ class _Joints:
                     usual_step=self._usual(k),
                     steps=self._steps,
                     position_at=(float(self._position_at[0, k]), float(self._position_at[1, k])),
+                    clipped=clipped / samples,
                 )
             )
         return tuple(found)
@@ -297,11 +299,11 @@ class _Plateau:
         self._counted = 0
         self._run = 0  # samples at the value at the end of what was seen
 
-    def add(self, values: Array) -> None:
-        """Add the next samples, shape (samples,)."""
+    def add(self, values: Array, counts: NDArray[np.bool_]) -> None:
+        """Add the next samples, and which of them count, shapes (samples,)."""
         if (largest := float(values.max())) > self._value:
             self._value, self._counted, self._run = largest, 0, 0
-        at_value = np.concatenate([[False], values == self._value, [False]])
+        at_value = np.concatenate([[False], (values == self._value) & counts, [False]])
         edges = np.flatnonzero(np.diff(at_value))
         begins, lengths = edges[::2], edges[1::2] - edges[::2]
         if len(begins) and begins[0] == 0:

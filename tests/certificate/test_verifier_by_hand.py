@@ -139,12 +139,12 @@ def test_a_witness_has_neither_more_nor_fewer_values(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "within", "beyond", "message"),
     [
-        # A millionth of the sizes of all terms together: of 1 kg that was printed and 1 kg that it should be.
-        ("m1", 1.0 + 1.9e-6, 1.0 + 2.1e-6, "base parameter 1 is another one"),
-        ("m1", 1.0 - 1.9e-6, 1.0 - 2.1e-6, "base parameter 1 is another one"),
-        ("Lxz1", 0.9e-6, 1.1e-6, f"not zero as printed: {PLANE_NAME}"),
-        ("Lxz1", -0.9e-6, -1.1e-6, f"not zero as printed: {PLANE_NAME}"),
-        ("Lzz1", 0.5 + 0.9e-6, 0.5 + 1.1e-6, "base parameter 3 is another one"),
+        # Of the sizes of all terms together: of 1 kg that was printed and 1 kg that it should be.
+        ("m1", 1.0 + 1.9e-12, 1.0 + 2.1e-12, "base parameter 1 is another one"),
+        ("m1", 1.0 - 1.9e-12, 1.0 - 2.1e-12, "base parameter 1 is another one"),
+        ("Lxz1", 0.9e-12, 1.1e-12, f"not zero as printed: {PLANE_NAME}"),
+        ("Lxz1", -0.9e-12, -1.1e-12, f"not zero as printed: {PLANE_NAME}"),
+        ("Lzz1", 0.5 + 0.9e-12, 0.5 + 1.1e-12, "base parameter 3 is another one"),
         ("lx1", 0.4999, 0.5001, f"not positive as printed: {SET}"),
     ],
 )
@@ -388,9 +388,10 @@ def test_the_file_and_its_certificate_are_about_one_set(claimed: str, fits: bool
 
 def test_the_bounds_of_what_is_read_are_the_ones_decided_on() -> None:
     # Every other test takes them from the code.
-    assert (certificate_verifier.MAX_FILE_CHARACTERS, MAX_LINKS, MAX_BLOCKS, MAX_SIZE) == (67_108_864, 200, 5000, 20)
-    assert (certificate_verifier.MAX_NUMBER_CHARACTERS, certificate_verifier._MAX_BITS) == (2000, 100_000)
+    assert (certificate_verifier.MAX_FILE_CHARACTERS, MAX_LINKS, MAX_BLOCKS, MAX_SIZE) == (4_194_304, 200, 5000, 20)
+    assert (certificate_verifier.MAX_NUMBER_CHARACTERS, certificate_verifier._MAX_BITS) == (2000, 20_000)
     assert certificate_verifier._MAX_STEPS == 20_000_000
+    assert (certificate_verifier.MAX_EXPRESSIONS, certificate_verifier.MAX_CHARACTERS) == (1000, 262_144)
 
 
 def test_numbers_are_written_up_to_a_length() -> None:

@@ -103,3 +103,15 @@ def test_required_velocities_that_are_missing_are_reported() -> None:
     options = plain_options(smoothing=plain_smoothing(velocity="measured"))
     with pytest.raises(RecordingError, match="has no velocities; leave out identification"):
         identify(with_options(model, options), [bare])
+
+
+@pytest.mark.slow
+def test_velocities_that_show_no_motion_are_named_and_not_the_positions() -> None:
+    """Columns of zeros were taken for an arm at rest: "are positions in the unit that recording.columns names?"."""
+    recording = noisy(*arm())
+    assert recording.velocity is not None
+    for velocity in (0.0 * recording.velocity, recording.velocity * [1.0, 0.0]):
+        with pytest.raises(
+            RecordingError, match="its positions show a motion that its velocities do not: correct or leave out"
+        ):
+            identified("choose", replace(recording, velocity=velocity))

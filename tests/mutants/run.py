@@ -74,6 +74,7 @@ GROUPS = {
         (
             "tests/certificate/test_verifier_by_hand.py",
             "tests/certificate/test_forgeries.py",
+            "tests/certificate/test_forged_files.py",
             "tests/certificate/test_certificate_hostile.py",
             "tests/certificate/test_exact_arithmetic.py",
             "tests/model/test_expressions.py",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from ident_service.config.load import load_arm
 from ident_service.config.quantities import TextFile
 from ident_service.errors import ConfigError, ModelError
 from ident_service.estimation.identify import Estimate, identify
+from ident_service.estimation.plausibility import torque_clipped
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.operations.identification import unusable_because
 from ident_service.operations.recordings import recording_quality
@@ -147,6 +148,100 @@ def test_a_spike_and_wrong_units_of_an_arm_without_limits() -> None:
     )
 
 
+def clipped(position: np.ndarray, torque: np.ndarray) -> None:
+    np.clip(torque, -20.0, 20.0, out=torque)
+
+
+def averaged(position: np.ndarray, torque: np.ndarray) -> None:
+    torque[:, [1, 3]] = torque[:, [1, 3]].mean(axis=1)[:, None]
+
+
+def hundredth(position: np.ndarray, torque: np.ndarray) -> None:
+    torque *= 0.01
+
+
+def tenfold(position: np.ndarray, torque: np.ndarray) -> None:
+    torque[:, 2] *= 10.0
+
+
+def infinite(position: np.ndarray, torque: np.ndarray) -> None:
+    torque *= 1e300
+
+
+def backwards(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:], torque[:] = position[::-1].copy(), torque[::-1].copy()
+
+
+def geared(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:, 1] *= 0.5
+
+
+def turned_zero(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:, 1] += 0.5
+
+
+def velocities(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:] = np.gradient(position, 0.005, axis=0)
+
+
+def coarse(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:] = np.round(position / 0.05) * 0.05
+
+
+def copied(position: np.ndarray, torque: np.ndarray) -> None:
+    torque[:] = torque[:, :1]
+
+
+def reordered(position: np.ndarray, torque: np.ndarray) -> None:
+    for columns in (position, torque):
+        columns[:] = columns[:, ::-1].copy()
+
+
+def wrapped(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:] = (position + np.pi / 2) % np.pi - np.pi / 2
+
+
+def zeros_behind(position: np.ndarray, torque: np.ndarray) -> None:
+    position[-100:], torque[-100:] = 0.0, 0.0
+
+
+def noise(position: np.ndarray, torque: np.ndarray) -> None:
+    torque[:, 1] = 20.0 * np.random.default_rng(0).normal(size=len(torque))
+
+
+def shuffled(position: np.ndarray, torque: np.ndarray) -> None:
+    order = np.random.default_rng(1).permutation(len(torque))
+    position[:], torque[:] = position[order], torque[order]
+
+
+def still(position: np.ndarray, torque: np.ndarray) -> None:
+    position[:] = position[0] + 1e-5 * np.random.default_rng(0).normal(size=position.shape)
+
+
+def far(position: np.ndarray, torque: np.ndarray) -> None:
+    position[100, 2] = 3.4e38
+
+
+@pytest.mark.slow
+def test_torques_that_were_cut_off_are_told_and_those_of_a_drive_at_its_limit_are_not() -> None:
+    """With 56 % of the samples of a joint at 20 N m, the torque error of 17 % was within what is usable."""
+    model = arm_model(kuka().model_copy(update={"identification": Identification(method="ols", delay=0.0)}))
+    recordings = changed(clipped, model)
+    estimate = identify(model, recordings[:1])
+    found = [(one, recording_quality(one, model)) for one in recordings[:1]]
+    (reason,) = unusable_because(estimate, found).reasons
+    assert re.search(
+        r"the torque of lwr_1_joint stays at exactly -20 or 20 in 56 % of the samples while it moves, and its torque"
+        r" error is \d\d %: it was cut off there; record it within the range of its sensor",
+        reason,
+    )
+    assert any("joint lwr_1_joint: torque saturated in 56 %" in line for line in found[0][1].warnings())
+    own = estimate.candidates[estimate.chosen]
+    own = replace(own, moving=replace(own.moving, joint_relative_percent=np.full(7, 9.0)))
+    predicted = replace(estimate, candidates=(*estimate.candidates[: estimate.chosen], own))
+    assert torque_clipped(predicted, [found[0][1].joints]) == ()
+
+
 # The KUKA in Craig's convention: a, alpha and d of each row are those before the joint.
 CRAIG = ((0.0, 0.3105), ("pi/2", 0.0), ("-pi/2", 0.4), ("-pi/2", 0.0), ("pi/2", 0.39), ("pi/2", 0.0), ("-pi/2", 0.0))
 
@@ -216,6 +311,22 @@ WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
         {},
         "lwr_3_joint moves 0.3.* rad between two samples, .* correct the samples 10.* s after",
     ),
+    "cut off": (clipped, {}, "the torque of lwr_1_joint stays at exactly -20 or 20 in 56 %"),
+    "averaged": (averaged, {}, "its torque error is 3.* more than 30 %"),
+    "hundredth": (hundredth, {}, "no torque is ever more than 0.22 % of its joint's limit"),
+    "tenfold": (tenfold, {}, "wrong sign at lwr_2_joint"),
+    "backwards": (backwards, {}, "wrong sign"),
+    "geared": (geared, {}, "wrong sign at lwr_2_joint"),
+    "turned zero": (turned_zero, {}, "lwr_1_joint"),
+    "velocities": (velocities, {}, "the torque, or the position, may have the wrong sign"),
+    "coarse": (coarse, {}, "lwr_0_joint moves 0.05 rad between two samples"),
+    "copied": (copied, {}, "more than 30 %"),
+    "reordered": (reordered, {}, "more than 30 %"),
+    "wrapped": (wrapped, {}, "lwr_2_joint moves 3.14 rad between two samples"),
+    "zeros behind": (zeros_behind, {}, "lwr_0_joint moves 0.5 rad between two samples"),
+    "noise": (noise, {}, "more than 30 %"),
+    "no gravity": (nothing, {"gravity": [0, 0, 0]}, "more than 30 %"),
+    "gravity of the moon": (nothing, {"gravity": [0, 0, -1.62]}, "without feasibility constraints: gravity"),
     "gravity": (
         nothing,
         {"gravity": [0.0, 0.0, 9.81]},
@@ -265,6 +376,31 @@ def test_the_command_says_no_where_people_look(tmp_path: Path, capsys: pytest.Ca
     state = tmp_path / "state"
     assert main(["accept", str(tmp_path / "out"), "--note", "x", "--by", "me", "--state", str(state)]) != 0
     assert "must not be used" in capsys.readouterr().err
+
+
+NO_RESULT: dict[str, tuple[Change, dict[str, Any], str]] = {
+    "shuffled": (shuffled, {}, r"run0\.csv: lwr_0_joint moves .* rad between two samples, .* correct the samples"),
+    "still": (still, {}, "no joint moves: each is slower than 0.005 rad/s or m/s over 20 ms; record a motion"),
+    "gravity in millimetres": (
+        nothing,
+        {"gravity": [0, 0, -9810]},
+        r"arm\.yaml:\d+:1: gravity: 9810 m/s\^2 is more than any planet has; in mm/s\^2\? gravity is \[0, 0, -9",
+    ),
+    "far": (far, {}, r"the position of lwr_2_joint reaches 3\.4e\+38, which no sensor measures"),
+    "infinite": (infinite, {}, r"the torque of lwr_0_joint reaches 2\.\d+e\+300, which no sensor measures"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NO_RESULT)
+def test_the_command_names_what_no_estimate_is_made_of(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """These ended with a wrong remedy: a longer recording, or weights that do not converge."""
+    change, tree, words = NO_RESULT[name]
+    assert main(written(tmp_path, change, tree)) == 2
+    assert re.search(words, capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
 
 
 DH = {"joint": {"a": 0.3, "alpha": "90 deg"}}

@@ -171,6 +171,9 @@ def test_a_header_lists_all_its_problems(tmp_path: Path) -> None:
         ("t q1 tau1", "columns are separated by spaces"),
         ("0.0,-1.5,2e3", "is numbers; put a line with the names of the columns above it: t,q1..qN,tau1..tauN"),
         ("# recorded by us", "is a comment; remove what stands"),
+        ("t,q1,tau1\r0,1,2\r1,2,3", "lines end in a carriage return alone; save it with line feeds"),
+        ('"t","q1","tau1"', "names are in quotation marks; write names and numbers without them"),
+        ("<!DOCTYPE html>", "is HTML or XML, a page and no recording; download the file itself"),
         ("T,Q1,Tau1", "write the names in small letters: t,q1..qN,tau1..tauN"),
         ("# t, q1, tau1", "is a comment; remove what stands before the names of the columns"),
         (
