@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
@@ -101,7 +102,7 @@ class MonitoredSample:
         age: cycles since each was usable.
         jumps: jumps of each in a row.
         frozen: which encoders stand still although the joint cannot.
-        was_powered: which axes' drives have said so before.
+        was_powered: which axes' drives have said so before, or would have by now.
         sent: last torque asked for [N m or N], shape (joints,), or None.
         max_age: cycles without an axis' feedback before it counts as gone.
         depths: how deep pairs of solids reach into each other [m].
@@ -157,7 +158,7 @@ def _quick_stop_checks(seen: MonitoredSample) -> Iterator[Check]:
     yield Check("drive_fault", _has_status(seen, AxisStatus.FAULT), "the drive reports a fault")
     yield Check("drive_watchdog", _has_status(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
     unpowered = seen.was_powered & ~_has_status(seen, AxisStatus.POWERED) & bool(seen.sample.status)
-    yield Check("drive_fault", unpowered, "the drive is no longer energised")
+    yield Check("drive_fault", unpowered, "the drive is not energised")
     yield Check("feedback_gone", seen.age >= seen.max_age, f"no usable feedback for {seen.max_age} cycles")
 
 
@@ -251,6 +252,7 @@ class SafetyMonitor:
     Attributes:
         findings: makes the faults and counts the warnings, of others than the guard too.
         rate: largest change of torque per cycle [N m or N], shape (joints,).
+        jump: how far from the expected one a position is believed [rad or m], shape (joints,).
     """
 
     def __init__(
@@ -266,6 +268,7 @@ class SafetyMonitor:
         max_age: int = MAX_AGE,
         most_torque: Vector | None = None,
         coupling: Vector | None = None,
+        report_delay: float | None = None,
     ) -> None:
         """Start with the arm standing at a position.
 
@@ -283,6 +286,9 @@ class SafetyMonitor:
                 [N m or N], shape (joints,); None for drives that are given torques.
             coupling: drive coordinates per joint coordinates, shape (joints, joints): a drive that moves several joints
                 can stand still, too; each joint's own drive when None.
+            report_delay: of an arm that is enabled before the first sample: with which its drives say so [s]
+                (`ArmDescription.report_delay`), and as many cycles later as feedback may be missing; when None, a drive
+                may say so at any time.
         """
         joints = len(position)
         self.findings = FaultCounter()
@@ -317,8 +323,9 @@ class SafetyMonitor:
         self._target = self._previous_target = position.copy()
         self._none = np.zeros(joints)
         self._healthy: tuple[int, ...] = ()
+        self._powered_by = 0 if report_delay is None else max_age + ceil(report_delay / period) + 1
         self._was_powered = np.zeros(joints, dtype=bool)
-        self._jump = JUMP * limits.velocity * period
+        self.jump = JUMP * limits.velocity * period
         self._not_applied = NOT_APPLIED * limits.torque
         together = np.eye(joints, dtype=bool) if limits.motors is None else limits.motors.together
         self._joined = together @ together.T  # which joints share motors
@@ -365,6 +372,8 @@ class SafetyMonitor:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
         self.findings.cycle += 1
+        if self.findings.cycle == self._powered_by:
+            self._was_powered, self._healthy = np.ones_like(self._was_powered), ()
         self._elapsed, self._known = self._period if elapsed is None else elapsed, known
         answered = all(sample.valid.tolist())
         encoders = self._encoders
@@ -511,7 +520,7 @@ class SafetyMonitor:
 
     def _farthest(self) -> Vector:
         """Return how far a position may be from the expected one [rad or m], shape (joints,)."""
-        return self._jump if self._known else self._jump * (self._elapsed / self._period)
+        return self.jump if self._known else self.jump * (self._elapsed / self._period)
 
     def _plain(self, sample: Sample) -> bool:
         """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""

@@ -167,6 +167,17 @@ def test_a_status_that_is_read_anew_but_says_the_same_is_the_same() -> None:
     is_fault(bench.see(HOME, status=(int(AxisStatus.POWERED), 0))[1], "drive_fault", 1)
 
 
+def test_a_drive_that_has_not_said_in_time_that_it_is_energised_is_not() -> None:
+    """It may have let go between the enabling and the first sample."""
+    on, bench = int(AxisStatus.POWERED), Bench(max_age=3, report_delay=1.5 * PERIOD)
+    for _ in range(3 + 2):
+        assert bench.see(HOME, status=(on, 0)) == ([True, True], None)
+    is_fault(bench.see(HOME, status=(on, 0))[1], "drive_fault", 1)
+    for status in ((on, on), ()):
+        bench = Bench(max_age=3, report_delay=0.0)
+        assert [bench.see(HOME, status=status)[1] for _ in range(9)] == [None] * 9
+
+
 @pytest.mark.parametrize("most", [3, 5])
 def test_an_axis_is_gone_after_as_many_cycles_as_its_driver_says(most: int) -> None:
     bench = Bench(max_age=most)
