@@ -159,7 +159,10 @@ def _quick_stop_checks(seen: MonitoredSample) -> Iterator[Check]:
     yield Check("drive_watchdog", _has_status(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
     unpowered = seen.was_powered & ~_has_status(seen, AxisStatus.POWERED) & bool(seen.sample.status)
     yield Check("drive_fault", unpowered, "the drive is not energised")
-    yield Check("feedback_gone", seen.age >= seen.max_age, f"no usable feedback for {seen.max_age} cycles")
+    age = seen.age.astype(float)
+    # Where the bus or this machine was late, others lack a few cycles less.
+    missing = (seen.age > 0) & (seen.age >= seen.max_age).any()
+    yield Check("feedback_gone", missing, "no usable feedback for {} cycles", (age,))
 
 
 def _what_must_end(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
@@ -168,7 +171,10 @@ def _what_must_end(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Chec
     away, allowed = np.abs(seen.wanted - position), limits.following_error
     what = "{} {u} from where it should be, {} {u} allowed"
     yield Check("following_lost", away > FOLLOWING_LOST * allowed, what, (away, allowed))
-    yield Check("encoder_jumps", seen.jumps >= 2, "position jumped in consecutive cycles")
+    unseen = (seen.age - seen.jumps).astype(float)
+    jumps = seen.jumps >= 2
+    after = " after {} without feedback" if unseen[jumps].any() else ""
+    yield Check("encoder_jumps", jumps, f"position jumped in consecutive cycles{after}", (unseen,))
     beyond, limit = _limit_excess(position, limits)
     yield Check("position_limit", beyond > 0.0, "at {} {u}, beyond the limit of {} {u}", (position, limit))
     towards = np.where(velocity > 0.0, limits.upper - position, position - limits.lower)
@@ -301,6 +307,8 @@ class SafetyMonitor:
         self._encoder_observer = encoder_observer
         self._position = self._shown = position.copy()
         self._age: Counts = np.zeros(joints, dtype=np.int64)
+        self._unseen = np.zeros(joints)  # s since each position was usable
+        self._unsure = np.zeros(joints)  # and how much of that may not have passed
         self._jumps: Counts = np.zeros(joints, dtype=np.int64)
         encoders = self._encoders = EncoderCoordinates.of(coupling, joints)
         self._fast = SUDDEN_SPEED * encoders.largest_motions(limits.velocity)
@@ -556,11 +564,14 @@ class SafetyMonitor:
         """Check a sample that may violate a threshold, threshold by threshold."""
         position = sample.position
         # If the window only grew with the age, the second reading of a wrong position would be accepted.
-        expected = self._position + velocity * (self._elapsed + self._period * self._age)
-        jumped = sample.valid & (np.abs(position - expected) > self._farthest())
+        unseen, unsure = self._unseen + self._elapsed, self._unsure + (0.0 if self._known else self._elapsed)
+        window = self.jump * np.maximum(unsure / self._period, 1.0)
+        jumped = sample.valid & (np.abs(position - self._position - velocity * unseen) > window)
         usable = sample.valid & ~jumped
         self._jumps = np.where(jumped, self._jumps + 1, 0)
         self._age = np.where(usable, 0, np.maximum(self._age + 1, sample.age))
+        self._unseen = np.where(usable, 0.0, np.maximum(unseen, self._period * sample.age))
+        self._unsure = np.where(usable, 0.0, unsure)
         self._position = np.where(usable, position, self._position)
         self._all_fresh = not self._age.any()
         self._shown = np.where(sample.valid, position, self._shown)
