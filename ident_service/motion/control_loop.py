@@ -140,6 +140,8 @@ class Loop:
         self.last.append(sample)
         found = self.deadlines.cycle(stamp_ns, woken_ns, sample.stamp_doubt_ns)
         if found is not None:
+            if found.reaction is Reaction.CONTROLLED_STOP and not self.gives_positions:
+                self.course.skip_to(stamp_ns)  # under the last torque the arm has gone on, not to the last position
             self._react(found, stamp_ns)
         reference = self.course.at(stamp_ns)
         if self.states.state is State.DONE:

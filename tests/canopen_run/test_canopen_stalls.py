@@ -155,6 +155,13 @@ def test_a_stall_that_is_too_long_or_comes_too_often_is_a_controlled_stop_of_its
     assert seen.fault.code == "late_cycles"
     assert re.search(said, str(seen.fault))
     assert seen.story.states[-3:] == ["exciting", "stopping", "stopped"]
+    # The stop begins where the arm has gone on to meanwhile.
+    ends = next(stamp for stamp, _, message in seen.story.events if message == "stopped")
+    stamps = seen.story.column("stamp_ns")
+    position, velocity = (seen.story.column(f"reference_{of}")[stamps < ends] for of in ("position", "velocity"))
+    passed = np.diff(stamps[stamps < ends])[:, None] * 1e-9
+    steps = np.diff(position, axis=0) - 0.5 * (velocity[1:] + velocity[:-1]) * passed
+    assert np.abs(steps).max() < 1e-3
 
 
 @pytest.mark.slow
