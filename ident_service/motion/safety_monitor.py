@@ -536,9 +536,12 @@ class SafetyMonitor:
             return False
         if sample.status is not self._healthy and not self._all_drives_healthy(sample.status):
             return False
-        if self._sent is not None and not all((np.abs(sample.torque - self._sent) <= self._not_applied).tolist()):
+        sent, most = self._sent, self._most_torque
+        if sent is not None and not all((np.abs(sample.torque - sent) <= self._not_applied).tolist()):
             return False
-        if self._most_torque is not None and not all((np.abs(sample.torque) <= self._most_torque).tolist()):
+        if most is not None and not all((np.abs(sample.torque) <= most).tolist()):
+            return False
+        if sent is None and most is None and not all(np.isfinite(sample.torque).tolist()):
             return False
         more = sample.torque_difference
         if more is not None and not all((np.abs(more) <= self._not_applied).tolist()):
