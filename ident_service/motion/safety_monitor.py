@@ -308,7 +308,7 @@ class SafetyMonitor:
         self._position = self._shown = position.copy()
         self._age: Counts = np.zeros(joints, dtype=np.int64)
         self._unseen = np.zeros(joints)  # s since each position was usable
-        self._unsure = np.zeros(joints)  # and how much of that may not have passed
+        self._unsure = np.zeros(joints)  # and the longest part of that which may not have passed
         self._jumps: Counts = np.zeros(joints, dtype=np.int64)
         encoders = self._encoders = EncoderCoordinates.of(coupling, joints)
         self._fast = SUDDEN_SPEED * encoders.largest_motions(limits.velocity)
@@ -567,7 +567,7 @@ class SafetyMonitor:
         """Check a sample that may violate a threshold, threshold by threshold."""
         position = sample.position
         # If the window only grew with the age, the second reading of a wrong position would be accepted.
-        unseen, unsure = self._unseen + self._elapsed, self._unsure + (0.0 if self._known else self._elapsed)
+        unseen, unsure = self._unseen + self._elapsed, np.maximum(self._unsure, 0.0 if self._known else self._elapsed)
         window = self.jump * np.maximum(unsure / self._period, 1.0)
         jumped = sample.valid & (np.abs(position - self._position - velocity * unseen) > window)
         usable = sample.valid & ~jumped
