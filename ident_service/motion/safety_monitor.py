@@ -339,7 +339,7 @@ class SafetyMonitor:
         self._joined = together @ together.T  # which joints share motors
         self._braking = 2.0 * ENVELOPE * limits.acceleration
         slack, fastest = (ENVELOPE_SLACK * limits.velocity) ** 2, VELOCITY_STOP * limits.velocity
-        bounds = limits.lower, limits.upper, self._braking, slack, fastest, limits.following_error
+        bounds = limits.lower, limits.upper, self._braking, slack, fastest, limits.following_error, self.jump
         self._quiet_bounds = list(zip(*(bound.tolist() for bound in bounds), strict=True))
 
     @property
@@ -508,10 +508,10 @@ class SafetyMonitor:
         """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
         rows = zip(
             *(position.tolist(), self._position.tolist(), wanted.tolist(), velocity.tolist()),
-            *(self._farthest().tolist(), self._quiet_bounds),
+            self._quiet_bounds,
             strict=True,
         )
-        for here, before, target, speed, farthest, (lower, upper, braking, slack, fastest, away) in rows:
+        for here, before, target, speed, (lower, upper, braking, slack, fastest, away, farthest) in rows:
             above, below, signed = here - upper, lower - here, speed * abs(speed)
             kept = (
                 above <= 0.0
@@ -525,10 +525,6 @@ class SafetyMonitor:
             if not kept:
                 return False
         return True
-
-    def _farthest(self) -> Vector:
-        """Return how far a position may be from the expected one [rad or m], shape (joints,)."""
-        return self.jump if self._known else self.jump * (self._elapsed / self._period)
 
     def _plain(self, sample: Sample) -> bool:
         """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""
@@ -573,7 +569,7 @@ class SafetyMonitor:
         usable = sample.valid & ~jumped
         self._jumps = np.where(jumped, self._jumps + 1, 0)
         self._age = np.where(usable, 0, np.maximum(self._age + 1, sample.age))
-        self._unseen = np.where(usable, 0.0, np.maximum(unseen, self._period * sample.age))
+        self._unseen = np.where(usable, 0.0, unseen)
         self._unsure = np.where(usable, 0.0, unsure)
         self._position = np.where(usable, position, self._position)
         self._all_fresh = not self._age.any()

@@ -138,6 +138,13 @@ def test_an_axis_that_was_away_meanwhile_is_expected_where_it_has_gone(skipped: 
 
     for passed in (gone,) if known else (PERIOD, gone):
         assert back(velocity * (passed + PERIOD)) == ([True, True], None)
+    bench, now = Bench(), HOME
+    for _ in range(2):  # and what has passed before counts no more
+        now = now + velocity * gone
+        bench.see(now, velocity=velocity, valid=(False, False), elapsed=gone, known=known)
+        now = now + velocity * PERIOD
+        assert bench.see(now, velocity=velocity) == ([True, True], None)
+    is_fault(bench.see(now + velocity * PERIOD + 1.001 * WINDOW * unit(0), now, velocity)[1], "encoder_jump", 0)
     reach = 1 if known else 1 + skipped
     usable, fault = back(velocity * (gone + PERIOD) + 1.001 * reach * WINDOW * unit(1))
     assert usable == [True, False]
