@@ -85,6 +85,10 @@ class JointEncoders:
             self._origin[k] = float(position[k]) - self._counts[k] * self._radians[k]
             self._beyond[k] = 0
 
+    def forget_told(self) -> None:
+        """Tell of joints that are still apart from their motors anew: of an idle arm nobody may have acted upon it."""
+        self._beyond = dict.fromkeys(self._radians, 0)
+
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
         """Return joint positions by the encoders, and an event of each joint that has come apart from its motors.
 
@@ -324,6 +328,7 @@ class BarrettArm(Arm):
             self.stop(StopKind.TORQUE_OFF)
             raise
         bus.codec.forget_events()
+        self._joint_encoders.forget_told()
         self._enabled = True
 
     def reset(self) -> None:

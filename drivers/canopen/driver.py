@@ -232,6 +232,10 @@ class Reports:
         self._look_every = look_every
         self._missed = MissedReports()
 
+    def forget_missing(self) -> None:
+        """Tell of reports that are still missing anew: what was told of an idle arm nobody may have acted upon."""
+        self._missed = MissedReports()
+
     def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
         """Return the events since the last call; `cycle` is the cycle's number, `now_ns` of the links' clock [ns]."""
         found: list[AxisEvent] = []
@@ -424,6 +428,7 @@ class CanopenArm(Arm):
             self.stop(StopKind.QUICK_STOP if held else StopKind.TORQUE_OFF)
             raise
         buses.forget_events()  # of the states that drives went through
+        self._reports.forget_missing()
         self._enabled = buses.enabled = True
 
     def reset(self) -> None:

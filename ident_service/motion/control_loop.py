@@ -112,30 +112,36 @@ class Loop:
         self._rest_speed = REST_SPEED * self.limits.velocity
         self._hold_speed = HOLD_SPEED * self.limits.velocity
 
-    def run(self, target: Vector) -> None:
+    def run(self, target: Vector, first: Sample | None = None) -> None:
         """Cycle until DONE, or until STOPPED and held.
 
         Args:
             target: of the first cycle, that holds the arm where it stands, shape (joints,): torque [N m or N], or
                 position [rad or m] of an arm that is given positions.
+            first: sample of the first cycle, where `target` has been exchanged already.
 
         Raises:
             ArmFault: torque must end now.
         """
-        wanted: Vector | None = target
+        wanted = self._after(self._exchanged(target) if first is None else first)
         while wanted is not None:
-            wanted = self._cycle(wanted)
+            wanted = self._after(self._exchanged(wanted))
 
-    def _cycle(self, target: Vector) -> Vector | None:
-        """Run one cycle with the target to send; returns that of the next cycle, or None at the end."""
+    def _exchanged(self, target: Vector) -> Sample:
+        """Return the sample of a cycle in which the target is sent."""
         try:
-            sample = (self.arm.exchange_position if self.gives_positions else self.arm.exchange)(target)
+            return (self.arm.exchange_position if self.gives_positions else self.arm.exchange)(target)
         except DriverError as error:
             raise self._end(self.guard.findings.found("driver", str(error))) from error
+
+    def _after(self, sample: Sample) -> Vector | None:
+        """Run one cycle from its sample on; returns the target of the next cycle, or None at the end."""
         woken_ns, stamp_ns = self.arm.clock.now_ns(), sample.stamp_ns
         self.last.append(sample)
         found = self.deadlines.cycle(stamp_ns, woken_ns, sample.stamp_doubt_ns)
         if found is not None:
+            if found.reaction is Reaction.CONTROLLED_STOP and not self.gives_positions:
+                self.course.skip_to(stamp_ns)  # under the last torque the arm has gone on, not to the last position
             self._react(found, stamp_ns)
         reference = self.course.at(stamp_ns)
         if self.states.state is State.DONE:

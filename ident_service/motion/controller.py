@@ -134,10 +134,11 @@ class ComputedTorque:
         """Update where positions are missing, or were: a velocity is over the time since the last one measured.
 
         Against a prediction over one period, what a joint had gained unseen in several would be a jump of its velocity.
+        Where that time is not known, the velocity stays for one more cycle.
         """
         measured, since = (self.position, np.zeros_like(position)) if self._missing is None else self._missing
-        since = since + seconds
-        seen = valid & (seconds > 0.0)
+        since = since + (seconds if seconds > 0.0 else np.inf)
+        seen = valid & np.isfinite(since)
         over = np.where(seen, since, self._period)
         gain = _gain(self._cutoff, over)
         self.velocity = np.where(

@@ -110,7 +110,7 @@ FAULTS: dict[str, Rule] = {
     # The loop can still be trusted to stop the arm.
     "repeated_warnings": Rule(_STOP, "a warning is tolerated once, not repeatedly"),
     "late_cycles": Rule(_STOP, "this computer does not keep the rate; check its load and scheduling"),
-    "encoder_jumps": Rule(_STOP, "the encoder or its cable is disturbed"),
+    "encoder_jumps": Rule(_STOP, "the encoder or its cable is disturbed, or its drive was late"),
     "position_envelope": Rule(_STOP, "it could hardly be stopped before its position limit"),
     "position_limit": Rule(_STOP, "it overshot, or was pushed"),
     "over_velocity": Rule(_STOP, "it was pushed, or model or gains are wrong"),
@@ -127,7 +127,9 @@ FAULTS: dict[str, Rule] = {
     # The arm can be measured, but does not follow.
     "following_lost": Rule(_LOWER, "it is blocked, loaded, or a drive does not give its torque"),
     # The host, the bus or single axes; the other drives can brake.
-    "feedback_gone": Rule(_QUICK, "an axis, its encoder or cable failed; if all: the bus, or this machine stalled"),
+    "feedback_gone": Rule(
+        _QUICK, "a drive is late, or it, its encoder or cable failed; if several: the bus, or this machine stalled"
+    ),
     "drive_fault": Rule(_QUICK, "the drive gives no torque; read its own fault code before anything else"),
     "drive_emergency": Rule(_QUICK, "the drive reports an error; see the code in its manual"),
     "drive_silent": Rule(_QUICK, "it lost its power or its cable, or its firmware hangs"),

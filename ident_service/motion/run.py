@@ -129,7 +129,8 @@ def unhurried() -> Iterator[None]:
 
 
 WAITS_FOR: Final = "waiting for a person:"  # begins the line of the story that names what is waited for
-MOVED: Final = 0.01  # rad or m that an arm may have been moved by while a person is waited for
+# rad or m that an arm may have been moved by while a person is waited for; less where the guard would call that a jump
+MOVED: Final = 0.01
 _ENABLINGS: Final = 3  # times that a person is asked again because the arm was moved meanwhile
 _INFO: Final = 20  # level of rcl_interfaces/msg/Log
 
@@ -241,6 +242,7 @@ class _Run:
             waiting = "; ".join(f"{fault.code} ({fault.cause})" for fault in self.latch.faults)
             raise MotionRefused(f"unacknowledged faults: {waiting}")
         self.nobody = ""
+        self._first: Sample | None = None
         for _ in range(_ENABLINGS):
             loop, torque = self._prepared()
             if self.controls.stop:  # planning takes a second or more; the arm must not be energised after a stop
@@ -258,7 +260,7 @@ class _Run:
         try:
             self.states.enter(State.ARMED)
             self.states.enter(loop.course.first)
-            loop.run(torque)
+            loop.run(torque, self._first)
             # Done, the arm stands where it stood supported; lowered, it rests; stopped, it may not: drives brake it.
             done = self.states.state is State.DONE
             self.arm.stop(StopKind.TORQUE_OFF if done or loop.lowered else StopKind.QUICK_STOP)
@@ -309,8 +311,9 @@ class _Run:
                 self.arm.still_wanted = wanted
             if not action or self.controls.stop:
                 return True
-            moved = np.abs(self.arm.exchange(torque).position - self._home)
-            if bool((moved <= MOVED).all()):
+            seen = self.arm.exchange(torque)
+            if bool((np.abs(seen.position - self._home) <= np.minimum(MOVED, loop.guard.jump)).all()):
+                self._first = seen  # to be judged: what it tells of drives and bus is told once
                 return True
             self.arm.stop(StopKind.QUICK_STOP)
             loop.tell(_INFO, self._stamp_ns, "the arm was moved while a person was waited for; planned again")
@@ -368,6 +371,7 @@ class _Run:
             max_age=described.lost_cycles,
             most_torque=(1.0 + NOT_APPLIED) * limits.torque if described.streams_position else None,
             coupling=encoder_coupling(model.config),
+            report_delay=described.report_delay,
         )
         friction = friction_feedforward(model, limits)
         control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home, friction)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
@@ -101,7 +102,7 @@ class MonitoredSample:
         age: cycles since each was usable.
         jumps: jumps of each in a row.
         frozen: which encoders stand still although the joint cannot.
-        was_powered: which axes' drives have said so before.
+        was_powered: which axes' drives have said so before, or would have by now.
         sent: last torque asked for [N m or N], shape (joints,), or None.
         max_age: cycles without an axis' feedback before it counts as gone.
         depths: how deep pairs of solids reach into each other [m].
@@ -157,8 +158,11 @@ def _quick_stop_checks(seen: MonitoredSample) -> Iterator[Check]:
     yield Check("drive_fault", _has_status(seen, AxisStatus.FAULT), "the drive reports a fault")
     yield Check("drive_watchdog", _has_status(seen, AxisStatus.WATCHDOG), "the drive's watchdog has struck")
     unpowered = seen.was_powered & ~_has_status(seen, AxisStatus.POWERED) & bool(seen.sample.status)
-    yield Check("drive_fault", unpowered, "the drive is no longer energised")
-    yield Check("feedback_gone", seen.age >= seen.max_age, f"no usable feedback for {seen.max_age} cycles")
+    yield Check("drive_fault", unpowered, "the drive is not energised")
+    age = seen.age.astype(float)
+    # Where the bus or this machine was late, others lack a few cycles less.
+    missing = (seen.age > 0) & (seen.age >= seen.max_age).any()
+    yield Check("feedback_gone", missing, "no usable feedback for {} cycles", (age,))
 
 
 def _what_must_end(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Check]:
@@ -167,7 +171,10 @@ def _what_must_end(seen: MonitoredSample, limits: MotionLimits) -> Iterator[Chec
     away, allowed = np.abs(seen.wanted - position), limits.following_error
     what = "{} {u} from where it should be, {} {u} allowed"
     yield Check("following_lost", away > FOLLOWING_LOST * allowed, what, (away, allowed))
-    yield Check("encoder_jumps", seen.jumps >= 2, "position jumped in consecutive cycles")
+    unseen = (seen.age - seen.jumps).astype(float)
+    jumps = seen.jumps >= 2
+    after = " after {} without feedback" if unseen[jumps].any() else ""
+    yield Check("encoder_jumps", jumps, f"position jumped in consecutive cycles{after}", (unseen,))
     beyond, limit = _limit_excess(position, limits)
     yield Check("position_limit", beyond > 0.0, "at {} {u}, beyond the limit of {} {u}", (position, limit))
     towards = np.where(velocity > 0.0, limits.upper - position, position - limits.lower)
@@ -251,6 +258,7 @@ class SafetyMonitor:
     Attributes:
         findings: makes the faults and counts the warnings, of others than the guard too.
         rate: largest change of torque per cycle [N m or N], shape (joints,).
+        jump: how far from the expected one a position is believed [rad or m], shape (joints,).
     """
 
     def __init__(
@@ -266,6 +274,7 @@ class SafetyMonitor:
         max_age: int = MAX_AGE,
         most_torque: Vector | None = None,
         coupling: Vector | None = None,
+        report_delay: float | None = None,
     ) -> None:
         """Start with the arm standing at a position.
 
@@ -283,6 +292,9 @@ class SafetyMonitor:
                 [N m or N], shape (joints,); None for drives that are given torques.
             coupling: drive coordinates per joint coordinates, shape (joints, joints): a drive that moves several joints
                 can stand still, too; each joint's own drive when None.
+            report_delay: of an arm that is enabled before the first sample: with which its drives say so [s]
+                (`ArmDescription.report_delay`), and as many cycles later as feedback may be missing; when None, a drive
+                may say so at any time.
         """
         joints = len(position)
         self.findings = FaultCounter()
@@ -295,6 +307,8 @@ class SafetyMonitor:
         self._encoder_observer = encoder_observer
         self._position = self._shown = position.copy()
         self._age: Counts = np.zeros(joints, dtype=np.int64)
+        self._unseen = np.zeros(joints)  # s since each position was usable
+        self._unsure = np.zeros(joints)  # and the longest part of that which may not have passed
         self._jumps: Counts = np.zeros(joints, dtype=np.int64)
         encoders = self._encoders = EncoderCoordinates.of(coupling, joints)
         self._fast = SUDDEN_SPEED * encoders.largest_motions(limits.velocity)
@@ -317,14 +331,15 @@ class SafetyMonitor:
         self._target = self._previous_target = position.copy()
         self._none = np.zeros(joints)
         self._healthy: tuple[int, ...] = ()
+        self._powered_by = 0 if report_delay is None else max_age + ceil(report_delay / period) + 1
         self._was_powered = np.zeros(joints, dtype=bool)
-        self._jump = JUMP * limits.velocity * period
+        self.jump = JUMP * limits.velocity * period
         self._not_applied = NOT_APPLIED * limits.torque
         together = np.eye(joints, dtype=bool) if limits.motors is None else limits.motors.together
         self._joined = together @ together.T  # which joints share motors
         self._braking = 2.0 * ENVELOPE * limits.acceleration
         slack, fastest = (ENVELOPE_SLACK * limits.velocity) ** 2, VELOCITY_STOP * limits.velocity
-        bounds = limits.lower, limits.upper, self._braking, slack, fastest, limits.following_error
+        bounds = limits.lower, limits.upper, self._braking, slack, fastest, limits.following_error, self.jump
         self._quiet_bounds = list(zip(*(bound.tolist() for bound in bounds), strict=True))
 
     @property
@@ -365,6 +380,8 @@ class SafetyMonitor:
             Which axes' positions may be used, and the most severe fault found, if any.
         """
         self.findings.cycle += 1
+        if self.findings.cycle == self._powered_by:
+            self._was_powered, self._healthy = np.ones_like(self._was_powered), ()
         self._elapsed, self._known = self._period if elapsed is None else elapsed, known
         answered = all(sample.valid.tolist())
         encoders = self._encoders
@@ -491,10 +508,10 @@ class SafetyMonitor:
         """Return whether positions that all answered keep every position, velocity, following and jump threshold."""
         rows = zip(
             *(position.tolist(), self._position.tolist(), wanted.tolist(), velocity.tolist()),
-            *(self._farthest().tolist(), self._quiet_bounds),
+            self._quiet_bounds,
             strict=True,
         )
-        for here, before, target, speed, farthest, (lower, upper, braking, slack, fastest, away) in rows:
+        for here, before, target, speed, (lower, upper, braking, slack, fastest, away, farthest) in rows:
             above, below, signed = here - upper, lower - here, speed * abs(speed)
             kept = (
                 above <= 0.0
@@ -509,19 +526,18 @@ class SafetyMonitor:
                 return False
         return True
 
-    def _farthest(self) -> Vector:
-        """Return how far a position may be from the expected one [rad or m], shape (joints,)."""
-        return self._jump if self._known else self._jump * (self._elapsed / self._period)
-
     def _plain(self, sample: Sample) -> bool:
         """Return whether encoders, status words, torques, velocities and collision distances are all healthy."""
         if not (self._none_still and self._all_change) and any(self._frozen().tolist()):
             return False
         if sample.status is not self._healthy and not self._all_drives_healthy(sample.status):
             return False
-        if self._sent is not None and not all((np.abs(sample.torque - self._sent) <= self._not_applied).tolist()):
+        sent, most = self._sent, self._most_torque
+        if sent is not None and not all((np.abs(sample.torque - sent) <= self._not_applied).tolist()):
             return False
-        if self._most_torque is not None and not all((np.abs(sample.torque) <= self._most_torque).tolist()):
+        if most is not None and not all((np.abs(sample.torque) <= most).tolist()):
+            return False
+        if sent is None and most is None and not all(np.isfinite(sample.torque).tolist()):
             return False
         more = sample.torque_difference
         if more is not None and not all((np.abs(more) <= self._not_applied).tolist()):
@@ -547,11 +563,14 @@ class SafetyMonitor:
         """Check a sample that may violate a threshold, threshold by threshold."""
         position = sample.position
         # If the window only grew with the age, the second reading of a wrong position would be accepted.
-        expected = self._position + velocity * (self._elapsed + self._period * self._age)
-        jumped = sample.valid & (np.abs(position - expected) > self._farthest())
+        unseen, unsure = self._unseen + self._elapsed, np.maximum(self._unsure, 0.0 if self._known else self._elapsed)
+        window = self.jump * np.maximum(unsure / self._period, 1.0)
+        jumped = sample.valid & (np.abs(position - self._position - velocity * unseen) > window)
         usable = sample.valid & ~jumped
         self._jumps = np.where(jumped, self._jumps + 1, 0)
         self._age = np.where(usable, 0, np.maximum(self._age + 1, sample.age))
+        self._unseen = np.where(usable, 0.0, unseen)
+        self._unsure = np.where(usable, 0.0, unsure)
         self._position = np.where(usable, position, self._position)
         self._all_fresh = not self._age.any()
         self._shown = np.where(sample.valid, position, self._shown)

@@ -228,6 +228,10 @@ class TrajectorySequencer:
         """Return for how long the present reference has rested at its end [s]; negative before."""
         return self._elapsed(stamp_ns) - self._way.duration
 
+    def skip_to(self, stamp_ns: int) -> None:
+        """Take the reference to a cycle before which others were missed, at most to the end of its trajectory."""
+        self.reference = self._way.at(self._elapsed(stamp_ns))
+
     def stop(self, stamp_ns: int) -> None:
         """Begin a controlled stop, in states that allow one."""
         if self._states.state in STOPPABLE:

@@ -244,6 +244,7 @@ class Session:
             max_age=described.lost_cycles,
             most_torque=np.minimum(np.abs(self.gravity) + self._band, limits.torque) if self.gives_positions else None,
             coupling=encoder_coupling(model.config),
+            report_delay=described.report_delay,
         )
         self._control = ComputedTorque(dynamics, limits, period, model.config.control.velocity_cutoff, home)
         self._since = Elapsed(period)
@@ -251,6 +252,7 @@ class Session:
         self._explained: Vector | None = None  # the model's torque, where drives are given positions
         self._correction = np.zeros_like(home)  # in the target that was sent last
         self._rows: list[tuple[Sample, Setpoint]] = []
+        self._first: Sample | None = None  # of an arm that a person has enabled, not judged yet
         self._words: tuple[int, ...] = ()
         self._friction = still
         self._coupling = model.chain.coupling
@@ -272,8 +274,8 @@ class Session:
         self._arm.enable()
         self._target = self._passed(self.home) if self.gives_positions else self._limited(self.gravity)
         if waits:
-            sample = self.exchange()
-            if not bool((np.abs(sample.position - self.home) <= MOVED).all()):
+            self._first = sample = self.exchange()
+            if not bool((np.abs(sample.position - self.home) <= np.minimum(MOVED, self._guard.jump)).all()):
                 self._arm.stop(StopKind.TORQUE_OFF)
                 raise ArmFault(MOVED_CODE, "the arm was moved while a person was waited for; check again", [sample])
 
@@ -302,7 +304,7 @@ class Session:
         learned: dict[bool, list[Vector]] = {}
         begin_ns: int | None = None
         while True:
-            sample = self.exchange()
+            sample, self._first = self._first or self.exchange(), None
             if begin_ns is None:
                 begin_ns = sample.stamp_ns
             elapsed = (sample.stamp_ns - begin_ns) * 1e-9

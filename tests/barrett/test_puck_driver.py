@@ -543,8 +543,11 @@ def test_a_cable_that_slips_shows_in_the_joints_that_its_motor_moves(motor: int,
         for _ in range(40):  # a motor that turns by itself, too slowly for a jump
             bench.behind.inject(DriveFault("encoder_offset", motor, size=0.005, duration=10.0))
             found += arm.exchange(None).events
+        arm.enable()  # by somebody to whom nothing was told
+        told = [event for _ in range(5) for event in arm.exchange(np.zeros(7)).events]
     slipped = [event for event in found if event.code is AxisEventCode.TRANSMISSION_SLIPPED]
     assert {event.axis for event in slipped} == joints  # each once
+    assert {event.axis for event in told if event.code is AxisEventCode.TRANSMISSION_SLIPPED} == joints
     assert len(slipped) == len(joints)
     assert "rad further than its motors since the arm was opened, 0.05 rad are tolerated" in slipped[0].words
 

@@ -59,6 +59,20 @@ def test_a_drive_whose_status_report_stays_away_is_reported_after_two_to_three_p
         assert told(arm, 0.5) == []
 
 
+def test_a_heartbeat_that_an_idle_arm_has_missed_is_missed_again_by_the_enabled_one() -> None:
+    """While a motion is planned nobody acts upon events; a state that lasts must not be lost with them."""
+    config = weightless_config()
+    taps = tapped(LockStepArm(config), config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        taps[0].misses = lambda frame: frame.identifier == 0x702
+        idle = [event.code for _ in range(round(0.5 / PERIOD)) for event in arm.exchange(None).events]
+        assert idle == [AxisEventCode.DRIVE_SILENT]
+        arm.enable()
+        ((when, event),) = told(arm, 0.5)
+        assert event == AxisEvent(AxisEventCode.DRIVE_SILENT, 1, "node 2: no heartbeat for 0.3 s")
+        assert when <= 10 * PERIOD
+
+
 def test_one_lost_status_report_is_nothing(running: tuple[CanopenArm, Tapped]) -> None:
     arm, tap = running
     for _ in range(3):

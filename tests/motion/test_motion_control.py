@@ -114,6 +114,20 @@ def test_samples_that_come_late_or_not_at_all_give_the_velocity_of_the_time_that
     np.testing.assert_allclose(control.velocity, speed, rtol=1e-6)
 
 
+@pytest.mark.parametrize("unknown", [1, 2])
+def test_an_axis_that_was_away_for_an_unknown_time_keeps_its_velocity(unknown: int) -> None:
+    """Nine periods' stall, in which an axis' answer is missed: over one period its way would be tenfold."""
+    speed, time = np.array([1.5, -0.5]), 0.0
+    control = controller(np.zeros(2))
+    for cycle in range(1, 200):
+        stalled = 150 <= cycle < 150 + unknown
+        time += PERIOD * (10.0 if cycle == 150 else 1.0)
+        valid = np.array([not stalled, True])
+        control.torque(time * speed, valid, rest(np.zeros(2)), 0.0 if stalled else PERIOD)
+        if cycle > 140:
+            np.testing.assert_allclose(control.velocity, speed, rtol=1e-3)
+
+
 @pytest.mark.parametrize("shown", [np.nan, 1e6, 0.0])
 def test_an_invalid_axis_is_taken_to_go_on_as_it_went(shown: float) -> None:
     speed = np.array([1.5, -0.5])

@@ -124,6 +124,33 @@ def test_where_nobody_knows_how_long_it_took_no_position_on_the_way_is_a_jump() 
     is_fault(fault, "encoder_jump", 1)
 
 
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("skipped", [1, 8])
+def test_an_axis_that_was_away_meanwhile_is_expected_where_it_has_gone(skipped: int, known: bool) -> None:
+    velocity, gone = 0.9 * LIMITS.velocity, PERIOD * (1 + skipped)
+
+    def back(way: Array) -> tuple[list[bool], Fault | None]:
+        bench = Bench()
+        there = HOME + velocity * gone
+        fault = bench.see(HOME * [np.nan, 1.0], there, velocity, (False, False), elapsed=gone, known=known)[1]
+        is_fault(fault, "lost_feedback")
+        return bench.see(HOME + way, velocity=velocity)
+
+    for passed in (gone,) if known else (PERIOD, gone):
+        assert back(velocity * (passed + PERIOD)) == ([True, True], None)
+    bench, now = Bench(), HOME
+    for _ in range(2):  # and what has passed before counts no more
+        now = now + velocity * gone
+        bench.see(now, velocity=velocity, valid=(False, False), elapsed=gone, known=known)
+        now = now + velocity * PERIOD
+        assert bench.see(now, velocity=velocity) == ([True, True], None)
+    is_fault(bench.see(now + velocity * PERIOD + 1.001 * WINDOW * unit(0), now, velocity)[1], "encoder_jump", 0)
+    reach = 1 if known else 1 + skipped
+    usable, fault = back(velocity * (gone + PERIOD) + 1.001 * reach * WINDOW * unit(1))
+    assert usable == [True, False]
+    is_fault(fault, "encoder_jump", 1)
+
+
 def test_one_jump_is_discarded_and_forgiven() -> None:
     bench = Bench()
     for _ in range(3):
@@ -165,6 +192,39 @@ def test_a_status_that_is_read_anew_but_says_the_same_is_the_same() -> None:
     for _ in range(3):
         assert bench.see(HOME, status=tuple([int(AxisStatus.POWERED)] * 2)) == ([True, True], None)
     is_fault(bench.see(HOME, status=(int(AxisStatus.POWERED), 0))[1], "drive_fault", 1)
+
+
+def test_a_drive_that_has_not_said_in_time_that_it_is_energised_is_not() -> None:
+    """It may have let go between the enabling and the first sample."""
+    on, bench = int(AxisStatus.POWERED), Bench(max_age=3, report_delay=1.5 * PERIOD)
+    for _ in range(3 + 2):
+        assert bench.see(HOME, status=(on, 0)) == ([True, True], None)
+    is_fault(bench.see(HOME, status=(on, 0))[1], "drive_fault", 1)
+    for status in ((on, on), ()):
+        bench = Bench(max_age=3, report_delay=0.0)
+        assert [bench.see(HOME, status=status)[1] for _ in range(9)] == [None] * 9
+
+
+def test_axes_that_are_gone_one_after_the_other_are_named_together() -> None:
+    """The machine that has them answer stalled between two of them."""
+    bench = Bench(max_age=3)
+    for valid in ((True, False), (False, False)):
+        bench.see(HOME, valid=valid)
+    fault = bench.see(HOME, valid=(False, False))[1]
+    is_fault(fault, "feedback_gone")
+    assert fault is not None
+    assert fault.message.startswith("shoulder, elbow: no usable feedback for 2, 3 cycles: a drive is late")
+
+
+def test_jumps_behind_cycles_without_feedback_say_so() -> None:
+    bench = Bench(max_age=9)
+    for _ in range(4):
+        bench.see(HOME, valid=(False, True))
+    for _ in range(2):
+        fault = bench.see(HOME + 0.5 * unit(0), HOME)[1]
+    is_fault(fault, "encoder_jumps", 0)
+    assert fault is not None
+    assert "jumped in consecutive cycles after 4 without feedback: " in fault.message
 
 
 @pytest.mark.parametrize("most", [3, 5])

@@ -102,9 +102,10 @@ def velocity_not_finite(joint: int) -> Fault | None:
 
 
 def acting_torque_not_finite(joint: int) -> Fault | None:
-    bench = Bench()
+    bench, acting = Bench(), np.where(unit(joint) > 0.0, np.nan, 0.0)
+    assert is_fault(bench.see(HOME, torque=acting)[1], "feedback_not_finite", joint)  # before any torque
     bench.guard.torque(TRUTHLESS)
-    return bench.see(HOME, torque=np.where(unit(joint) > 0.0, np.nan, 0.0))[1]
+    return bench.see(HOME, torque=acting)[1]
 
 
 def position_limit(joint: int) -> Fault | None:

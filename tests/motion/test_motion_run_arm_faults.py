@@ -43,6 +43,16 @@ def test_feedback_gone_takes_the_torque(make: Callable[..., Bench], joint: int |
     assert bench.story.column("cycle")[-1] == MIDWAY + 2
 
 
+def test_a_drive_that_lets_go_before_the_first_sample_ends_the_run(make: Callable[..., Bench]) -> None:
+    bench = make()
+    arm = bench.arm
+    arm.shown = lambda sample: replace(sample, status=(sample.status[0], 0)) if arm.torques else sample
+    error = bench.fault()
+    assert error.code == "drive_fault"
+    assert str(error).startswith("drive_fault: elbow: the drive is not energised")
+    assert len(arm.torques) == arm.describe().lost_cycles + 1
+
+
 @pytest.mark.parametrize("joint", [0, 1])
 def test_one_encoder_jump_is_passed_over(make: Callable[..., Bench], healthy: Healthy, joint: int) -> None:
     bench, expected = make(Fault(MIDWAY, FaultKind.ENCODER_JUMP, joint, 1, 1.0)), healthy.report

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from campaign_pucks import bench_puck_config
+from campaign_pucks import FOREIGN, bench_puck_config
+from helpers.emulated_arms import Tapped
 from helpers.local_commands import LocalCommands
 from motion_bench import Story
 
+from drivers.arm import Sample, Vector
 from drivers.barrett.driver import BarrettArm
 from ident_service.config.arm import ArmConfig
 from ident_service.errors import ArmFault, MotionRefused
@@ -61,7 +63,7 @@ def waited(story: Story) -> int:
 
 @pytest.mark.slow
 def test_an_arm_that_was_moved_meanwhile_is_planned_again_from_where_it_is() -> None:
-    report, story, _ = moved(1, 0.05)
+    report, story, _ = moved(1, 0.009)  # of this arm the guard believes 8 mrad in a cycle
     assert report.state is State.DONE
     assert waited(story) == 2
     assert "the arm was moved while a person was waited for; planned again" in story.states
@@ -157,3 +159,39 @@ def test_preflight_names_an_emergency_stop_that_is_pressed_while_a_person_is_wai
     (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
     assert check.reason.startswith("the emergency stop is pressed, or has been: release it")
     assert "cables" not in check.remedy
+
+
+class SharedArm(BarrettArm):
+    """An arm that another host gives torques, too, from the first cycle on in which this one does."""
+
+    def __init__(self, config: ArmConfig) -> None:
+        self.behind, self.taps = LockStepArm(config), list[Tapped]()
+        super().__init__(config, self._links)
+
+    def _links(self, config: ArmConfig) -> list[Tapped]:
+        self.taps = [Tapped(self.behind.link(0))]
+        return self.taps
+
+    def exchange(self, torque: Vector | None) -> Sample:
+        if torque is not None:
+            self.taps[-1].disturb([FOREIGN["foreign_torque"]])
+        return super().exchange(torque)
+
+
+def test_another_host_that_comes_with_the_person_is_heard_in_the_first_cycle() -> None:
+    """It is told once, with the sample in which the arm is compared with where it stood."""
+    config, story = bench_puck_config(), Story()
+    model = arm_model(config)
+    with SharedArm(config) as arm, pytest.raises(ArmFault, match="somebody else sends frames 401h") as stopped:
+        run(arm, model, excitation(model, "identification"), story)
+    assert stopped.value.code == "second_host"
+    assert len(story.samples) == 1
+
+
+def test_preflight_hears_another_host_that_comes_with_the_person() -> None:
+    document = bench_puck_config().model_dump(mode="json", by_alias=True)
+    document["joints"]["shoulder"]["torque"] = 30.0  # what its motor gives at most
+    config = ArmConfig.model_validate(document)
+    ticket = preflight(SharedArm(config), arm_model(config), None, confirm=lambda _: config.name, look_seconds=0.2)
+    (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
+    assert "somebody else sends frames 401h" in check.reason
