@@ -138,8 +138,9 @@ def state_folder(arguments: argparse.Namespace) -> Path:
     else:
         base = os.environ.get("XDG_STATE_HOME")
         state = (Path(base) if base else Path.home() / ".local" / "state") / "ident"
-    if state.is_file():
-        raise UsageError(f"{state}: is a file, not a folder; --state or $IDENT_STATE names the state folder")
+    with suppress(PermissionError):  # what is tried there tells of it
+        if state.is_file():
+            raise UsageError(f"{state}: is a file, not a folder; --state or $IDENT_STATE names the state folder")
     return state
 
 

@@ -101,9 +101,9 @@ def alarms(
 ) -> list[Row]:
     """Return open alarms, or `closed` ones too, the newest first, from the one before the number `before`."""
     return db.rows(
-        "SELECT * FROM alarms WHERE (?1 IS NULL OR arm = ?1) AND (?2 OR closed IS NULL) AND id < ?3 "
-        "ORDER BY id DESC LIMIT ?4",
-        *(arm, int(closed), 2**62 if before is None else before, most),
+        "SELECT * FROM alarms WHERE (? IS NULL OR arm = ?) AND (? OR closed IS NULL) AND id < ? "
+        "ORDER BY id DESC LIMIT ?",
+        *(arm, arm, int(closed), 2**62 if before is None else before, most),
     )
 
 

@@ -131,7 +131,7 @@ def add_schedule(db: Database, arm: str, when: DueRule, by: str, now: float, mot
 
 def schedules(db: Database, arm: str | None = None) -> list[Row]:
     """Return all schedules, or those of an arm, the earliest first; `motion` is an id or None."""
-    rows = db.rows("SELECT * FROM schedules WHERE ?1 IS NULL OR arm = ?1 ORDER BY id", arm)
+    rows = db.rows("SELECT * FROM schedules WHERE ? IS NULL OR arm = ? ORDER BY id", arm, arm)
     return [{**row, "motion": json.loads(row["request"]).get("motion")} for row in rows]
 
 
@@ -259,7 +259,7 @@ def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = F
 
 def pending(db: Database, arm: str | None = None) -> list[Row]:
     """Return what is due and has not been done, the earliest first."""
-    return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (?1 IS NULL OR arm = ?1) ORDER BY id", arm)
+    return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (? IS NULL OR arm = ?) ORDER BY id", arm, arm)
 
 
 def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:

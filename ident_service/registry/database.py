@@ -445,9 +445,9 @@ class Database:
         """
         last = None if before is None else self.known(table, what, before)[at]
         return self.rows(
-            f"SELECT * FROM {table} WHERE (?1 IS NULL OR arm = ?1) "  # noqa: S608 - ours
-            f"AND (?2 IS NULL OR {at} < ?2 OR {at} = ?2 AND id > ?3) ORDER BY {at} DESC, id LIMIT ?4",
-            *(arm, last, before, most),
+            f"SELECT * FROM {table} WHERE (? IS NULL OR arm = ?) "  # noqa: S608 - ours
+            f"AND (? IS NULL OR {at} < ? OR {at} = ? AND id > ?) ORDER BY {at} DESC, id LIMIT ?",
+            *(arm, arm, last, last, last, before, most),
         )
 
     def sound(self) -> bool:

@@ -187,7 +187,7 @@ def label_run(db: Database, run: str, tags: Sequence[str], words: str, who: str)
 
 def run_labels(db: Database, run: str | None = None) -> dict[str, Row]:
     """Return the labels of a run, or of all: per run its `tags`, `note`, and `who` gave them `at` what time."""
-    found = db.rows("SELECT * FROM run_labels WHERE ?1 IS NULL OR run = ?1", run)
+    found = db.rows("SELECT * FROM run_labels WHERE ? IS NULL OR run = ?", run, run)
     return {row["run"]: {**row, "tags": json.loads(row["tags"])} for row in found}
 
 

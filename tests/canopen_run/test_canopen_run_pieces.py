@@ -40,6 +40,7 @@ def test_privileges_of_the_kernel_are_given_back() -> None:
 import gc, os
 from ident_service.motion.realtime import temporary_privileges
 def state(): return os.sched_getscheduler(0), os.sched_getaffinity(0), gc.isenabled(), gc.get_freeze_count()
+gc.unfreeze()  # what Python 3.12 has frozen itself
 before = state()
 with temporary_privileges(1) as granted:
     assert not gc.isenabled()
