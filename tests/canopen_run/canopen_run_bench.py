@@ -45,6 +45,7 @@ STALLS = (
     "drive_watchdog",
     "feedback_gone",
     "late",
+    "not ready to switch on within",
     "repeated_warnings",
     "lease_lost",
     "8250h",
