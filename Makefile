@@ -99,7 +99,7 @@ campaign: test-socketcan test-pythons
 	$(BIN)/pytest -m campaign --timeout 7200
 	$(TESTS) -m "not campaign and not realtime" --hypothesis-profile campaign --timeout 7200
 
-# Slips in the code that guards people, one at a time in a copy of the checkout: each must fail one of its quick tests.
+# Slips in the code that guards people, one at a time in a copy of the checkout: each must fail one of its tests.
 mutants: $(VENV)/.mutants
 	$(BIN)/python tests/mutants/run.py
 

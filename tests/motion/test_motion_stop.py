@@ -103,6 +103,7 @@ def test_each_joint_stops_as_soon_as_it_can() -> None:
 def test_from_every_reachable_state_the_stop_stays_within_all_limits(case: Reached) -> None:
     reference = stop(case.state, case.limits)
     close(reference.at(0.0), case.state)
+    close(reference.at(-0.5), case.state)
     keeps_to(case.limits, reference, 5e-6)  # what a way or a sampled motion may leave its limits by, unseen
     end = reference.at(reference.duration)
     np.testing.assert_array_equal(end.position, reference.end)

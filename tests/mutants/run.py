@@ -1,7 +1,7 @@
 """Change one operator, number or word of the code that guards people at a time: a test must fail for each change.
 
 A fixed sample of such mutants is made by cosmic-ray in a copy of the checkout, so that an interrupted run leaves the
-checkout as it was, and each is shown to the quick tests of its module. One that passes them all must stand in
+checkout as it was, and each is shown to the tests of its module. One that passes them all must stand in
 `survivors.toml` with the reason, else this fails. Results are one line each: module, line, operator, the operator's
 occurrence in the module, and `killed`, `survived` or `timeout`; two runs over the same modules compare by `diff`.
 """
@@ -57,6 +57,8 @@ GROUPS = {
             "tests/motion/test_motion_guard_thresholds.py",
             "tests/motion/test_motion_guard_table.py",
             "tests/motion/test_motion_guard.py",
+            "tests/motion/test_motion_guard_motors.py",
+            "tests/motion/test_motion_guard_positions.py",
             "tests/motion/test_motion_drive_events.py",
             "tests/motion/test_motion_encoder_observer.py",
             "tests/motion/test_motion_encoder_observer_runs.py",
@@ -85,7 +87,7 @@ GROUPS = {
     ),
 }
 PYTEST = (
-    *("-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "'not campaign and not slow'"),
+    *("-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-m", "'not campaign'"),
     # Of the plugins only these, as loading all of them takes longer than most tests here.
     *("-p", "pytest_timeout", "-p", "_hypothesis_pytestplugin", "-p", "repeatable"),
 )
