@@ -95,9 +95,10 @@ bench-fleet: $(READY)
 	$(BIN)/python -m benchmarks.fleet $(FLEET)
 
 # What takes too long for every change, once a night. The guest with the kernel's CAN emulates a processor for four minutes.
-campaign: test-socketcan test-pythons
+campaign: test-socketcan
 	$(BIN)/pytest -m campaign --timeout 7200
 	$(TESTS) -m "not campaign and not realtime" --hypothesis-profile campaign --timeout 7200
+	$(MAKE) test-pythons
 
 # Slips in the code that guards people, one at a time in a copy of the checkout: each must fail one of its tests.
 mutants: $(VENV)/.mutants
