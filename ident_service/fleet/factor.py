@@ -661,8 +661,3 @@ def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]
         tuple(clusters),
         sum(part.samples for part in whole),
     )
-
-
-def missing(merged: Merged | tuple[str, ...]) -> tuple[str, ...]:
-    """Return the keys of the factors that are damaged or gone; none where all could be merged."""
-    return () if isinstance(merged, Merged) else merged
