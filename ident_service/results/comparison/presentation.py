@@ -38,7 +38,7 @@ from ident_service.results.comparison.comparison import (
 )
 from ident_service.results.evidence.gathering import friction_term
 from ident_service.results.manifest import write_atomically
-from ident_service.results.parameter_file import require_schema
+from ident_service.results.parameter_file import finite_or_none, require_schema
 from ident_service.results.plots import Axes, Canvas, draw_frame, draw_key, number, range_around
 from ident_service.results.report.figures import LEFT, RIGHT, WIDTH, Figure
 from ident_service.results.report.rendering import Cell, Table, render
@@ -406,7 +406,7 @@ def _pair_document(reference: ComparedSet, pair: Pair) -> dict[str, Any]:
             "tested": "unconstrained_values" if pair.free else "values",
             "used": {"reference": pair.in_use.reference.tolist(), "compared": pair.in_use.side.tolist()},
             "used_torque_share": None if pair.in_use.shares is None else pair.in_use.shares[0].tolist(),
-            "standard_deviations": None if found is None else _perhaps(found.deviations),
+            "standard_deviations": None if found is None else finite_or_none(found.deviations),
             "z": None if found is None else found.z.tolist(),
             "p": None if found is None else found.p.tolist(),
         },
@@ -455,10 +455,6 @@ def _test(test: Test) -> dict[str, Any]:
 
 def _error(error: TorqueError) -> dict[str, Any]:
     return {"whole": error.relative_percent, "per_joint": error.joint_relative_percent.tolist()}
-
-
-def _perhaps(values: Array) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 _NOTHING = Cell("\u2014")
