@@ -378,8 +378,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
         kinds = {torque_in(recording) for recording in usable}
         # Measured torques are not mixed with commanded ones, here as elsewhere.
         told = "commanded" if "commanded" in kinds else "measured" if "measured" in kinds else None
-        options = config.identification.model_copy(update={"torque": told or config.identification.torque})
-        model = replace(model, config=config.model_copy(update={"identification": options}))
+        model = model.with_options(torque=told or config.identification.torque)
         if len(kinds) > 1:
             usable = [open_for_arm(recording.path, model) for recording in usable]
         if not usable:
