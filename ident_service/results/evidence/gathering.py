@@ -373,7 +373,10 @@ class Scatter:
         return np.concatenate(self._rows)
 
 
-_POINTS, _BINS = 400, 50  # points of friction that are kept; equal parts of their range, with equal rights to points
+_MOST_POINTS, _PARTS = (
+    400,
+    50,
+)  # points of friction that are kept; equal parts of their range, each with its share
 
 
 def spread(x: Array, y: Array) -> tuple[Array, Array]:
@@ -383,13 +386,13 @@ def spread(x: Array, y: Array) -> tuple[Array, Array]:
         x: shape (points,).
         y: likewise.
     """
-    if len(x) <= _POINTS:
+    if len(x) <= _MOST_POINTS:
         return x, y
-    width = (x.max() - x.min()) / _BINS or 1.0
-    place = np.minimum((x - x.min()) / width, _BINS - 1).astype(int)
-    share = _POINTS // _BINS
+    width = (x.max() - x.min()) / _PARTS or 1.0
+    place = np.minimum((x - x.min()) / width, _PARTS - 1).astype(int)
+    share = _MOST_POINTS // _PARTS
     chosen = []
-    for part in range(_BINS):
+    for part in range(_PARTS):
         members = np.flatnonzero(place == part)
         if len(members) > share:
             members = members[np.linspace(0, len(members) - 1, share).round().astype(int)]
