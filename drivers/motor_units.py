@@ -166,7 +166,7 @@ def motor_coordinates(
     size = len(counts_per_turn)
     if size != len(transmission.ratios):
         raise DriverError(f"{size} drives but {len(transmission.ratios)} ratios in the transmission")
-    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
+    coupling = transmission.coupling_matrix
     motor_per_joint = np.array(transmission.ratios)[:, None] * coupling
     joint_per_motor = np.linalg.inv(motor_per_joint)
     # An inverse that is only nearly zero where it should be zero would couple joints that are not coupled.

@@ -261,9 +261,9 @@ class Position:
     encoder: int | None = None
 
 
-def get(destination: int, number: int, *, group: bool = False, sender: int = HOST) -> Frame:
+def get(destination: int, number: int, *, group: bool = False) -> Frame:
     """Return the frame that asks a puck, or a group of pucks, for a property."""
-    return Frame(Address(sender, destination, group).identifier, bytes([number & 0x7F]))
+    return Frame(Address(HOST, destination, group).identifier, bytes([number & 0x7F]))
 
 
 def put(destination: int, number: int, value: int, *, group: bool = False, sender: int = HOST) -> Frame:

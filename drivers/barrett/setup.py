@@ -70,17 +70,16 @@ class PropertyPort:
         self.link = link
         self.clock = link.clock
 
-    def ask(self, node: int, number: int, timeout: float = TIMEOUT) -> int | None:
+    def ask(self, node: int, number: int) -> int | None:
         """Return the value of a property; None where no answer comes within a few tries.
 
         Args:
             node: of the puck.
             number: of the property.
-            timeout: of one try [s].
         """
         for _ in range(_TRIES):
             self.link.send(get(node, number))
-            until_ns = self.clock.now_ns() + round(timeout * 1e9)
+            until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
             while (frame := self.link.receive(until_ns)) is not None:
                 answer = decoded(frame)
                 if isinstance(answer, Reply) and (answer.node, answer.number) == (node, number):

@@ -51,11 +51,10 @@ class Zeros:
             raise DriverError(f"{config.name}: driver.zero is at_home, which needs joints.*.home for every joint")
         self.home: Vector = np.array(homes, dtype=float)
         self.home.setflags(write=False)
-        coupling = np.eye(len(homes)) if gears.coupling is None else np.array(gears.coupling)
         self._about = [
             # Numbers, not their rounded text: what is nearly the same is another arm.
             (drive.bus, drive.node, drive.counts, (ratio * row).tolist(), self.home[row != 0.0].tolist())
-            for drive, ratio, row in zip(driver.drives, gears.ratios, coupling, strict=True)
+            for drive, ratio, row in zip(driver.drives, gears.ratios, gears.coupling_matrix, strict=True)
         ]
 
     def mark(self, number: int, counts: int) -> int:

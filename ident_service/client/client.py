@@ -106,27 +106,6 @@ _UPLOAD_AGAIN = 1.0  # s between them
 _CHECKING = 600.0  # s for the hash of the longest recording
 
 
-def upload(connection: Connection, arm: str, file: Path, columns: str, tell: Callable[[float], None]) -> dict[str, str]:
-    """Upload a file; arguments, result and errors as `IdentClient.upload`."""
-    if not file.is_file():
-        raise UsageError(f"{file}: no such file")
-    try:
-        with file.open("rb") as stream:
-            sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
-            size = stream.seek(0, 2)
-            name = re.sub(r"[^A-Za-z0-9_.-]", "_", file.name)[-120:].lstrip("_.-")
-            announced = {"arm": arm, "name": name, "bytes": size, "sha256": sha256, "columns": columns}
-            seen = connection.post(_UPLOADS, announced)
-            if seen["run"] is None:
-                seen = _sent(connection, stream, file, seen, tell)
-    except OSError as error:
-        if isinstance(error, IdentError):
-            raise
-        raise UsageError(f"{file}: cannot be read: {error.strerror or error}") from None
-    tell(1.0)
-    return {"run": str(seen["run"]), "name": str(seen["name"])}
-
-
 def _sent(
     connection: Connection, stream: BinaryIO, file: Path, seen: dict[str, Any], tell: Callable[[float], None]
 ) -> dict[str, Any]:
@@ -276,7 +255,23 @@ class IdentClient(Connection):
             UsageError: the file cannot be read, or is no recording by its name.
             ArmError: the daemon cannot be reached, or has no room for it.
         """
-        return upload(self, arm, file, columns, tell)
+        if not file.is_file():
+            raise UsageError(f"{file}: no such file")
+        try:
+            with file.open("rb") as stream:
+                sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
+                size = stream.seek(0, 2)
+                name = re.sub(r"[^A-Za-z0-9_.-]", "_", file.name)[-120:].lstrip("_.-")
+                announced = {"arm": arm, "name": name, "bytes": size, "sha256": sha256, "columns": columns}
+                seen = self.post(_UPLOADS, announced)
+                if seen["run"] is None:
+                    seen = _sent(self, stream, file, seen, tell)
+        except OSError as error:
+            if isinstance(error, IdentError):
+                raise
+            raise UsageError(f"{file}: cannot be read: {error.strerror or error}") from None
+        tell(1.0)
+        return {"run": str(seen["run"]), "name": str(seen["name"])}
 
     def begin(self, kind: str, *, key: str | None = None, **asked: Any) -> Job:
         """Queue a computation and return at once.

@@ -25,7 +25,7 @@ from ident_service.config.quantities import (
     Section,
     Seed,
 )
-from ident_service.config.recording import Transmission
+from ident_service.config.recording import Transmission, motor_disagreements
 from ident_service.config.simulation import SimulatedFault
 
 LOWER: Final = range(1, 5)  # nodes whose torques share the first frame; 5 to 7 share the second
@@ -33,7 +33,6 @@ MOST_COUNTS: Final = 8191  # of a torque slot of 14 bits, either way: -8192 has 
 WARNING: Final = 0.9  # of a fault's limit, as libbarrett has it
 VELOCITY_UNIT: Final = 4096  # counts of VL1 and VL2 per m/s (Q4.12)
 _LEAST_HEARTBEAT = 2.0  # cycles: one may be late
-_LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles, as for other drives
 Seconds = Annotated[float, Field(strict=True, ge=0.001, le=60.0)]
 
 
@@ -212,19 +211,8 @@ def disagreements(
             f"driver.heartbeat: {driver.heartbeat:g} s at {rate:g} Hz has no room for a late cycle; at least "
             f"{_LEAST_HEARTBEAT:g} cycles are needed, {_LEAST_HEARTBEAT / rate:g} s",
         )
-    if driver.lost_cycles > max(_MOST_LOST, _LONGEST_LOSS * rate):
-        yield (
-            ("driver", "lost_cycles"),
-            f"driver.lost_cycles: {driver.lost_cycles} at {rate:g} Hz is {1e3 * driver.lost_cycles / rate:g} ms without"
-            f" positions; at most {max(_MOST_LOST, int(_LONGEST_LOSS * rate))} cycles",
-        )
     count = len(driver.pucks)
-    if transmission is None:
-        yield ("driver",), "pucks need the section transmission: gear ratios from joints to motors"
-    elif len(transmission.ratios) != count:
-        yield ("driver", "pucks"), f"{count} pucks but {len(transmission.ratios)} ratios in transmission"
-    if joints and len(joints) != count:
-        yield ("driver", "pucks"), f"{count} pucks for {len(joints)} joints"
+    yield from motor_disagreements(("pucks", "pucks"), count, driver.lost_cycles, transmission, joints, rate)
     if driver.emulation.ipnm is not None and len(driver.emulation.ipnm) != count:
         yield (
             ("driver", "emulation", "ipnm"),

@@ -28,7 +28,7 @@ from ident_service.config.quantities import (
     TextBeside,
     TextFile,
 )
-from ident_service.config.recording import Transmission
+from ident_service.config.recording import Transmission, motor_disagreements
 from ident_service.config.simulation import SimulatedFault, WindingsOff
 from ident_service.errors import DriverError
 
@@ -387,10 +387,8 @@ def motor_speeds(transmission: Transmission, velocities: Sequence[float | None])
         transmission: the arm's.
         velocities: of the joints [rad/s or m/s]; None where one has no limit, which counts as standing still.
     """
-    size = len(transmission.ratios)
-    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
     known = np.array([0.0 if one is None else one for one in velocities])
-    motors = np.abs(np.array(transmission.ratios)) * (np.abs(coupling) @ known)
+    motors = np.abs(np.array(transmission.ratios)) * (np.abs(transmission.coupling_matrix) @ known)
     return [float(speed) for speed in motors * 60.0 / (2.0 * math.pi)]
 
 
@@ -401,11 +399,11 @@ def joint_torques(driver: CanopenDriver, transmission: Transmission) -> list[flo
         driver: the section `driver`, with as many drives as ratios.
         transmission: the arm's.
     """
-    size = len(transmission.ratios)
-    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
     motors = np.array([drive.max_torque for drive in driver.drives])
     # tau_motor = J^-T tau: a joint alone asks each of its motors for a share.
-    shares = np.abs(np.linalg.inv(np.array(transmission.ratios)[:, None] * coupling))  # (joints, motors)
+    shares = np.abs(
+        np.linalg.inv(np.array(transmission.ratios)[:, None] * transmission.coupling_matrix)
+    )  # (joints, motors)
     with np.errstate(divide="ignore"):
         return [float(most) for most in (motors / np.where(shares > 1e-12, shares, 0.0)).min(axis=1)]
 
@@ -418,9 +416,8 @@ def motor_torques(driver: CanopenDriver, transmission: Transmission, torques: Se
         transmission: the arm's.
         torques: limits of the joints [N m or N]; None where one has none.
     """
-    size = len(transmission.ratios)
-    coupling = np.eye(size) if transmission.coupling is None else np.array(transmission.coupling)
-    reach = np.abs(np.array(transmission.ratios)[:, None] * coupling)  # (motors, joints): tau = J^T tau_motor
+    # (motors, joints): tau = J^T tau_motor
+    reach = np.abs(np.array(transmission.ratios)[:, None] * transmission.coupling_matrix)
     most = np.array([drive.max_torque for drive in driver.drives])
     allowed = np.array([np.inf if one is None else one for one in torques])
     share = np.minimum(
@@ -454,8 +451,6 @@ _WHOLE_TURNS = 0.999  # 6080h holds whole turns per minute
 _ANOTHER_UNIT = 100.0  # times between a joint's torque limit and what its motors give: no choice is so far off
 _POSITION_RATES = 100.0, 500.0  # Hz; slower the guard sees too little, faster a torque path is what a drive has
 _LEAST_DEADLINE = 2.0  # cycles: one frame may be late
-# Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.
-_LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
 
 
 def disagreements(
@@ -505,17 +500,10 @@ def disagreements(
             f"driver.torque_deadline: {driver.torque_deadline:g} s at {rate:g} Hz has no room for a late torque frame;"
             f" at least {_LEAST_DEADLINE:g} cycles are needed, {_LEAST_DEADLINE / rate:g} s",
         )
-    if driver.lost_cycles > max(_MOST_LOST, _LONGEST_LOSS * rate):
-        yield (
-            ("driver", "lost_cycles"),
-            f"driver.lost_cycles: {driver.lost_cycles} at {rate:g} Hz is {1e3 * driver.lost_cycles / rate:g} ms without"
-            f" positions; at most {max(_MOST_LOST, int(_LONGEST_LOSS * rate))} cycles",
-        )
-    if transmission is None:
-        yield ("driver",), "CANopen drives need the section transmission: gear ratios from joints to motors"
-    elif len(transmission.ratios) != len(driver.drives):
-        yield ("driver", "drives"), f"{len(driver.drives)} drives but {len(transmission.ratios)} ratios in transmission"
-    elif len(velocities) == len(driver.drives):
+    motors = len(driver.drives)
+    what = "CANopen drives", "drives"
+    yield from motor_disagreements(what, motors, driver.lost_cycles, transmission, joints, rate)
+    if transmission is not None and len(transmission.ratios) == len(velocities) == motors:
         for k, (drive, speed) in enumerate(zip(driver.drives, motor_speeds(transmission, velocities), strict=True)):
             if drive.max_speed < _WHOLE_TURNS * speed:
                 yield (
@@ -524,7 +512,7 @@ def disagreements(
                     f" per minute (6080h), but its motor turns at {speed:.0f} when joints move at their limits:"
                     " raise max_speed, or lower joints.NAME.velocity",
                 )
-    if transmission is not None and len(torques) == len(driver.drives) == len(transmission.ratios):
+    if transmission is not None and len(torques) == len(transmission.ratios) == motors:
         for k, (limit, reach) in enumerate(zip(torques, joint_torques(driver, transmission), strict=True)):
             ratio = 1.0 if limit is None else max(reach / limit, limit / reach)
             if ratio > _ANOTHER_UNIT:
@@ -555,8 +543,6 @@ def disagreements(
         driver.families  # noqa: B018 - reading them checks them
     except DriverError as error:
         yield ("driver", "profiles"), f"driver.profiles: {error}"
-    if joints and len(joints) != len(driver.drives):
-        yield ("driver", "drives"), f"{len(driver.drives)} drives for {len(joints)} joints"
 
 
 def _positions(driver: CanopenDriver, rate: float) -> Iterator[tuple[tuple[str | int, ...], str]]:

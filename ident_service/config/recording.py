@@ -156,6 +156,11 @@ class Transmission(ExtendedSection):
     """Most that each motor gives [N m], where motors share joints and the driver's section does not say it."""
     later = frozenset({"motor_torque"})
 
+    @property
+    def coupling_matrix(self) -> NDArray[np.float64]:
+        """Return `coupling`, or the identity where each motor has its own joint, shape (motors, joints)."""
+        return np.eye(len(self.ratios)) if self.coupling is None else np.array(self.coupling)
+
     @field_validator("ratios")
     @classmethod
     def _require_nonzero_ratios(cls, ratios: tuple[float, ...]) -> tuple[float, ...]:
@@ -200,12 +205,49 @@ class Transmission(ExtendedSection):
 
 def motor_groups(transmission: Transmission) -> NDArray[np.bool_]:
     """Tell which motors move each joint, directly or through other joints, shape (joints, motors)."""
-    size = len(transmission.ratios)
-    moves = np.eye(size, dtype=bool) if transmission.coupling is None else np.array(transmission.coupling) != 0.0
+    moves = transmission.coupling_matrix != 0.0
     found = moves.T
-    for _ in range(size):
+    for _ in transmission.ratios:
         found = found @ moves @ moves.T
     return np.asarray(found)
+
+
+# Without positions, as long as a stall of this computer may last (decision 0069), or FIELDBUS.md's cycles.
+_LONGEST_LOSS, _MOST_LOST = 0.010, 5  # s; cycles
+
+
+def motor_disagreements(
+    what: tuple[str, str],
+    motors: int,
+    lost_cycles: int,
+    transmission: Transmission | None,
+    joints: Sequence[str],
+    rate: float,
+) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield what is inconsistent between motors on a bus, gears and joints: the place in the file, and the mistake.
+
+    Args:
+        what: the motors' name, and their key in the section `driver`.
+        motors: how many there are.
+        lost_cycles: `driver.lost_cycles`.
+        transmission: the arm's.
+        joints: names of the arm's joints; none where the file does not name them.
+        rate: cycles per second.
+    """
+    name, key = what
+    most = max(_MOST_LOST, _LONGEST_LOSS * rate)
+    if lost_cycles > most:
+        yield (
+            ("driver", "lost_cycles"),
+            f"driver.lost_cycles: {lost_cycles} at {rate:g} Hz is {1e3 * lost_cycles / rate:g} ms without positions;"
+            f" at most {int(most)} cycles",
+        )
+    if transmission is None:
+        yield ("driver",), f"{name} need the section transmission: gear ratios from joints to motors"
+    elif len(transmission.ratios) != motors:
+        yield ("driver", key), f"{motors} {key} but {len(transmission.ratios)} ratios in transmission"
+    if joints and len(joints) != motors:
+        yield ("driver", key), f"{motors} {key} for {len(joints)} joints"
 
 
 class RecordingFormat(Section):

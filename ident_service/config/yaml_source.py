@@ -29,7 +29,7 @@ def shipped_arms() -> dict[str, Path]:
 
 
 def arm_schema_file() -> Path:
-    """Return the JSON schema of descriptions that comes with this package (`config/schema.py`)."""
+    """Return the JSON schema of descriptions that comes with this package (`tools/description_reference.py`)."""
     return _shipped_folder() / SCHEMA
 
 

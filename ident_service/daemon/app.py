@@ -36,7 +36,7 @@ from ident_service.daemon.routes import (
     views,
 )
 from ident_service.daemon.routes.checks import Checks
-from ident_service.daemon.run_series import RunSeries
+from ident_service.daemon.run_series import RecentDocuments
 from ident_service.daemon.settings import Settings
 from ident_service.daemon.uploads import delete_stale_uploads
 from ident_service.daemon.web import (
@@ -125,8 +125,8 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     )
     app.state.service = service
     app.state.live = LiveRuns()
-    app.state.views = views.Views()
-    app.state.series = RunSeries()
+    app.state.views = RecentDocuments()
+    app.state.series = RecentDocuments()
     app.state.watch = EventPoller(
         db, settings.state, lambda row: jobs.job_answer_document(service, row).model_dump(mode="json")
     )

@@ -84,16 +84,15 @@ class Thinned:
         }
 
 
-def thinned(samples: Samples, names: tuple[str, ...], first_ns: int, bin_ns: int = BIN_NS) -> Thinned:
-    """Return one point of every bin of samples.
+def thinned(samples: Samples, names: tuple[str, ...], first_ns: int) -> Thinned:
+    """Return one point of every bin of `BIN_NS` of samples.
 
     Args:
         samples: consecutive cycles.
         names: of the joints.
         first_ns: stamp from which time and bins count [ns].
-        bin_ns: width of a bin [ns].
     """
-    bins = (samples.stamp_ns - first_ns) // bin_ns
+    bins = (samples.stamp_ns - first_ns) // BIN_NS
     starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
     ends = np.append(starts[1:], len(bins)) - 1
     error = samples.reference - samples.position

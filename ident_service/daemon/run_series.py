@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,29 +30,17 @@ _STOPPING = 40  # level of events for a fault that stopped the arm (`motion/faul
 _WARNING = 30
 
 
-class RunSeries:
-    """Series of finished runs, the last few that were asked for; may be used from any thread."""
+class RecentDocuments:
+    """JSON documents that were asked for last, by what they are made of; may be used from any thread."""
 
     def __init__(self) -> None:
-        self._lock, self._kept = threading.Lock(), OrderedDict[tuple[str, str], str]()
+        self._lock, self._kept = threading.Lock(), OrderedDict[tuple[str, ...], str]()
 
-    def document(self, folder: Path, recording: str, sha256: str) -> str:
-        """Return the series of a run as JSON.
-
-        Args:
-            folder: of the run.
-            recording: name of its recording.
-            sha256: of the recording.
-
-        Raises:
-            RecordingError: it is damaged.
-            UsageError: it is too large to be drawn.
-        """
-        key = (str(folder), sha256)
-        with self._lock:  # one at a time: reading is what costs
+    def document(self, key: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> str:
+        """Return the JSON of what `make` returns, made only if the key is new."""
+        with self._lock:  # one at a time: reading recordings and distances of bodies are what costs
             if (found := self._kept.get(key)) is None:
-                found = json.dumps(series(folder, recording), allow_nan=False)
-                self._kept[key] = found
+                found = self._kept[key] = json.dumps(make(), allow_nan=False)
                 while len(self._kept) > _KEPT:
                     self._kept.popitem(last=False)
             self._kept.move_to_end(key)
@@ -60,7 +48,16 @@ class RunSeries:
 
 
 def series(folder: Path, recording: str) -> dict[str, Any]:
-    """Return the series of a run as JSON values, as `RunSeries.document`."""
+    """Return the series of a run as JSON values.
+
+    Args:
+        folder: of the run.
+        recording: name of its recording.
+
+    Raises:
+        RecordingError: it is damaged.
+        UsageError: it is too large to be drawn.
+    """
     path = folder / recording
     if (size := path.stat().st_size) > MOST_BYTES:
         raise UsageError(

@@ -153,13 +153,13 @@ class QueuedHandler(logging.Handler):
                     self._stream.flush()
 
 
-def log_as_json(level: int = logging.INFO) -> None:
+def log_as_json() -> None:
     """Write all logs of this process as lines of JSON from now on."""
     handler = QueuedHandler(sys.stderr)
     handler.setFormatter(JsonLines())
     handler.addFilter(RepeatFilter())
     atexit.register(handler.close)
-    logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     # Each request has its line already (`request_guard.py`).
     logging.getLogger("uvicorn.access").disabled = True
 

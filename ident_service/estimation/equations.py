@@ -331,9 +331,7 @@ def motors_of_torques(model: ArmModel) -> Array:
     gears = model.config.transmission
     if gears is None:
         return np.eye(model.chain.joints)
-    ratios = np.array(gears.ratios)
-    coupling = np.eye(len(ratios)) if gears.coupling is None else np.array(gears.coupling)
-    found = np.linalg.inv(coupling.T * ratios)
+    found = np.linalg.inv(gears.coupling_matrix.T * np.array(gears.ratios))
     # An inverse that is only nearly zero would couple motors that are not coupled.
     return np.where(np.abs(found) > _UNCOUPLED * np.abs(found).max(axis=1, keepdims=True), found, 0.0)
 

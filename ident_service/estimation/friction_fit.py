@@ -443,14 +443,12 @@ _RATE = 125.0  # Hz; friction changes slowly enough to be fitted on fewer rows
 
 def with_friction(model: ArmModel, shape: FrictionShape) -> ArmModel:
     """Return the arm with these friction numbers; those still to be fitted stand at a middling value."""
-    options = model.config.identification.model_copy(update={"friction": shape})
-    config = model.config.model_copy(update={"identification": options})
+    model = model.with_options(friction=shape)
     velocity = 0.1 if shape.stribeck_velocity == "fit" else shape.stribeck_velocity
-    joints = model.chain.joints
     if "stribeck" not in model.layout.terms:
-        return replace(model, config=config)
-    velocities = tuple(float(v) for v in np.broadcast_to(np.asarray(velocity), (joints,)))
-    return replace(model, config=config, layout=replace(model.layout, stribeck_velocity=velocities))
+        return model
+    velocities = tuple(float(v) for v in np.broadcast_to(np.asarray(velocity), (model.chain.joints,)))
+    return replace(model, layout=replace(model.layout, stribeck_velocity=velocities))
 
 
 def friction_trials(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> FrictionTrials:
@@ -674,6 +672,4 @@ def _thinned(model: ArmModel, recordings: Sequence[Recording]) -> ArmModel:
     first = next(iter(recordings[0].blocks()), None)
     period = 1e-3 if first is None else float(np.median(np.diff(first.stamp_ns))) * 1e-9
     step = max(int(options.smoothing.decimate), int(1.0 / (_RATE * period)))
-    smoothing = options.smoothing.model_copy(update={"decimate": step})
-    config = model.config.model_copy(update={"identification": options.model_copy(update={"smoothing": smoothing})})
-    return replace(model, config=config)
+    return model.with_options(smoothing=options.smoothing.model_copy(update={"decimate": step}))

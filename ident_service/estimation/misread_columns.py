@@ -311,8 +311,7 @@ def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[tuple[Rec
     smoothing = options.smoothing.model_copy(update={"regressor_cutoff": None})
     if options.smoothing.regressor_cutoff is not None:
         smoothing = smoothing.model_copy(update={"filter_torque": True})
-    config = model.config.model_copy(update={"identification": options.model_copy(update={"smoothing": smoothing})})
-    model = replace(model, config=config)
+    model = model.with_options(smoothing=smoothing)
     parts = list(_first_minute(recordings, model))
     step = max(sum(len(motion.time) for _, motion in parts) // _ROWS, 1)
     return [(one, motion[slice(None, None, step)]) for one, motion in parts]

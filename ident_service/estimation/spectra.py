@@ -8,7 +8,7 @@ which the noise is a few percent of the acceleration: noise in the regressor bia
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -90,8 +90,7 @@ def with_chosen_cutoff(model: ArmModel, recordings: Sequence[Recording]) -> ArmM
     Raises:
         RecordingError: a recording cannot be read.
     """
-    options = with_filter(recordings, model.config.identification, model.config.recording)
-    return replace(model, config=model.config.model_copy(update={"identification": options}))
+    return model.with_options(with_filter(recordings, model.config.identification, model.config.recording))
 
 
 def remarks_on_noise(recordings: Sequence[Recording], model: ArmModel) -> tuple[str, ...]:

@@ -88,9 +88,7 @@ class TorqueConstants:
 
     def of(self, model: ArmModel) -> ArmModel:
         """Return an arm's model whose recorded torques are multiplied by these factors."""
-        told = tuple((self.applied * self.factors).tolist())
-        options = model.config.identification.model_copy(update={"torque_factors": told})
-        return replace(model, config=model.config.model_copy(update={"identification": options}))
+        return model.with_options(torque_factors=tuple((self.applied * self.factors).tolist()))
 
     def uncertainty(self) -> ShapeUncertainty:
         """Return what the factors' uncertainty adds to that of parameters that take them for known."""

@@ -51,8 +51,7 @@ class Delay:
 
 def with_delay(model: ArmModel, seconds: float) -> ArmModel:
     """Return the arm with its recordings' torque taken to be stamped `seconds` [s] too late."""
-    options = model.config.identification.model_copy(update={"delay": seconds})
-    return replace(model, config=model.config.model_copy(update={"identification": options}))
+    return model.with_options(delay=seconds)
 
 
 def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseParameters) -> Delay:
@@ -71,8 +70,7 @@ def estimate_delay(recordings: Sequence[Recording], model: ArmModel, base: BaseP
     options = with_chosen_cutoff(model, recordings).config.identification
     cutoff = 0.5 * float(options.smoothing.cutoff)
     slow = options.smoothing.model_copy(update={"cutoff": cutoff, "filter_torque": True, "decimate": 1})
-    apart = options.model_copy(update={"reversal": Reversal(), "smoothing": slow})
-    model = replace(model, config=model.config.model_copy(update={"identification": apart}))
+    model = model.with_options(options, reversal=Reversal(), smoothing=slow)
     seconds = 0.0
     for _ in range(_MOST_ROUNDS):
         shifted = with_delay(model, seconds)

@@ -53,7 +53,7 @@ from ident_service.model.information import empty_information
 from ident_service.results.evidence.file import EVIDENCE, write_evidence
 from ident_service.results.evidence.gathering import evidence_without_samples
 from ident_service.results.manifest import write_atomically
-from ident_service.results.parameter_file import write_parameters
+from ident_service.results.parameter_file import finite_or_none, write_parameters
 from ident_service.results.run_folder import PARAMETERS, write_manifest, write_results
 
 Files = Mapping[str, bytes]
@@ -412,7 +412,7 @@ def _files(
     fleet = {
         **more,
         "alone": alone.fit.beta.tolist(),
-        "alone_deviations": [float(value) if np.isfinite(value) else None for value in alone.doubt.deviations],
+        "alone_deviations": finite_or_none(alone.doubt.deviations),
         "together": None if pooled is None else pooled.beta.tolist(),
         "together_deviations": None if pooled is None else pooled.standard_deviations.tolist(),
     }
@@ -462,7 +462,7 @@ def _estimated(
         "unusable": list(unusable),
         "error_percent": chosen.candidates[chosen.chosen].identification.relative_percent,
         "values": chosen.beta.tolist(),
-        "standard_deviations": [float(v) if np.isfinite(v) else None for v in chosen.standard_deviations],
+        "standard_deviations": finite_or_none(chosen.standard_deviations),
         "verdicts": list(chosen.verdicts),
     }
     with tempfile.TemporaryDirectory(prefix="ident-fleet-") as name:

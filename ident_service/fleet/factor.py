@@ -378,8 +378,7 @@ def settle(sources: Sequence[Source], description: str) -> Settled | tuple[Probl
         kinds = {torque_in(recording) for recording in usable}
         # Measured torques are not mixed with commanded ones, here as elsewhere.
         told = "commanded" if "commanded" in kinds else "measured" if "measured" in kinds else None
-        options = config.identification.model_copy(update={"torque": told or config.identification.torque})
-        model = replace(model, config=config.model_copy(update={"identification": options}))
+        model = model.with_options(torque=told or config.identification.torque)
         if len(kinds) > 1:
             usable = [open_for_arm(recording.path, model) for recording in usable]
         if not usable:
@@ -661,8 +660,3 @@ def merge(parts: Sequence[Merged | tuple[str, ...]]) -> Merged | tuple[str, ...]
         tuple(clusters),
         sum(part.samples for part in whole),
     )
-
-
-def missing(merged: Merged | tuple[str, ...]) -> tuple[str, ...]:
-    """Return the keys of the factors that are damaged or gone; none where all could be merged."""
-    return () if isinstance(merged, Merged) else merged

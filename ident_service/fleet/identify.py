@@ -14,7 +14,6 @@ the files. A folder of results holds
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,12 +64,7 @@ from ident_service.fleet.trends import Change, compare_arms
 from ident_service.model.chain import Array
 from ident_service.operations.drift_alarms import verdict_of
 from ident_service.operations.parameter_files import DOCUMENT, compare_files
-from ident_service.results.manifest import (
-    exchange_folders,
-    require_place,
-    staging_beside,
-    write_atomically,
-)
+from ident_service.results.manifest import replacing_folder, require_place, write_atomically
 
 
 def identify_fleet(
@@ -98,15 +92,8 @@ def identify_fleet(
     with connected(request, tell) as client:
         reduced = reduce_fleet(client, request, listed, tell, step)
         result, written, splits = _analysed(client, request, reduced, folder, tell, step)
-    with staging_beside(folder) as staging:
+    with replacing_folder(folder, _require_replaceable) as staging:
         _write(staging, result, written, splits, request)
-        _require_replaceable(folder)
-        place = folder.resolve()
-        if place.exists():
-            exchange_folders(staging, place)
-            shutil.rmtree(staging)
-        else:
-            staging.rename(place)
     return result
 
 

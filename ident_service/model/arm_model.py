@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ident_service.config.arm import ArmConfig
+from ident_service.config.arm import ArmConfig, Identification
 from ident_service.config.quantities import TextFile
 from ident_service.config.recording import mismatched_units
 from ident_service.errors import ModelError
@@ -32,6 +33,11 @@ class ArmModel:
     chain: Chain
     layout: Layout
     prior: Array | None
+
+    def with_options(self, options: Identification | None = None, **changes: Any) -> ArmModel:
+        """Return the arm with other options of identification, or with some of its own changed by their keys."""
+        options = (options or self.config.identification).model_copy(update=changes)
+        return replace(self, config=self.config.model_copy(update={"identification": options}))
 
 
 def arm_model(config: ArmConfig, *, bodies: bool = True) -> ArmModel:

@@ -31,7 +31,7 @@ from ident_service.errors import ModelError, MotionRefused
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.pinocchio_models import link_frame
-from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace, Solid, rotation_rpy
+from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace, Solid, corners, rotation_rpy
 from ident_service.model.urdf import urdf_solids
 
 
@@ -142,10 +142,11 @@ def _link(chain: Chain, name: str, capsules: tuple[given.Capsule, ...]) -> Itera
 
 def _obstacles(workspace: given.Workspace) -> Iterator[Body]:
     for name, obstacle in workspace.obstacles.items():
-        yield Body(f"obstacle {name}", WORLD, _obstacle(obstacle))
+        yield Body(f"obstacle {name}", WORLD, obstacle_solid(obstacle))
 
 
-def _obstacle(obstacle: given.Obstacle) -> Solid:
+def obstacle_solid(obstacle: given.Obstacle) -> Solid:
+    """Return a configured obstacle as a solid in the frame of the base."""
     if obstacle.box is not None:
         box = obstacle.box
         return Box(rotation_rpy(*box.rpy), np.array(box.center), 0.5 * np.array(box.size))
@@ -221,24 +222,8 @@ def _of_body(scene: Scene, body: Body) -> Array:
     return result
 
 
-def corners(body: Body) -> tuple[Array, float]:
-    """Return points whose convex hull, made thicker by a radius, contains a solid.
-
-    Returns:
-        Points in the joint frame [m], shape (points, 3), and the radius [m].
-    """
-    solid = body.solid
-    if isinstance(solid, Capsule):
-        return np.array([solid.start, solid.end]), solid.radius
-    if isinstance(solid, HalfSpace):
-        raise AssertionError("a half space is no part of a link")
-    half = solid.half if isinstance(solid, Box) else np.array([solid.radius, solid.radius, solid.half_length])
-    signs = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
-    return solid.center + (signs * half) @ solid.rotation.T, 0.0
-
-
 def _around(body: Body, axis: Array) -> _Hull:
-    points, radius = corners(body)
+    points, radius = corners(body.solid)
     return _hull(points, axis, radius, radius, float(np.linalg.norm(points, axis=1).max()) + radius)
 
 

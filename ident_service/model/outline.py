@@ -33,8 +33,8 @@ from ident_service.errors import ConfigError, ModelError, Problem, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.limited_process import answer_within, run_limited_process
 from ident_service.model.mechanism import count_mechanism, parse_xml, read_mechanism, require_urdf
-from ident_service.model.solids import Box, Cylinder, Solid
 from ident_service.model.solids import Capsule as Pill
+from ident_service.model.solids import corners as corners_of
 from ident_service.model.urdf import origin_of, solid_of
 
 MOST_MESH_BYTES: Final = 64 * 2**20
@@ -364,25 +364,12 @@ def _urdf_surface(link: ET.Element, folder: Path) -> tuple[list[Capsule], Array,
             if isinstance(solid, Pill):
                 exact.append(_rounded(solid.start, solid.end, solid.radius))
             else:
-                corners.append(_hull(outline_of(solid)))
+                corners.append(_hull(corners_of(solid)[0]))
         elif (found := _mesh_file(mesh, folder)) is None:
             read = False
         else:
             corners.append(found @ rotation.T + translation)
     return exact, np.vstack(corners), read
-
-
-def outline_of(solid: Solid) -> Array:
-    """Return the corners of the box around a solid, in its frame [m], shape (points, 3)."""
-    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    if isinstance(solid, Box):
-        return np.asarray(solid.center + corners * solid.half @ solid.rotation.T)
-    if isinstance(solid, Cylinder):
-        half = np.array([solid.radius, solid.radius, solid.half_length])
-        return np.asarray(solid.center + corners * half @ solid.rotation.T)
-    if isinstance(solid, Pill):
-        return np.vstack([end + solid.radius * corners for end in (solid.start, solid.end)])
-    return np.zeros((0, 3))
 
 
 def _hull(points: Array) -> Array:

@@ -75,6 +75,12 @@ def inertia_from_delta(parameters: Array) -> pin.Inertia:
     return pin.Inertia.FromDynamicParameters(np.array([m, mx, my, mz, xx, xy, yy, xz, yz, zz]))
 
 
+def quaternion(rotation: Array) -> Array:
+    """Return w, x, y, z of a rotation, w >= 0, shape (4,)."""
+    x, y, z, w = pin.Quaternion(rotation).coeffs()
+    return np.array([w, x, y, z]) if w >= 0.0 else -np.array([w, x, y, z])
+
+
 def link_frame(chain: Chain, link: int) -> pin.SE3:
     """Return the placement of the link frame in the joint frame."""
     return pin.SE3(chain.link_rotation[link], chain.link_translation[link])

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -49,6 +50,21 @@ class HalfSpace:
 
 
 Solid = Capsule | Box | Cylinder | HalfSpace
+SIGNS = np.array(list(product((-1.0, 1.0), repeat=3)))  # of the corners of a box
+
+
+def corners(solid: Solid) -> tuple[Array, float]:
+    """Return points whose convex hull, made thicker by a radius, contains a solid that has an end.
+
+    Returns:
+        Points in the solid's frame [m], shape (points, 3), and the radius [m].
+    """
+    if isinstance(solid, Capsule):
+        return np.array([solid.start, solid.end]), solid.radius
+    if isinstance(solid, HalfSpace):
+        raise AssertionError("a half space has no corners")
+    half = solid.half if isinstance(solid, Box) else np.array([solid.radius, solid.radius, solid.half_length])
+    return solid.center + SIGNS * half @ solid.rotation.T, 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -248,12 +248,8 @@ def _sizes(text: str | None, count: int, where: str) -> list[float]:
 
 
 def _attribute_numbers(text: str | None, count: int, where: str) -> list[float]:
-    def read() -> Iterator[float]:
-        for word in (text or "").split():
-            yield float(word)
-
     try:
-        numbers = list(read())
+        numbers = [float(word) for word in (text or "").split()]
     except ValueError:
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():

@@ -128,9 +128,7 @@ def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
     gears = config.transmission
     if gears is None:
         return ""
-    names = tuple(config.joints)
-    coupling = np.eye(len(names)) if gears.coupling is None else np.array(gears.coupling)
-    turns = np.array(gears.ratios) * (coupling @ (position - last.position)) / (2.0 * np.pi)
+    turns = np.array(gears.ratios) * (gears.coupling_matrix @ (position - last.position)) / (2.0 * np.pi)
     whole = np.rint(turns)
     if not whole.any() or (np.abs(turns - whole) > TURN).any():
         return ""
@@ -139,7 +137,7 @@ def turned(last: LastPosition, position: Vector, config: ArmConfig) -> str:
         for number, count in enumerate(whole)
         if count
     ]
-    moved = zip(names, position - last.position, strict=True)
+    moved = zip(config.joints, position - last.position, strict=True)
     joints = ", ".join(f"{name} {away:+.4g}" for name, away in moved if abs(away) > 1e-3)
     return f"{', '.join(motors)} when the arm was closed at {last.when:%Y-%m-%d %H:%M} UTC ({joints} rad or m)"
 

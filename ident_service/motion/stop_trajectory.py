@@ -117,16 +117,6 @@ def stop(start: Setpoint, limits: MotionLimits) -> StopProfile:
         return _braked(start, limits, np.where(hard_leaves < quick_leaves, side, 0.0))
 
 
-def stop_overshoot(limits: MotionLimits) -> Vector:
-    """Return how far the quickest stop from a state of a motion can go beyond the motion's own turning points.
-
-    Returns:
-        A^3 / (24 J^2) [rad or m], shape (joints,); proof above. A motion that stays so far inside the position limits
-        is stopped inside them without braking harder than the quickest stop does.
-    """
-    return np.asarray(limits.acceleration**3 / (24.0 * limits.jerk**2))
-
-
 def stop_extent(path: Path, limits: MotionLimits) -> tuple[Vector, Vector]:
     """Return the lowest and highest position that stops from anywhere on a motion reach, the motion itself included.
 

@@ -165,9 +165,9 @@ def failed(code: str, reason: str, remedy: str, found: Sequence[Measure] = ()) -
     return Check(code, Verdict.FAILED, tuple(found), reason, remedy)
 
 
-def skipped(code: str, reason: str, remedy: str = "") -> Check:
+def skipped(code: str, reason: str) -> Check:
     """Return a check that was not made."""
-    return Check(code, Verdict.SKIPPED, (), reason, remedy)
+    return Check(code, Verdict.SKIPPED, (), reason)
 
 
 def joint_units(revolute: Sequence[bool], turning: str, sliding: str) -> tuple[str, ...]:

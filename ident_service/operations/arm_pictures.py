@@ -6,12 +6,10 @@ Nothing is proven here: preflight does that. Numbers are of samples along the mo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Final
 
 import numpy as np
 
-from ident_service.config.motion_design import Obstacle as ConfiguredObstacle
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.quantities import TextFile
 from ident_service.errors import IdentError
@@ -19,13 +17,13 @@ from ident_service.excitation.motion_file import Excitation
 from ident_service.excitation.trajectory import FourierPath, PosturePath
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array
-from ident_service.model.collision import corners, scene
+from ident_service.model.collision import obstacle_solid, scene
 from ident_service.model.kinematics import branches, frame_origins, joint_poses
 from ident_service.model.mechanism import Kind, read_mechanism
-from ident_service.model.solids import Body, HalfSpace
+from ident_service.model.solids import Body, HalfSpace, corners
 from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
 from ident_service.operations.arm_view import home_position
-from ident_service.results.posture_figure import Box, Closest, Limb, Plane, Postures, Rod, silhouette, stick_figure
+from ident_service.results.posture_figure import Closest, Limb, Postures, silhouette, stick_figure
 
 _SAMPLES: Final = 1000
 _POSTURES: Final = 120
@@ -121,7 +119,7 @@ def _fixed_points(model: ArmModel) -> dict[int, list[tuple[Array, float]]]:
                     found.setdefault(names.index(mechanism.names[joint]), []).append((place, 0.0))
     for body in _bodies(model):
         if body.joint != WORLD and not isinstance(body.solid, HalfSpace):
-            points, radius = corners(body)
+            points, radius = corners(body.solid)
             found.setdefault(body.joint, []).extend((point, radius) for point in points)
     return found
 
@@ -172,7 +170,7 @@ def postures(model: ArmModel, path: FourierPath | PosturePath, time: Array, clos
         frames=frame_origins(model.chain, path.at(time)[0]),
         times=time,
         branches=branches(model.chain),
-        obstacles=tuple(_solid(name, obstacle) for name, obstacle in workspace.obstacles.items()),
+        obstacles={name: obstacle_solid(obstacle) for name, obstacle in workspace.obstacles.items()},
         workspace=box,
         closest=closest,
     )
@@ -192,7 +190,7 @@ def _limbs(model: ArmModel, position: Array) -> list[Limb]:
     for body in _bodies(model):
         if isinstance(body.solid, HalfSpace):
             continue
-        points, radius = corners(body)
+        points, radius = corners(body.solid)
         if body.joint >= 0:
             turned, moved = poses[body.joint]
             points = points @ turned[0].T + moved[0]
@@ -216,26 +214,3 @@ def _upright(gravity: Array) -> Array:
         return np.diag([1.0, -1.0, -1.0])
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + cosine))
-
-
-def _solid(name: str, obstacle: ConfiguredObstacle) -> Box | Plane | Rod:
-    if obstacle.half_space is not None:
-        normal = np.array(obstacle.half_space.normal)
-        length = float(np.linalg.norm(normal))
-        return Plane(name, normal / length, obstacle.half_space.offset / length)
-    if obstacle.capsule is not None:
-        return Rod(name, np.array([obstacle.capsule.start, obstacle.capsule.end]), obstacle.capsule.radius)
-    if obstacle.box is None:
-        raise AssertionError("an obstacle is one solid")
-    box = obstacle.box
-    corners_of_box = np.array(list(product((-0.5, 0.5), repeat=3))) * np.array(box.size)
-    return Box(name, corners_of_box @ _turned(box.rpy).T + np.array(box.center))
-
-
-def _turned(rpy: tuple[float, float, float]) -> Array:
-    """Return the rotation by roll about x, pitch about y and yaw about z of the base, in this order, shape (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
-    x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(z @ y @ x)

@@ -23,7 +23,7 @@ from ident_service.model.appearance import visible_bodies
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, surroundings
-from ident_service.model.solids import Body, Box, Capsule, Cylinder
+from ident_service.model.solids import Body, Box, Capsule, Cylinder, HalfSpace
 from ident_service.motion.trajectory import Reference, Setpoint, plan_reduced_trajectory, rest
 from ident_service.recordings.open import open_recording
 
@@ -213,19 +213,14 @@ def _positions(reference: Reference, time: Array) -> Array:
     return np.array([reference.at(float(at)).position for at in time])
 
 
+_SHAPES: Final = {Capsule: "capsule", Box: "box", Cylinder: "cylinder", HalfSpace: "half_space"}
+
+
 def _solid(body: Body) -> dict[str, Any]:
-    solid, common = body.solid, {"owner": body.owner, "joint": body.joint}
-    if isinstance(solid, Capsule):
-        ends = {"start": _numbers(solid.start), "end": _numbers(solid.end)}
-        return {**common, "shape": "capsule", **ends, "radius": float(solid.radius)}
-    if isinstance(solid, Box):
-        placed = {"rotation": _numbers(solid.rotation), "center": _numbers(solid.center)}
-        return {**common, "shape": "box", **placed, "half": _numbers(solid.half)}
-    if isinstance(solid, Cylinder):
-        placed = {"rotation": _numbers(solid.rotation), "center": _numbers(solid.center)}
-        sizes = {"radius": float(solid.radius), "half_length": float(solid.half_length)}
-        return {**common, "shape": "cylinder", **placed, **sizes}
-    return {**common, "shape": "half_space", "normal": _numbers(solid.normal), "offset": float(solid.offset)}
+    values = {
+        name: float(value) if isinstance(value, float) else _numbers(value) for name, value in vars(body.solid).items()
+    }
+    return {"owner": body.owner, "joint": body.joint, "shape": _SHAPES[type(body.solid)], **values}
 
 
 def _numbers(values: Array) -> list[float]:

@@ -36,14 +36,9 @@ def judge_apart(path: Path) -> dict[str, Any]:
         ConfigError: its mistakes.
         ModelError: any other error of it, or judging it takes too long or crashes.
     """
-    try:
-        answer = run_limited_process(_MODULE, path, _DEADLINE)
-    except ModelError as error:
-        raise ModelError(f"{path.name}: {error}") from None
+    answer = _answer(path.name, path, _DEADLINE)
     if (problems := answer.get("problems")) is not None:
         raise ConfigError([Problem(Path(where), line, column, said) for where, line, column, said in problems])
-    if (error_text := answer.get("error")) is not None:
-        raise ModelError(error_text)
     return answer
 
 
@@ -60,13 +55,7 @@ def describe_apart(path: Path, name: str) -> dict[str, Any]:
     Raises:
         ModelError: there is no arm in it, or it takes too long or crashes.
     """
-    try:
-        answer = run_limited_process(_MODULE, path, 3.0 * _DEADLINE, _NEW, name)
-    except ModelError as error:
-        raise ModelError(f"{path.name}: {error}") from None
-    if (error_text := answer.get("error")) is not None:
-        raise ModelError(error_text)
-    return answer
+    return _answer(path.name, path, 3.0 * _DEADLINE, _NEW, name)
 
 
 def draw_apart(path: Path, meshes: Path, out: Path) -> None:
@@ -80,12 +69,18 @@ def draw_apart(path: Path, meshes: Path, out: Path) -> None:
     Raises:
         ModelError: it takes too long or crashes.
     """
+    _answer("the meshes", path, 3.0 * _DEADLINE, _DRAW, str(meshes), str(out))
+
+
+def _answer(what: str, path: Path, deadline: float, *words: str) -> dict[str, Any]:
+    """Run this module on a file; raise ModelError where the process ends without an answer, or with an error."""
     try:
-        answer = run_limited_process(_MODULE, path, 3.0 * _DEADLINE, _DRAW, str(meshes), str(out))
+        answer = run_limited_process(_MODULE, path, deadline, *words)
     except ModelError as error:
-        raise ModelError(f"the meshes: {error}") from None
+        raise ModelError(f"{what}: {error}") from None
     if (error_text := answer.get("error")) is not None:
         raise ModelError(error_text)
+    return answer
 
 
 def _drawn_document(path: Path, meshes: Path, out: Path) -> dict[str, Any]:

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ident_service.config.arm import ArmConfig, Method
 from ident_service.config.load import config_error, folder_of, load_arm, load_recording_format
 from ident_service.config.payload import Payload
@@ -43,6 +41,7 @@ from ident_service.operations.recordings import (
 from ident_service.recordings.quality import Quality
 from ident_service.recordings.recording import Recording
 from ident_service.results.manifest import replacing_folder, require_replaceable, write_atomically
+from ident_service.results.parameter_file import finite_or_none
 from ident_service.results.report_files import write_report
 from ident_service.results.run_folder import MANIFEST, write_manifest, write_results
 
@@ -332,7 +331,7 @@ def _bootstrap(estimate: Estimate, replicates: int) -> dict[str, Any]:
     return {
         "replicates": replicates,
         "blocks_in_a_run": drawn.run,
-        "standard_deviations": [float(value) if np.isfinite(value) else None for value in drawn.standard_deviations],
+        "standard_deviations": finite_or_none(drawn.standard_deviations),
     }
 
 

@@ -32,7 +32,7 @@ from ident_service.model.regressor import joint_regressor
 from ident_service.motion.clearance import Nearest, stop_clearance
 from ident_service.motion.stop_trajectory import stop_extent
 from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
-from ident_service.results.parameter_file import read_parameters
+from ident_service.results.parameter_file import finite_or_none, read_parameters
 
 _LOOKED_AT = 2000  # samples of each part of a motion for the forecast of the following error
 _USED = 0.25  # share of the torque limits used by an arm without a prior
@@ -252,7 +252,7 @@ def preview_document(seen: Preview) -> dict[str, Any]:
         "base_parameters": {
             "expressions": list(seen.base.expressions),
             "units": list(seen.base.units),
-            "expected_standard_deviations": [float(value) if np.isfinite(value) else None for value in seen.deviations],
+            "expected_standard_deviations": finite_or_none(seen.deviations),
         },
         "objections": list(seen.objections),
         "warnings": list(seen.warnings),

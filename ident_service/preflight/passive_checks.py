@@ -102,7 +102,6 @@ def identities_check(
     described: ArmDescription,
     model: ArmModel,
     limits: MotionLimits,
-    expected: Sequence[str] | None,
     looked: IdleRecording,
     setup: Sequence[SetupCheck] = (),
 ) -> Check:
@@ -112,7 +111,6 @@ def identities_check(
         described: by the open arm.
         model: of the arm.
         limits: of the description; the driver must not clip below them, or what was proven of torques is not true.
-        expected: identities from an earlier check, in the order of the axes; None accepts whatever answers.
         looked: at the arm.
         setup: what the drives report of their set-up.
     """
@@ -122,18 +120,6 @@ def identities_check(
             code,
             f"the drives have the joints {', '.join(described.joint_names)}, the description {', '.join(names)}",
             "Give the description of this arm, or connect the arm that the description means.",
-        )
-    if expected is not None and tuple(expected) != described.identities:
-        theirs = [*described.identities, *["nothing"] * len(expected)]
-        changed = [
-            f"{name}: {is_!r} instead of {was!r}"
-            for name, was, is_ in zip(names, expected, theirs, strict=False)
-            if was != is_
-        ]
-        return failed(
-            code,
-            "; ".join(changed) or "other drives than expected",
-            "If a drive was exchanged on purpose, calibrate its zero and torque constant and accept the new identity.",
         )
     if wrong := [one for one in setup if not one.good]:
         remedies = dict.fromkeys(one.remedy for one in wrong if one.remedy)

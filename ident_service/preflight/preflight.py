@@ -112,7 +112,6 @@ def preflight(
     *,
     confirm: Confirm = lambda question: "",
     clock: Clock | None = None,
-    identities: Sequence[str] | None = None,
     tell: Tell = lambda check: None,
     valid: timedelta = VALID,
     look_seconds: float = LOOK,
@@ -129,7 +128,6 @@ def preflight(
             position limits.
         confirm: shows a question and returns what a person typed; asked once, before anything is energised.
         clock: whose UTC the ticket is stamped with; by default the machine's. The loop has the arm's own.
-        identities: of the drives, as an earlier ticket has them; None accepts whatever answers.
         tell: called with every check as soon as it is made.
         valid: how long the ticket counts.
         look_seconds: how long rate and noise are measured.
@@ -141,7 +139,7 @@ def preflight(
         The ticket, whatever its verdict; what fails is in its checks, and nothing the arm does is raised.
     """
     clock = RealClock() if clock is None else clock
-    flight = _Preflight(arm, model, excitation, confirm, identities, tell, look_seconds, rate_seconds, closed, announce)
+    flight = _Preflight(arm, model, excitation, confirm, tell, look_seconds, rate_seconds, closed, announce)
     flight.run()
     subject = subject_of(model, excitation, flight.described)
     return new_ticket(subject, flight.all_checks(), clock.now_ns() + clock.utc_offset_ns, valid)
@@ -175,7 +173,6 @@ class _Preflight:
         model: ArmModel,
         excitation: Excitation | None,
         confirm: Confirm,
-        identities: Sequence[str] | None,
         tell: Tell,
         look_seconds: float,
         rate_seconds: float,
@@ -184,7 +181,7 @@ class _Preflight:
     ) -> None:
         self.announce = announce
         self.arm, self.model, self.excitation = arm, model, excitation
-        self.confirm, self.identities, self.tell = confirm, identities, tell
+        self.confirm, self.tell = confirm, tell
         self.look_seconds, self.rate_seconds, self.closed = look_seconds, rate_seconds, closed
         self.described: ArmDescription | None = None
         self.away = ""  # from home, in words
@@ -258,7 +255,7 @@ class _Preflight:
     def _agreed(self, looked: IdleRecording, limits: MotionLimits) -> Consent | None:
         """Check the arm at rest; returns whether its watchdog may be tried, None where the arm may not be touched."""
         if self.described is None or not self._passed(
-            identities_check(self.described, self.model, limits, self.identities, looked, self.arm.setup_checks())
+            identities_check(self.described, self.model, limits, looked, self.arm.setup_checks())
         ):
             return None
         if not self._passed(at_rest_check(looked, self.model, self._bounds(limits), self.closed)):

@@ -14,7 +14,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -236,16 +236,20 @@ def _why(path: Path, name: str) -> str:
 
 
 @contextmanager
-def replacing_folder(folder: Path) -> Iterator[Path]:
+def replacing_folder(folder: Path, require: Callable[[Path], None] = require_replaceable) -> Iterator[Path]:
     """Yield a place to build a folder of results in, which replaces an earlier result when the block ends well.
 
+    Args:
+        folder: of the results.
+        require: raises where the folder holds anything but an earlier result; asked before and after the block.
+
     Raises:
-        UsageError: the folder holds anything but an earlier result, before or after the block, or cannot be written.
+        UsageError: the folder may not be replaced, or cannot be written.
     """
-    require_replaceable(folder)
+    require(folder)
     with staging_beside(folder) as staging:
         yield staging
-        require_replaceable(folder)
+        require(folder)
         place = folder.resolve()
         try:
             if place.exists():

@@ -287,21 +287,21 @@ def parameters_document(estimate: Estimate, described: ArmConfig | None = None) 
         }
     apart = estimate.noise_deviations
     held = estimate.constrained_intervals
-    intervals = {} if held is None else {"constrained_intervals": [_perhaps(ends) for ends in held]}
-    noise = {} if apart is None else {"noise_standard_deviations": _perhaps(apart)}
+    intervals = {} if held is None else {"constrained_intervals": [finite_or_none(ends) for ends in held]}
+    noise = {} if apart is None else {"noise_standard_deviations": finite_or_none(apart)}
     document |= {
         "base_parameters": {
             "expressions": list(base.expressions),
             "units": list(base.units),
             "values": estimate.beta.tolist(),
             "unconstrained_values": estimate.fit.beta.tolist(),
-            "standard_deviations": _perhaps(estimate.standard_deviations),
-            "white_standard_deviations": _perhaps(estimate.white_standard_deviations),
+            "standard_deviations": finite_or_none(estimate.standard_deviations),
+            "white_standard_deviations": finite_or_none(estimate.white_standard_deviations),
             "degrees_of_freedom": [round(value, 3) for value in estimate.degrees.tolist()],
             **noise,
-            "covariance": [_perhaps(row) for row in estimate.covariance],
+            "covariance": [finite_or_none(row) for row in estimate.covariance],
             **intervals,
-            "negligible": _perhaps(estimate.negligible),
+            "negligible": finite_or_none(estimate.negligible),
             "verdicts": list(estimate.verdicts),
         },
         "feasibility": {
@@ -421,7 +421,8 @@ def _numbers(value: Any, joints: int) -> list[float]:
     return [float(one) for one in np.broadcast_to(np.asarray(value, dtype=float), (joints,))]
 
 
-def _perhaps(values: Array) -> list[float | None]:
+def finite_or_none(values: Array) -> list[float | None]:
+    """Return numbers as JSON has them: null for one that is not finite; shape (n,)."""
     return [float(value) if np.isfinite(value) else None for value in values]
 
 

@@ -24,7 +24,7 @@ from ident_service.estimation.uncertainty import negligible, verdicts
 from ident_service.model.chain import Array
 from ident_service.model.parameter_layout import INERTIAL
 from ident_service.results.manifest import write_atomically
-from ident_service.results.parameter_file import information_document, require_schema
+from ident_service.results.parameter_file import finite_or_none, information_document, require_schema
 from ident_service.results.summary import rows_and_filter, wrapped
 
 _WORDS: Mapping[Word, tuple[str, str]] = {
@@ -69,8 +69,8 @@ def payload_document(payload: Payload, arm: KnownArm, arm_sha256: str, recording
             "expressions": list(base.expressions),
             "units": list(base.units),
             "values": payload.fit.beta.tolist(),
-            "standard_deviations": _perhaps(payload.standard_deviations),
-            "covariance": [_perhaps(row) for row in payload.covariance],
+            "standard_deviations": finite_or_none(payload.standard_deviations),
+            "covariance": [finite_or_none(row) for row in payload.covariance],
             "verdicts": list(payload.verdicts),
         },
         "center_of_mass": None
@@ -243,9 +243,9 @@ def loaded_parameters(
     table |= {
         "values": beta.tolist(),
         "units": list(base.units) if any(base.units) else table.get("units", list(base.units)),
-        "standard_deviations": _perhaps(deviations),
-        "covariance": [_perhaps(row) for row in covariance],
-        "negligible": _perhaps(as_zero),
+        "standard_deviations": finite_or_none(deviations),
+        "covariance": [finite_or_none(row) for row in covariance],
+        "negligible": finite_or_none(as_zero),
         "verdicts": list(verdicts(beta, deviations, as_zero)),
     }
     condition = ordinary_least_squares(recorded.total).condition_number
@@ -301,7 +301,3 @@ def _errors(error: TorqueError, names: tuple[str, ...]) -> dict[str, Any]:
     rows = zip(names, error.joint_relative_percent.tolist(), error.joint_rms.tolist(), strict=True)
     per_joint = [{"joint": name, "relative_error_percent": relative, "rms": rms} for name, relative, rms in rows]
     return {"relative_error_percent": error.relative_percent, "per_joint": per_joint}
-
-
-def _perhaps(values: Array) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]

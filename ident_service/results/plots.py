@@ -166,6 +166,11 @@ def number(value: float, digits: int = 3) -> str:
     return ("0" if float(text) == 0.0 else text).replace("-", "\u2212")
 
 
+def shortened(text: str, width: int) -> str:
+    """Return text in so many characters at most, its end left out where it is longer."""
+    return text if len(text) <= width else text[: width - 3] + "..."
+
+
 def _pixel(value: float) -> str:
     text = f"{value:.1f}".removesuffix(".0")
     return "0" if text == "-0" else text

@@ -10,8 +10,8 @@ Both views are orthographic and have the same scale, so lengths can be compared 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import chain
 
 import numpy as np
@@ -19,33 +19,8 @@ import numpy as np
 from ident_service.errors import UsageError
 from ident_service.model.chain import Chain
 from ident_service.model.kinematics import branches, frame_origins
+from ident_service.model.solids import Capsule, HalfSpace, Solid, corners
 from ident_service.results.plots import STEPS, Array, Axes, Canvas, number, require_drawable, round_values
-
-
-@dataclass(frozen=True)
-class Box:
-    """Obstacle with eight corners [m], shape (8, 3), in any order."""
-
-    name: str
-    corners: Array
-
-
-@dataclass(frozen=True)
-class Plane:
-    """Obstacle that fills `normal . x < offset` [m]; `normal` has shape (3,) and points to free space."""
-
-    name: str
-    normal: Array
-    offset: float
-
-
-@dataclass(frozen=True)
-class Rod:
-    """Obstacle of all points within `radius` of the line between `ends` [m], shape (2, 3)."""
-
-    name: str
-    ends: Array
-    radius: float
 
 
 @dataclass(frozen=True)
@@ -73,7 +48,7 @@ class Postures:
         frames: origins of links, base and tool among them [m], shape (postures, points, 3).
         times: increasing [s], shape (postures,).
         branches: for every branch of the arm the points from base to tool, two or more.
-        obstacles: what does not move.
+        obstacles: what does not move, by name.
         workspace: lowest and highest corner of the box that the arm must stay in [m], shape (2, 3); infinite where it
             is open; or None.
         closest: the posture of smallest clearance, or None.
@@ -83,7 +58,7 @@ class Postures:
     frames: Array
     times: Array
     branches: tuple[tuple[int, ...], ...]
-    obstacles: tuple[Box | Plane | Rod, ...] = ()
+    obstacles: Mapping[str, Solid] = field(default_factory=dict)
     workspace: Array | None = None
     closest: Closest | None = None
     marked: tuple[int, ...] = ()
@@ -93,7 +68,7 @@ class Postures:
 
         Raises:
             UsageError: no postures, shapes that do not belong together, values that are no numbers, branches or a
-                closest posture that do not exist, obstacles without extent.
+                closest posture that do not exist.
         """
         if self.frames.ndim != 3:
             raise UsageError(f"cannot draw postures: {self.frames.shape=}, not (postures, points, 3)")
@@ -107,8 +82,6 @@ class Postures:
         if not all(0 <= point < points for point in chain(*self.branches, self.marked)):
             named = (*self.branches, self.marked) if self.marked else self.branches
             raise UsageError(f"cannot draw postures: the {points} points do not include all of {named}")
-        for obstacle in self.obstacles:
-            _require_obstacle(obstacle)
         if self.workspace is not None:
             require_drawable("workspace", self.workspace, (2, 3), unlimited=True)
             if not (self.workspace[0] < self.workspace[1]).all():
@@ -121,44 +94,27 @@ class Postures:
                 require_drawable("nearest points", self.closest.points, (2, 3))
 
 
-def _require_obstacle(obstacle: Box | Plane | Rod) -> None:
-    if isinstance(obstacle, Box):
-        require_drawable(f"obstacle {obstacle.name}", obstacle.corners, (8, 3))
-    elif isinstance(obstacle, Plane):
-        require_drawable(f"normal of obstacle {obstacle.name}", obstacle.normal, (3,))
-        require_drawable(f"offset of obstacle {obstacle.name}", np.array([obstacle.offset]), (1,))
-        if not np.abs(obstacle.normal).max() > 1e-9:
-            raise UsageError(f"cannot draw obstacle {obstacle.name}: its normal has no direction")
-    else:
-        require_drawable(f"obstacle {obstacle.name}", obstacle.ends, (2, 3))
-        require_drawable(f"radius of obstacle {obstacle.name}", np.array([obstacle.radius]), (1,))
-        if not obstacle.radius > 0.0:
-            raise UsageError(f"cannot draw obstacle {obstacle.name}: its radius is not above zero")
-
-
-def draw_obstacle(
-    canvas: Canvas, axes: Axes, view: tuple[int, int], obstacle: Box | Plane | Rod
-) -> tuple[float, float] | None:
+def draw_obstacle(canvas: Canvas, axes: Axes, view: tuple[int, int], obstacle: Solid) -> tuple[float, float] | None:
     """Draw an obstacle; return the middle of what is seen of it [px], or None where the view does not meet it."""
-    if isinstance(obstacle, Rod):
-        ends = obstacle.ends[:, list(view)]
+    if isinstance(obstacle, Capsule):
+        ends = corners(obstacle)[0][:, list(view)]
         (xa, xb), (ya, yb) = axes.x(ends[:, 0]), axes.y(ends[:, 1])
         scale = axes.width / (axes.high_x - axes.low_x)
         # Seen along any direction, all points near a line are a thick line with round ends.
         canvas.line("rod", float(xa), float(ya), float(xb), float(yb), width=2.0 * obstacle.radius * scale)
         outline = ends
-    elif isinstance(obstacle, Box):
-        outline = _hull(obstacle.corners[:, list(view)])
+    elif isinstance(obstacle, HalfSpace):
+        outline, border = _behind(axes, obstacle.normal[list(view)], obstacle.offset)
+        if not len(outline) or np.abs(obstacle.normal[list(view)]).max() <= 1e-6:
+            return None
+        canvas.polygon("solid", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
+        canvas.polyline("edge", axes.x(border[:, 0]), axes.y(border[:, 1]))
+    else:
+        outline = _hull(corners(obstacle)[0][:, list(view)])
         if _fills(axes, outline):
             # The hall's floor, seen from above: no line of it is in the view.
             return None
         canvas.polygon("solid edge", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
-    else:
-        outline, border = _behind(axes, obstacle.normal[list(view)], obstacle.offset)
-        if not len(outline) or np.abs(obstacle.normal[list(view)]).max() <= 1e-6 * np.abs(obstacle.normal).max():
-            return None
-        canvas.polygon("solid", axes.x(outline[:, 0]), axes.y(outline[:, 1]))
-        canvas.polyline("edge", axes.x(border[:, 0]), axes.y(border[:, 1]))
     low = np.maximum(outline.min(axis=0), (axes.low_x, axes.low_y))
     high = np.minimum(outline.max(axis=0), (axes.high_x, axes.high_y))
     if (low > high).any():
@@ -292,7 +248,7 @@ def stick_figure(postures: Postures, title: str = "The arm along its motion") ->
         canvas.text("warn strong", 50, 67, words, size=12.5)
     _legend(canvas, _LEFT + 2 * _PAGE.width + _GAP, postures)
     about = f"Side and top view of an arm in {len(shown)} postures of its motion, with the path of its tool."
-    names = ", ".join(obstacle.name for obstacle in postures.obstacles)
+    names = ", ".join(postures.obstacles)
     about += f" Obstacles: {names}." if names else ""
     return canvas.svg(title, about + (f" {words}." if words else ""))
 
@@ -400,7 +356,7 @@ def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures,
     i, j = view
     step = _grid(canvas, axes, view)
     canvas.clip(axes)
-    places = [draw_obstacle(canvas, axes, view, obstacle) for obstacle in postures.obstacles]
+    places = [draw_obstacle(canvas, axes, view, obstacle) for obstacle in postures.obstacles.values()]
     if postures.workspace is not None:
         draw_workspace(canvas, axes, view, postures.workspace)
     for rank, posture in enumerate(shown):
@@ -426,9 +382,9 @@ def _view(canvas: Canvas, axes: Axes, view: tuple[int, int], postures: Postures,
     for point in dict.fromkeys(branch[0] for branch in postures.branches):
         x, y = float(axes.x(postures.frames[0, point, i])), float(axes.y(postures.frames[0, point, j]))
         canvas.rectangle("base", x - 5, y - 5, 10, 10)
-    for obstacle, place in zip(postures.obstacles, places, strict=True):
+    for name, place in zip(postures.obstacles, places, strict=True):
         if place is not None:
-            write_name(canvas, axes, obstacle.name, *place)
+            write_name(canvas, axes, name, *place)
     canvas.clip(None)
     canvas.rectangle("frame", axes.left, axes.top, axes.width, axes.height)
     _scale_bar(canvas, axes, step)
@@ -443,18 +399,16 @@ def _extent(postures: Postures) -> tuple[Array, Array]:
     arm_low, arm_high = frames.min(axis=0), frames.max(axis=0)
     reach = max(float(np.max(arm_high - arm_low)), 0.1)
     points = [frames]
-    for obstacle in postures.obstacles:
-        if isinstance(obstacle, Box):
-            points.append(obstacle.corners)
-        elif isinstance(obstacle, Rod):
-            points += [obstacle.ends - obstacle.radius, obstacle.ends + obstacle.radius]
-        else:
+    for obstacle in postures.obstacles.values():
+        if isinstance(obstacle, HalfSpace):
             # A plane has no end; what matters of it is what is near the arm.
-            normal = obstacle.normal / np.linalg.norm(obstacle.normal)
             middle = 0.5 * (arm_low + arm_high)
-            foot = middle - (normal @ middle - obstacle.offset / np.linalg.norm(obstacle.normal)) * normal
+            foot = middle - (obstacle.normal @ middle - obstacle.offset) * obstacle.normal
             if np.linalg.norm(foot - middle) < reach:
-                points.append(foot[None] - 0.04 * reach * normal)
+                points.append(foot[None] - 0.04 * reach * obstacle.normal)
+        else:
+            ends, radius = corners(obstacle)
+            points += [ends - radius, ends + radius]
     if postures.workspace is not None:
         points.append(np.where(np.isfinite(postures.workspace), postures.workspace, frames[:1]))
     if postures.closest is not None and postures.closest.points is not None:

@@ -23,6 +23,7 @@ from ident_service.model.likely_bodies import IN_WORDS, likely_bodies, lines_of
 from ident_service.model.parameter_layout import NO_STRIBECK
 from ident_service.results.assessment import Assessment, assess_estimate
 from ident_service.results.evidence.gathering import ellipsoid
+from ident_service.results.plots import shortened
 
 
 def rows_and_filter(options: Identification) -> tuple[str, ...]:
@@ -97,6 +98,8 @@ def wrapped(sentences: Iterable[str]) -> list[str]:
 def _words(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:g}"
 
+
+_WIDTH = 58  # columns of an expression
 
 MASSES = 10.0  # factor above or below a likely mass
 _REACH = 1.0 / 3.0  # of the arm's, from a likely centre, or the link's own length
@@ -196,7 +199,7 @@ def summary(
     doubtful = [i for i, verdict in enumerate(estimate.verdicts) if verdict != "identified"]
     for i in doubtful:
         lines.append(
-            f"  {estimate.verdicts[i]:12s} {_short(estimate.base.expressions[i])} = {estimate.beta[i]:.4g} "
+            f"  {estimate.verdicts[i]:12s} {shortened(estimate.base.expressions[i], _WIDTH)} = {estimate.beta[i]:.4g} "
             f"+- {estimate.standard_deviations[i]:.2g} {estimate.base.units[i]}"
         )
     return "\n".join(lines) + "\n"
@@ -302,7 +305,7 @@ def _torque_constants(estimate: Estimate) -> list[str]:
 
 def parameter_table(estimate: Estimate) -> str:
     """Return every base parameter as text: estimate, standard deviation, verdict (table 6)."""
-    lines = [f"{'base parameter':58s} {'estimate':>12s} {'deviation':>10s}  verdict"]
+    lines = [f"{'base parameter':{_WIDTH}s} {'estimate':>12s} {'deviation':>10s}  verdict"]
     for expression, value, deviation, unit, verdict in zip(
         estimate.base.expressions,
         estimate.beta,
@@ -311,7 +314,7 @@ def parameter_table(estimate: Estimate) -> str:
         estimate.verdicts,
         strict=True,
     ):
-        lines.append(f"{_short(expression):58s} {value:12.5g} {deviation:10.2g}  {verdict} [{unit}]")
+        lines.append(f"{shortened(expression, _WIDTH):{_WIDTH}s} {value:12.5g} {deviation:10.2g}  {verdict} [{unit}]")
     return "\n".join(lines) + "\n"
 
 
@@ -356,13 +359,9 @@ def _convex(estimate: Estimate) -> list[str]:
             f"  objective {one:.9g} by {first_by}, {other:.9g} by {second_by}"
             + (f", which misses the set by {-second.margin:.1g}" if second.margin <= 0.0 else ""),
             f"  predicted torques differ by {second.torque_percent:.2g} %, base parameters by at most "
-            f"{second.deviations:.2g} deviations: {_short(second.expression)}",
+            f"{second.deviations:.2g} deviations: {shortened(second.expression, _WIDTH)}",
         ]
     return lines
-
-
-def _short(expression: str, width: int = 58) -> str:
-    return expression if len(expression) <= width else expression[: width - 3] + "..."
 
 
 def _row(label: str, cells: list[str]) -> str:

@@ -20,8 +20,8 @@ class Traffic(Enum):
     OTHER = "other"
 
 
-class Companion(Protocol):
-    """Define a device on the bus that moves no motor: a safety controller, with the pendant that belongs to it."""
+class BusDevice(Protocol):
+    """Define a device on the bus; no call goes back in time, each returns the frames that follow in order."""
 
     @property
     def number(self) -> int:
@@ -39,7 +39,7 @@ class Companion(Protocol):
         """Start the firmware."""
 
     def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of the host."""
+        """Process a frame of another node; of a SYNC, what its answer needs."""
 
     def tick(self, now_ns: int) -> list[Frame]:
         """Process the timers that are due."""
@@ -47,26 +47,18 @@ class Companion(Protocol):
     def listens(self, identifier: int) -> bool:
         """Return whether a frame of this identifier means anything to the device."""
 
+
+class Companion(BusDevice, Protocol):
+    """Define a device that moves no motor: a safety controller, with the pendant that belongs to it."""
+
     def press(self, key: str, now_ns: int) -> None:
         """Press a key of its pendant: `activate` or `idle`."""
 
 
-class EmulatedDevice(Protocol):
-    """Define one emulated motor controller; no call goes back in time, each returns the frames that follow in order."""
+class EmulatedDevice(BusDevice, Protocol):
+    """Define one emulated motor controller."""
 
     motor: Motor
-
-    @property
-    def number(self) -> int:
-        """Return the drive's number on its bus."""
-
-    @property
-    def next_deadline_ns(self) -> int | None:
-        """Return when `tick` has something to do [ns]; None for never."""
-
-    @property
-    def state(self) -> str:
-        """Describe the state in words, for people."""
 
     @property
     def released(self) -> bool:
@@ -76,23 +68,11 @@ class EmulatedDevice(Protocol):
     def sync_identifier(self) -> int:
         """Return the identifier of the frames with which the host begins a cycle."""
 
-    def power_up(self, now_ns: int) -> None:
-        """Start the firmware."""
-
-    def receive(self, frame: Frame, now_ns: int) -> list[Frame]:
-        """Process a frame of another node; of a SYNC, what its answer needs."""
-
     def finish_sync(self, now_ns: int) -> list[Frame]:
         """Do what else a SYNC asks for, when its answer is on its way; called after each `receive` of one."""
 
-    def tick(self, now_ns: int) -> list[Frame]:
-        """Process the timers that are due."""
-
     def watch(self, now_ns: int) -> None:
         """Limit the torque by position and speed of the motor, during a longer silence."""
-
-    def listens(self, identifier: int) -> bool:
-        """Return whether a frame of this identifier means anything to the drive."""
 
     def traffic(self, frame: Frame) -> Traffic:
         """Return the kind of a frame that the drive has sent."""

@@ -358,7 +358,7 @@ def test_a_puck_that_says_something_else_is_shown_by_preflight_and_not_enabled(
     model, limits = arm_model(config), motion_limits(config)
     with bench.arm as arm:
         looked = record_idle(arm, 10, 1.0 / RATE)
-        found = identities_check(arm.describe(), model, limits, None, looked, arm.setup_checks())
+        found = identities_check(arm.describe(), model, limits, looked, arm.setup_checks())
         assert found.verdict is Verdict.FAILED
         assert words in found.reason
         assert found.remedy
@@ -375,7 +375,7 @@ def test_a_sound_arm_tells_every_value_and_passes() -> None:
         assert {one.what.split(" ")[0] for one in told} == {"VERS", "groups", "PIDX", "CTS", "MT", "IPNM", "POLES"}
         looked = record_idle(arm, 120, 1.0 / RATE)
         model, limits = arm_model(config), motion_limits(config)
-        assert identities_check(arm.describe(), model, limits, None, looked, told).verdict is Verdict.PASSED
+        assert identities_check(arm.describe(), model, limits, looked, told).verdict is Verdict.PASSED
         first = arm.describe().identities[0]
         assert first == "puck 1: VERS 200 ROLE 0000h SN 1001 IPNM 2700 MT 4860 CTS 4096"
 

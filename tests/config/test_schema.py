@@ -13,12 +13,12 @@ import yaml
 from config.test_config_mistakes import GOOD
 
 from ident_service.cli import main
-from ident_service.config.schema import arm_schema, reference
-from ident_service.config.schema import main as write_published
 from ident_service.config.yaml_source import MODELINE, arm_schema_file, shipped_arms
+from tools.description_reference import arm_schema, reference
+from tools.description_reference import main as write_published
 
 ROOT = Path(__file__).parents[2]
-RENEW = "run: python -m ident_service.config.schema"
+RENEW = "run: python tools/description_reference.py"
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,6 @@ from ident_service.motion.stop_trajectory import (
     require_stops_within_limits,
     stop,
     stop_extent,
-    stop_overshoot,
 )
 from ident_service.motion.trajectory import PathReference, Setpoint, rest
 
@@ -125,6 +124,11 @@ def test_a_stop_that_can_only_just_stay_inside_does(seed: int) -> None:
     assert (highest <= limits.upper + 2e-7).all()
 
 
+def _overshoot(limits: MotionLimits) -> Array:
+    """Return the proven bound of the module's docstring [rad or m], shape (joints,)."""
+    return np.asarray(limits.acceleration**3 / (24.0 * limits.jerk**2))
+
+
 @settings(max_examples=100)
 @given(SEEDS)
 def test_the_quickest_stop_overshoots_a_turning_point_by_less_than_its_bound(seed: int) -> None:
@@ -132,8 +136,8 @@ def test_the_quickest_stop_overshoots_a_turning_point_by_less_than_its_bound(see
     limits = random_limits(rng, 5)
     state = turning_state(rng, limits)
     lowest, highest = stop(state, _unlimited(limits)).extent()
-    assert (highest <= limits.upper + stop_overshoot(limits) + 1e-7).all()
-    assert (lowest >= limits.lower - stop_overshoot(limits) - 1e-7).all()
+    assert (highest <= limits.upper + _overshoot(limits) + 1e-7).all()
+    assert (lowest >= limits.lower - _overshoot(limits) - 1e-7).all()
 
 
 def test_the_bound_of_the_overshoot_is_reached() -> None:
@@ -142,10 +146,10 @@ def test_the_bound_of_the_overshoot_is_reached() -> None:
     start = Setpoint(np.zeros(2), velocity, -LIMITS.acceleration)
     turning = 0.5 * velocity**2 / LIMITS.acceleration
     wide = _unlimited(LIMITS)
-    np.testing.assert_allclose(stop(start, wide).extent()[1] - turning, stop_overshoot(LIMITS), rtol=1e-9)
+    np.testing.assert_allclose(stop(start, wide).extent()[1] - turning, _overshoot(LIMITS), rtol=1e-9)
     narrow = replace(LIMITS, upper=turning)
     np.testing.assert_allclose(stop(start, narrow).extent()[1], turning, rtol=1e-9)
-    np.testing.assert_allclose(stop_overshoot(LIMITS), [8.0**3 / 24 / 80.0**2, 15.0**3 / 24 / 150.0**2])
+    np.testing.assert_allclose(_overshoot(LIMITS), [8.0**3 / 24 / 80.0**2, 15.0**3 / 24 / 150.0**2])
 
 
 @settings(max_examples=100)

@@ -102,15 +102,6 @@ def test_another_arm_on_the_bus_is_not_touched() -> None:
     untouched(flight)
 
 
-def test_an_exchanged_drive_is_noticed() -> None:
-    flight = Flight()
-    expected = ("simulated axis shoulder, seed 0", "serial 42")
-    check = only_failure(flight.ticket(identities=expected), "identities")
-    assert check.reason.startswith("elbow: 'simulated axis elbow, seed 0' instead of 'serial 42'")
-    assert "exchanged on purpose" in check.remedy
-    untouched(flight)
-
-
 def test_a_driver_that_clips_below_the_limits_is_noticed() -> None:
     flight = Flight()
     flight.arm.description = lambda described: replace(described, torque_limit=np.array([40.0, 5.0]))

@@ -487,13 +487,13 @@ class Engine:
         self.live.enter(live)
         return row
 
-    def cancel(self, job: str, by: str, why: str = "") -> None:
+    def cancel(self, job: str, by: str) -> None:
         """End a job: a motion by a controlled stop, a computation by SIGTERM, one that waits at once.
 
         Raises:
             UsageError: no such job, or it has ended.
         """
-        if not self.live.end(job, why or f"cancelled by {by}"):
+        if not self.live.end(job, f"cancelled by {by}"):
             raise UsageError(f"the job {job} has ended already: {rows.known_job(self.db, job)['state']}")
         self.audit.note(by, "job cancelled", job)
 

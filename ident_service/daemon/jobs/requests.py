@@ -33,11 +33,22 @@ class RecordingReference(RequestBody):
     end: Second | None = None
 
 
-class Design(RequestBody):
+class ArmJob(RequestBody):
+    """Job about an arm."""
+
+    arm: ArmName
+
+
+class RunJob(RequestBody):
+    """Job about a run."""
+
+    run: Id
+
+
+class Design(ArmJob):
     """Search for a motion; options left out are as the arm's description says."""
 
     kind: Literal["design"]
-    arm: ArmName
     seconds: Annotated[float, Field(gt=0, le=24 * 3600)] | None = None
     starts: Annotated[int, Field(ge=1, le=100_000)] | None = None
     seed: Seed = 0
@@ -47,11 +58,10 @@ class Design(RequestBody):
     after: Annotated[tuple[RecordingReference, ...], Field(max_length=16)] = ()
 
 
-class Check(RequestBody):
+class Check(ArmJob):
     """Do the preflight for a motion, the description's own without one, or for the motion home."""
 
     kind: Literal["check"]
-    arm: ArmName
     motion: Id | None = None
     home: bool = False
 
@@ -62,11 +72,10 @@ class Check(RequestBody):
         return self
 
 
-class Rehearse(RequestBody):
+class Rehearse(ArmJob):
     """Run the motion slowly, while the lease is renewed as fast as a held key repeats."""
 
     kind: Literal["rehearse"]
-    arm: ArmName
     motion: Id | None = None
     speed: Speed = 0.2
 
@@ -78,101 +87,88 @@ class Until(RequestBody):
     parameters: Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=100)] = ()
 
 
-class Run(RequestBody):
+class Run(ArmJob):
     """Move the arm along a motion and record it."""
 
     kind: Literal["run"]
-    arm: ArmName
     motion: Id | None = None
     speed: Speed = 1.0
     until: Until | None = None
 
 
-class Home(RequestBody):
+class Home(ArmJob):
     """Move the arm to its home position, slowly."""
 
     kind: Literal["home"]
-    arm: ArmName
 
 
-class Zero(RequestBody):
+class Zero(ArmJob):
     """Set the encoders' zero: a person confirms that the arm stands at home; nothing moves, and it never waits."""
 
     kind: Literal["zero"]
-    arm: ArmName
 
 
-class LeaveLimit(RequestBody):
+class LeaveLimit(ArmJob):
     """Move an arm that stands outside its position limits back inside, slowly."""
 
     kind: Literal["leave_limit"]
-    arm: ArmName
 
 
-class Recover(RequestBody):
+class Recover(ArmJob):
     """Report after a fault or a stop what prevents motion, and what to do; nothing moves."""
 
     kind: Literal["recover"]
-    arm: ArmName
 
 
-class Watch(RequestBody):
+class Watch(ArmJob):
     """Read the arm's positions and drive status without torque and without changing its state."""
 
     kind: Literal["watch"]
-    arm: ArmName
     seconds: Annotated[float, Field(gt=0, le=600)] = 2.0
 
 
-class BusLoad(RequestBody):
+class BusLoad(ArmJob):
     """Compute the load of every frame on the arm's buses, and whether all of them fit."""
 
     kind: Literal["bus_load"]
-    arm: ArmName
     rate: Annotated[float, Field(gt=0, le=1e6)] | None = None
 
 
-class BusScan(RequestBody):
+class BusScan(ArmJob):
     """List the nodes on the arm's buses; reads only."""
 
     kind: Literal["bus_scan"]
-    arm: ArmName
 
 
-class BusProbe(RequestBody):
+class BusProbe(ArmJob):
     """Read the capabilities of the arm's drives, and what they lack; reads only."""
 
     kind: Literal["bus_probe"]
-    arm: ArmName
 
 
-class ConfigCheck(RequestBody):
+class ConfigCheck(ArmJob):
     """Check the arm's description: bus budget, and whether its gains are stable."""
 
     kind: Literal["config_check"]
-    arm: ArmName
 
 
-class Base(RequestBody):
+class Base(ArmJob):
     """List the base parameters and their expressions."""
 
     kind: Literal["base"]
-    arm: ArmName
 
 
-class Preview(RequestBody):
+class Preview(ArmJob):
     """Predict the demands of a motion on the arm, and the accuracy that it will give."""
 
     kind: Literal["preview"]
-    arm: ArmName
     motion: Id | None = None
 
 
-class Identify(RequestBody):
+class Identify(ArmJob):
     """Identify parameters from recordings."""
 
     kind: Literal["identify"]
-    arm: ArmName
     recordings: Annotated[tuple[RecordingReference, ...], Field(min_length=1, max_length=16)]
     validate_on: Annotated[tuple[RecordingReference, ...], Field(max_length=16)] = ()
     method: Literal["ols", "wls", "huber", "iv"] | None = None
@@ -192,78 +188,69 @@ class Simulate(RequestBody):
     feasible_set: FeasibleSet | None = None
 
 
-class Report(RequestBody):
+class Report(RunJob):
     """Write the report of a run as one page."""
 
     kind: Literal["report"]
-    run: Id
 
 
-class Export(RequestBody):
+class Export(RunJob):
     """Write the parameters of a run for other tools."""
 
     kind: Literal["export"]
-    run: Id
     formats: Annotated[tuple[Literal["urdf", "mjcf", "sdf", "json", "csv", "c"], ...], Field(min_length=1)] = ("urdf",)
 
 
-class Verify(RequestBody):
+class Verify(RunJob):
     """Check the certificate in a run's parameters against its own conditions, or those of an arm's description."""
 
     kind: Literal["verify"]
-    run: Id
     arm: ArmName | None = None
 
 
-class Feasible(RequestBody):
+class Feasible(RunJob):
     """Check whether a real body could have a run's parameters; `arm` adds the conditions of its description."""
 
     kind: Literal["feasible"]
-    run: Id
     feasible_set: Literal["pseudo_inertia", "inertia"] | None = None
     arm: ArmName | None = None
 
 
-class Correct(RequestBody):
+class Correct(RunJob):
     """Find the feasible parameters nearest to a run's, as a file of their own; the run is unchanged."""
 
     kind: Literal["correct"]
-    run: Id
     metric: Literal["euclidean", "covariance"] = "euclidean"
     feasible_set: Literal["pseudo_inertia", "inertia"] | None = None
     arm: ArmName | None = None
 
 
-class Figures(RequestBody):
+class Figures(RunJob):
     """Write the drawings of a run's report as files."""
 
     kind: Literal["figures"]
-    run: Id
     format: Literal["svg", "png"] = "svg"
 
 
-class Payload(RequestBody):
+class Payload(RunJob):
     """Identify the payload that the arm of a run carries in recordings of other runs."""
 
     kind: Literal["payload"]
-    run: Id
     recordings: Annotated[tuple[RecordingReference, ...], Field(min_length=1, max_length=16)]
     refit_offsets: bool = False
 
 
-class Compare(RequestBody):
+class Compare(RunJob):
     """Compare two runs: what changed, and by how many standard deviations."""
 
     kind: Literal["compare"]
-    run: Id
     other: Id
 
 
-class Judge(RequestBody):
+class Judge(ArmJob):
     """Compare a run's parameters with those of an acceptance of its arm; the comparison is stored in the run."""
 
     kind: Literal["judge"]
-    arm: ArmName
     run: Id
     against: Annotated[int, Field(ge=1, lt=10_000)]
 
@@ -271,14 +258,13 @@ class Judge(RequestBody):
 ArmPattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9*?_.\-\[\]]{1,64}$")]
 
 
-class Fleet(RequestBody):
+class Fleet(ArmJob):
     """Identify arms of one kind together, from every recording that the registry has of them.
 
     `arm` describes each of them; `arms` are their names, or patterns of names such as `cell*`.
     """
 
     kind: Literal["fleet"]
-    arm: ArmName
     arms: Annotated[tuple[ArmPattern, ...], Field(min_length=1, max_length=1000)]
     settle_again: bool = False
 

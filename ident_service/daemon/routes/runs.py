@@ -16,6 +16,7 @@ from ident_service.daemon.dependencies import Operator, Serving, Viewer
 from ident_service.daemon.errors import api_router, failures
 from ident_service.daemon.jobs.requests import ArmName, FileName, Id, RequestBody
 from ident_service.daemon.routes.jobs import without_paths
+from ident_service.daemon.run_series import series
 from ident_service.errors import UnknownId
 from ident_service.operations import deletion, run_archive
 from ident_service.registry import runs
@@ -123,7 +124,9 @@ def get_series(service: Serving, _: Viewer, request: Request, run: Id, name: Fil
     chosen = name or runs.recording_name(service.db, run)
     path = runs.run_file(service.db, service.state, run, chosen)
     sha256 = runs.run_files(service.db, service.state, run)[chosen]
-    return Response(request.app.state.series.document(path.parent, chosen, sha256), media_type="application/json")
+    key = (str(path.parent), sha256)
+    text = request.app.state.series.document(key, lambda: series(path.parent, chosen))
+    return Response(text, media_type="application/json")
 
 
 @router.get("/runs/{run}/files/{name}", response_class=FileResponse, responses=_BINARY)

@@ -7,8 +7,6 @@ imported when the first is asked for, so that the service starts without.
 from __future__ import annotations
 
 import json
-import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Annotated, Any, Final, Literal
 
@@ -28,7 +26,6 @@ from ident_service.registry import motions, runs
 from ident_service.results.manifest import file_sha256
 
 router = api_router("views", 404, 409)
-_KEPT: Final = 16
 _MOST_BYTES: Final = 256 * 2**20  # of a recording: half a minute of reading
 OWN: Final = "own"
 Numbers = list[float]
@@ -135,23 +132,6 @@ class ViewAnswer(BaseModel):
     phases: list[ViewedPhase]
     clearance: ViewedClearance | None
     notes: list[str]
-
-
-class Views:
-    """Documents that were asked for last, by what they are made of; may be used from any thread."""
-
-    def __init__(self) -> None:
-        self._lock, self._kept = threading.Lock(), OrderedDict[tuple[str, ...], str]()
-
-    def document(self, key: tuple[str, ...], make: Callable[[], dict[str, Any]]) -> str:
-        """Return the JSON of what `make` returns, made only if the key is new."""
-        with self._lock:  # one at a time: distances of bodies are what costs
-            if (found := self._kept.get(key)) is None:
-                found = self._kept[key] = json.dumps(make(), allow_nan=False)
-                while len(self._kept) > _KEPT:
-                    self._kept.popitem(last=False)
-            self._kept.move_to_end(key)
-            return found
 
 
 @router.get("/arms/{arm}/view", response_model=ViewAnswer)

@@ -531,15 +531,10 @@ def _requested_job(arm: str, form: dict[str, str]) -> dict[str, Any]:
     except ValueError:
         raise UsageError(f"{kind}: a number is missing, or is none") from None
     asked["kind"] = kind
+    if kind == "export":
+        asked["formats"] = [name.removeprefix("format-") for name in form if name.startswith("format-")]
     if kind in ("report", "export"):
-        return {
-            **asked,
-            **(
-                {"formats": [name.removeprefix("format-") for name in form if name.startswith("format-")]}
-                if kind == "export"
-                else {}
-            ),
-        }
+        return asked
     if "until" in asked:
         asked["until"] = {"share": asked["until"]}
     if kind == "identify":

@@ -150,7 +150,8 @@ def _map(block: Rows, slack: Array) -> Array:
             return np.ones(len(slack))
 
 
-def _entries(size: int) -> tuple[Array, Array, Array]:
+def _entries(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Return row, column and weight of each entry of an upper triangle, as `triangle_entries` orders them."""
     columns = np.concatenate([np.full(j + 1, j) for j in range(size)])
     rows = np.concatenate([np.arange(j + 1) for j in range(size)])
     return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
@@ -229,36 +230,31 @@ class ConicProblem:
     variables: int
     rough: bool = field(default=False, kw_only=True)
     _rows: list[Rows] = field(default_factory=list)
-    _scales: list[Array] = field(default_factory=list)
 
     def zero(self, F: Array, f: Array) -> None:
         """Add `F x + f = 0` entry by entry; F of shape (rows, variables)."""
-        self._add(Rows("zero", F, f), np.ones(len(f)))
+        self._rows.append(Rows("zero", F, f))
 
     def nonnegative(self, F: Array, f: Array) -> None:
         """Add `F x + f >= 0` entry by entry; F of shape (rows, variables)."""
-        self._add(Rows("nonnegative", F, f), np.ones(len(f)))
+        self._rows.append(Rows("nonnegative", F, f))
 
     def second_order(self, F: Array, f: Array) -> None:
         """Add the condition that the first entry of `F x + f` is at least the norm of the others."""
-        self._add(Rows("second_order", F, f), np.ones(len(f)))
+        self._rows.append(Rows("second_order", F, f))
 
     def exponential(self, F: Array, f: Array) -> None:
         """Add the condition b exp(a / b) <= c on the three entries (a, b, c) of `F x + f`."""
-        self._add(Rows("exponential", F, f), np.ones(len(f)))
+        self._rows.append(Rows("exponential", F, f))
 
     def semidefinite(self, F: Array, f: Array, size: int) -> None:
         """Add the condition that `F x + f` is the upper triangle of a positive semidefinite matrix of `size` rows."""
-        scale = np.array([1.0 if i == j else np.sqrt(2.0) for i, j in triangle_entries(size)])
-        self._add(Rows("semidefinite", F * scale[:, None], f * scale, size), scale)
+        *_, weight = _entries(size)
+        self._rows.append(Rows("semidefinite", F * weight[:, None], f * weight, size))
 
     def copy(self) -> ConicProblem:
         """Return a copy of the problem that further constraints can be added to."""
-        return ConicProblem(self.variables, list(self._rows), list(self._scales), rough=self.rough)
-
-    def _add(self, rows: Rows, scale: Array) -> None:
-        self._rows.append(rows)
-        self._scales.append(scale)
+        return ConicProblem(self.variables, list(self._rows), rough=self.rough)
 
     def minimise(
         self, objective: Array, name: str, quadratic: Array | None = None, enough: float | None = None
@@ -305,7 +301,8 @@ class ConicProblem:
 
     def _duals(self, pose: ScaledProblem, z: Array) -> tuple[Array, ...]:
         ends = np.cumsum([len(rows.f) for rows in self._rows])[:-1]
-        return tuple(dual / scale for dual, scale in zip(pose.duals(np.split(z, ends)), self._scales, strict=True))
+        found = zip(pose.duals(np.split(z, ends)), self._rows, strict=True)
+        return tuple(dual / _entries(rows.size)[2] if rows.size else dual for dual, rows in found)
 
 
 @dataclass(frozen=True)

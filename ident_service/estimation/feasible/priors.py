@@ -142,10 +142,9 @@ def solve_with_prior(
     if prior.names != conditions.names:
         raise ParameterError("the prior and the feasible set are about different link parameters")
     sigma = residual_deviation(fit) if prior.sigma is None else prior.sigma
-    n, links = len(prior.names), prior.whitened if prior.kind == "entropic" else ()
-    rows = len(fit.rho1)
+    n, rows = len(prior.names), len(fit.rho1)
     # Variables: delta in reference scales, the whitened residual r, per link Z and t.
-    variables = n + rows + 14 * len(links)
+    variables = n + rows + (14 * len(prior.whitened) if prior.kind == "entropic" else 0)
     problem = ConicProblem(variables)
     to_delta = np.zeros((n, variables))
     to_delta[:, :n] = np.diag(prior.scales)
@@ -158,14 +157,7 @@ def solve_with_prior(
     data, known = 1.0 / (1.0 + prior.weight), prior.weight / (1.0 + prior.weight)
     objective, quadratic = np.zeros(variables), np.zeros(variables)
     quadratic[n : n + rows] = 2.0 * data
-    quadratic[prior.euclidean] = 2.0 * known
-    objective[prior.euclidean] = -2.0 * known * (prior.delta / prior.scales)[prior.euclidean]
-    for k, block in enumerate(links):
-        start = n + rows + 14 * k
-        _logdet(problem, block, to_delta, start)
-        trace = block.F[[entry for entry, (i, j) in enumerate(triangle_entries(4)) if i == j]].sum(axis=0)
-        objective += known * (trace @ to_delta)
-        objective[start + 10 : start + 14] -= known
+    _add_divergence(problem, prior, to_delta, n + rows, known, objective, quadratic)
     size = float(np.max(np.abs(np.concatenate([fit.beta, prior.delta])), initial=0.0))
     name = "constrained least squares with a prior"
     # The prior itself keeps masses from growing beyond all limits.
@@ -223,9 +215,10 @@ def move_off_boundary(
 
 def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: ChangeEllipsoid, inside: Array) -> Array:
     """Return link parameters of least divergence from the prior whose base parameters lie within `near`."""
-    n, links = len(prior.names), prior.whitened
-    problem = ConicProblem(n + 14 * len(links), rough=True)  # seven digits are enough to start Newton's method
-    to_delta = np.zeros((n, n + 14 * len(links)))
+    n = len(prior.names)
+    variables = n + 14 * len(prior.whitened)
+    problem = ConicProblem(variables, rough=True)  # seven digits are enough to start Newton's method
+    to_delta = np.zeros((n, variables))
     to_delta[:, :n] = np.diag(prior.scales)
     add_conditions(problem, conditions, to_delta, inside)
     still = np.flatnonzero(~near.moves)
@@ -233,16 +226,32 @@ def _within(prior: Prior, base: BaseParameters, conditions: FeasibleSet, near: C
     rows = near.metric @ base.K @ to_delta
     problem.second_order(np.vstack([np.zeros(rows.shape[1]), rows]), np.append(_ROOM, -near.metric @ near.origin))
     objective, quadratic = np.zeros(rows.shape[1]), np.zeros(rows.shape[1])
-    quadratic[prior.euclidean] = 2.0
-    objective[prior.euclidean] = -2.0 * (prior.delta / prior.scales)[prior.euclidean]
-    for k, block in enumerate(links):
-        start = n + 14 * k
-        _logdet(problem, block, to_delta, start)
-        trace = block.F[[entry for entry, (i, j) in enumerate(triangle_entries(4)) if i == j]].sum(axis=0)
-        objective += trace @ to_delta
-        objective[start + 10 : start + 14] -= 1.0
+    _add_divergence(problem, prior, to_delta, n, 1.0, objective, quadratic)
     size = float(np.max(np.abs(np.concatenate([near.origin, prior.delta])), initial=0.0))
     return solve_inside(problem, objective, "likely bodies", to_delta, conditions, size, quadratic, OF_TESTS)[0]
+
+
+def _add_divergence(
+    problem: ConicProblem,
+    prior: Prior,
+    to_delta: Array,
+    start: int,
+    weight: float,
+    objective: Array,
+    quadratic: Array,
+) -> None:
+    """Add the divergence from a prior to an objective; its own variables, per link Z and t, begin at `start`.
+
+    The first variables are delta in reference scales; `objective` and `quadratic` are changed in place.
+    """
+    quadratic[prior.euclidean] = 2.0 * weight
+    objective[prior.euclidean] = -2.0 * weight * (prior.delta / prior.scales)[prior.euclidean]
+    diagonal = [entry for entry, (i, j) in enumerate(triangle_entries(4)) if i == j]
+    for block in prior.whitened if prior.kind == "entropic" else ():
+        _logdet(problem, block, to_delta, start)
+        objective += weight * (block.F[diagonal].sum(axis=0) @ to_delta)
+        objective[start + 10 : start + 14] -= weight
+        start += 14
 
 
 def _logdet(problem: ConicProblem, block: Block, to_delta: Array, start: int) -> None:

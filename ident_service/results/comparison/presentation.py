@@ -38,8 +38,8 @@ from ident_service.results.comparison.comparison import (
 )
 from ident_service.results.evidence.gathering import friction_term
 from ident_service.results.manifest import write_atomically
-from ident_service.results.parameter_file import require_schema
-from ident_service.results.plots import Axes, Canvas, draw_frame, draw_key, number, range_around
+from ident_service.results.parameter_file import finite_or_none, require_schema
+from ident_service.results.plots import Axes, Canvas, draw_frame, draw_key, number, range_around, shortened
 from ident_service.results.report.figures import LEFT, RIGHT, WIDTH, Figure
 from ident_service.results.report.rendering import Cell, Table, render
 
@@ -230,11 +230,11 @@ def _pair(comparison: Comparison, pair: Pair) -> list[str]:
     lines += ["", *_table(comparison.reference, pair)]
     for title, left_out in (("the reference", pair.only_reference), (str(pair.side.path), pair.only_side)):
         if left_out:
-            lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in shortened(left_out))]
+            lines += ["", f"left out, only in {title}:", *(f"  {one}" for one in first_rows(left_out))]
     if pair.provenance:
         lines += ["", "differences in how they were made (reference; compared):"]
         said = {key: both for key, both in pair.provenance.items() if UNSAID not in both}
-        lines += [f"  {key}: {_short(a, 60)}; {_short(b, 60)}" for key, (a, b) in said.items()]
+        lines += [f"  {key}: {shortened(a, 60)}; {shortened(b, 60)}" for key, (a, b) in said.items()]
         if alone := [key for key in pair.provenance if key not in said]:
             lines.append(f"  given for one alone: {', '.join(alone)}")
     lines += [f"note: {note}" for note in pair.notes]
@@ -288,7 +288,7 @@ def tested_line(pair: Pair) -> str:
     return f"{line}; the values in use, constrained to a feasible set, are beside them" if pair.in_use.apart else line
 
 
-def shortened(rows: Sequence[str]) -> list[str]:
+def first_rows(rows: Sequence[str]) -> list[str]:
     """Return the first few of many rows, and how many more there are."""
     if len(rows) <= _MOST:
         return list(rows)
@@ -337,15 +337,11 @@ def _table(reference: ComparedSet, pair: Pair) -> list[str]:
             seen = bool(np.isfinite(pair.drift.deviations[k]))
             z, p = (f"{pair.drift.z[k]:.2f}", f"{pair.drift.p[k]:.2g}") if seen else ("unseen", "")
         lines.append(
-            f"{_short(expressions[here], _WIDTH):{_WIDTH}s} {values[0]:11.4g} {values[1]:11.4g} "
+            f"{shortened(expressions[here], _WIDTH):{_WIDTH}s} {values[0]:11.4g} {values[1]:11.4g} "
             f"{pair.difference[k]:11.3g} {z:>8s} {p:>9s}"
             f"{f' {use.reference[k]:11.4g} {use.side[k]:11.4g}' if apart else ''}".rstrip()
         )
     return lines
-
-
-def _short(text: str, width: int) -> str:
-    return text if len(text) <= width else text[: width - 3] + "..."
 
 
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
@@ -406,7 +402,7 @@ def _pair_document(reference: ComparedSet, pair: Pair) -> dict[str, Any]:
             "tested": "unconstrained_values" if pair.free else "values",
             "used": {"reference": pair.in_use.reference.tolist(), "compared": pair.in_use.side.tolist()},
             "used_torque_share": None if pair.in_use.shares is None else pair.in_use.shares[0].tolist(),
-            "standard_deviations": None if found is None else _perhaps(found.deviations),
+            "standard_deviations": None if found is None else finite_or_none(found.deviations),
             "z": None if found is None else found.z.tolist(),
             "p": None if found is None else found.p.tolist(),
         },
@@ -455,10 +451,6 @@ def _test(test: Test) -> dict[str, Any]:
 
 def _error(error: TorqueError) -> dict[str, Any]:
     return {"whole": error.relative_percent, "per_joint": error.joint_relative_percent.tolist()}
-
-
-def _perhaps(values: Array) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]
 
 
 _NOTHING = Cell("\u2014")
@@ -537,7 +529,7 @@ def _parameters(reference: ComparedSet, pair: Pair) -> Table:
 
 def _left_out(pair: Pair) -> list[tuple[str, list[str]]]:
     parts = [("the reference", pair.only_reference), ("the compared", pair.only_side)]
-    return [(name, list(shortened(rows))) for name, rows in parts if rows]
+    return [(name, first_rows(rows)) for name, rows in parts if rows]
 
 
 def _effects(pair: Pair) -> Table | None:

@@ -373,22 +373,26 @@ class Scatter:
         return np.concatenate(self._rows)
 
 
-def spread(x: Array, y: Array, most: int = 400, bins: int = 50) -> tuple[Array, Array]:
-    """Return at most `most` of the points, so that no part of the range of x that has any is left empty.
+_MOST_POINTS, _PARTS = (
+    400,
+    50,
+)  # points of friction that are kept; equal parts of their range, each with its share
+
+
+def spread(x: Array, y: Array) -> tuple[Array, Array]:
+    """Return at most 400 of the points, so that no part of the range of x that has any is left empty.
 
     Args:
         x: shape (points,).
         y: likewise.
-        most: number of points to keep.
-        bins: equal parts of the range of x, each with an equal right to points.
     """
-    if len(x) <= most:
+    if len(x) <= _MOST_POINTS:
         return x, y
-    width = (x.max() - x.min()) / bins or 1.0
-    place = np.minimum((x - x.min()) / width, bins - 1).astype(int)
-    share = most // bins
+    width = (x.max() - x.min()) / _PARTS or 1.0
+    place = np.minimum((x - x.min()) / width, _PARTS - 1).astype(int)
+    share = _MOST_POINTS // _PARTS
     chosen = []
-    for part in range(bins):
+    for part in range(_PARTS):
         members = np.flatnonzero(place == part)
         if len(members) > share:
             members = members[np.linspace(0, len(members) - 1, share).round().astype(int)]

@@ -75,6 +75,8 @@ def _shared(model: ArmModel, delta: Array) -> Carried:
 def _text(
     model: ArmModel, delta: Array, has: Carried, shared: Carried, lost: tuple[str, ...], said: tuple[str, ...]
 ) -> str:
+    from ident_service.model.pinocchio_models import quaternion
+
     chain = model.chain
     bodies = joint_bodies(model, delta)
     require_real(model, bodies, "MuJoCo")
@@ -95,7 +97,7 @@ def _text(
             "body",
             name=names[k],
             pos=_numbers(chain.translation[k]),
-            quat=_numbers(_quaternion(chain.rotation[k])),
+            quat=_numbers(quaternion(chain.rotation[k])),
         )
         mass, center, inertia = about_center(bodies[k])
         six = [inertia[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
@@ -147,24 +149,6 @@ def _require_same_tendons(model: ArmModel, delta: Array, text: str, shared: Carr
     meant = np.array(values).T.reshape(found.shape) if len(fixed) == int((~own).sum()) else None
     if meant is None or not np.array_equal(coupling, chain.coupling[~own]) or not np.array_equal(found, meant):
         raise ModelError(f"{name}: the tendons read back differ from the drives; it was not written")
-
-
-def _quaternion(rotation: Array) -> Array:
-    """Return w, x, y, z of a rotation, w >= 0, shape (4,), from the largest component for accuracy."""
-    R = rotation
-    squares = np.array([np.trace(R), R[0, 0], R[1, 1], R[2, 2]])
-    largest = int(np.argmax(squares))
-    # Row k: four times the k-th component times every component.
-    products = np.array(
-        [
-            [1.0 + np.trace(R), R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], 1.0 + R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
-            [R[0, 2] - R[2, 0], R[0, 1] + R[1, 0], 1.0 - R[0, 0] + R[1, 1] - R[2, 2], R[1, 2] + R[2, 1]],
-            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], 1.0 - R[0, 0] - R[1, 1] + R[2, 2]],
-        ]
-    )[largest]
-    unit = products / np.linalg.norm(products)
-    return np.asarray(unit if unit[0] >= 0.0 else -unit)
 
 
 def _numbers(values: Array | NDArray[np.float64]) -> str:

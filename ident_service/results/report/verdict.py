@@ -15,7 +15,7 @@ from ident_service.results.assessment import (
 )
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.parameter_file import ParameterFile
-from ident_service.results.plots import number
+from ident_service.results.plots import number, shortened
 from ident_service.results.report.figures import relative_deviations
 
 ILL_CONDITIONED = 1000.0  # condition number of the regressor, SI units
@@ -46,14 +46,9 @@ def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
 
 def listed(names: Sequence[str]) -> str:
     """Join the first few names, shortened, and say how many more there are."""
-    shown = [shortened(name) for name in names[:NAMED]]
+    shown = [shortened(name, _LONGEST) for name in names[:NAMED]]
     more = len(names) - len(shown)
     return "; ".join(shown) + (f"; and {more} more" if more > 0 else "")
-
-
-def shortened(name: str) -> str:
-    """Return a name that fits into a sentence."""
-    return name if len(name) <= _LONGEST else name[: _LONGEST - 3] + "..."
 
 
 SIMULATED = "The arm is simulated: this is no commissioning of a real arm."
@@ -94,7 +89,7 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         else:
             sentences.append("They lie too close to the boundary for a certificate in exact arithmetic.")
         if (custom := parameters.content.get("custom")) is not None:
-            name = shortened(custom["function"])
+            name = shortened(custom["function"], _LONGEST)
             sentences.append(f"They also meet {name} says, a function that no certificate is about.")
         if tight:
             sentences.append(f"{active_conditions(evidence, parameters)}: {tight}.")
@@ -143,7 +138,8 @@ def _knowledge(parameters: ParameterFile) -> str:
     if not unknown:
         return words + "."
     shown = "; ".join(
-        f"{shortened(name)} ({'not seen' if np.isinf(share) else number(share, 2)})" for name, share in unknown[:NAMED]
+        f"{shortened(name, _LONGEST)} ({'not seen' if np.isinf(share) else number(share, 2)})"
+        for name, share in unknown[:NAMED]
     )
     more = f"; and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
     return f"{words}, the most uncertain first (\u03c3 over the larger of size and reference): {shown}{more}."

@@ -1,7 +1,7 @@
 """Publish the keys of an arm description: their JSON schema for editors, and their reference for people.
 
 Both are made from the models: types, bounds and defaults are pydantic's, words and units those of the docstring under
-each key (`[rad/s]`; `[1]` for numbers without a unit). `python -m ident_service.config.schema` writes both anew.
+each key (`[rad/s]`; `[1]` for numbers without a unit). `python tools/description_reference.py` writes both anew.
 
 The schema is of draft 7, which editors know. No key of it is `required`: a description that `extends` another may leave
 out any, at any depth; `ident config check` knows which are missing.
@@ -143,7 +143,7 @@ def reference() -> str:
             titles[name] += f" {parents[name].partition(' ')[2]}"
     parts = [
         "# Keys of an arm description\n\n"
-        "Made from the models by `python -m ident_service.config.schema`; `ident schema arm` prints the same for "
+        "Made from the models by `python tools/description_reference.py`; `ident schema arm` prints the same for "
         f"editors. A file names that schema in its first line: `{MODELINE}`.\n\n"
         "SI units throughout. Angles may be written as radians (`1.57`), as fractions of pi (`-pi/2`) or in degrees "
         "(`90 deg`). A unit `1` is that of a number without one. A default of `-` is none: the key may be left out.\n"
@@ -270,8 +270,8 @@ def _examples(schema: Mapping[str, Any]) -> dict[tuple[str, str], str]:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Write the schema and the reference into the checkout that this file is of, or where they are asked for."""
-    root = Path(__file__).resolve().parents[2]
-    parser = argparse.ArgumentParser(prog="python -m ident_service.config.schema", description=main.__doc__)
+    root = Path(__file__).resolve().parents[1]
+    parser = argparse.ArgumentParser(prog="python tools/description_reference.py", description=main.__doc__)
     parser.add_argument("schema", nargs="?", type=Path, default=root / "configs" / "ident-arm.schema.json")
     parser.add_argument("page", nargs="?", type=Path, default=root / "docs" / "reference-description.md")
     given = parser.parse_args(words)
