@@ -22,10 +22,20 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog, read_only
+from drivers.arm import (
+    Arm,
+    ArmDescription,
+    Sample,
+    SetupCheck,
+    StopKind,
+    Vector,
+    Watchdog,
+    read_only,
+    require_set_up,
+)
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.can.bus_load import Budget
-from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode
+from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import BusSession
 from drivers.canopen import object_dictionary as od
@@ -405,19 +415,26 @@ class CanopenArm(Arm):
         """Return the load of the buses, see `Arm`."""
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
+    def setup_checks(self) -> tuple[SetupCheck, ...]:
+        """Return a check of each controller of the host that is error-passive or bus-off, see `Arm`."""
+        codecs = self._open().codecs
+        return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
+
     def enable(self) -> None:
         """Energise all drives together with zero torque, through the states of CiA 402.
 
         Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
 
         Raises:
-            DriverError: not open, a drive has a fault, or does not follow in time; only what held the arm still does.
+            DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, or does not
+                follow in time; only what held the arm still does.
         """
         buses = self._open()
         held = hold(buses.drives)
         self._no_torque()
         self._streaming, self._stop = True, StopCommand()
         try:
+            require_set_up(self.setup_checks())
             reports = self._driver.report_delay, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
             buses.forget_modes()

@@ -552,6 +552,20 @@ def test_a_cable_that_slips_shows_in_the_joints_that_its_motor_moves(motor: int,
     assert "rad further than its motors since the arm was opened, 0.05 rad are tolerated" in slipped[0].words
 
 
+def test_a_puck_that_ceases_to_tell_its_joint_encoder_is_told_once_and_anew_to_whoever_enables_the_arm() -> None:
+    bench = encoded()
+    with bench.arm as arm:
+        bench.cycles(3)
+        bench.pucks[1]._joint = None
+        found = [arm.exchange(None).events for _ in range(20)]
+        arm.enable()
+        again = [event for _ in range(5) for event in arm.exchange(NONE).events]
+    told = [(cycle, event) for cycle, events in enumerate(found) for event in events]
+    assert [(cycle, event.code, event.axis) for cycle, event in told] == [(2, AxisEventCode.JOINT_ENCODER_LOST, 1)]
+    assert told[0][1].words == "puck 2 tells its position without that of its joint encoder"
+    assert [event.code for event in again] == [AxisEventCode.JOINT_ENCODER_LOST]
+
+
 def test_an_encoder_that_freezes_at_a_differential_shows_in_the_joints_own() -> None:
     # Both joints seem to move, by their other motor: no position stands still.
     bench = encoded()
