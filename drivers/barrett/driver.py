@@ -144,6 +144,7 @@ _SETTLED = 5  # cycles in a row with everybody's position before an arm counts a
 _AWAKE = 2.0  # s within which they must come
 _TRIES, _AGAIN = 75, 0.001  # s between two tries to stop
 _FAREWELL = 20  # cycles, at most, in which pucks report that they are idle
+_CLOSING = 1.0  # s, at most, in which a stop that the link does not take is sent again before the arm is left
 _RAISED = 0.5  # s that all motors may take to follow the safety puck
 _RESET = 1.0  # s
 _LOWER_EVERY = 5  # cycles between two commands to an arm that is active while nobody drives it
@@ -266,7 +267,8 @@ class BarrettArm(Arm):
             self._checks = setup.checks(found, self._driver)
             self._require_reachable(found)
             if not self._looks:
-                setup.lower(port.link, found)
+                for frame in setup.lowering(found):
+                    port.link.send(frame)
                 setup.limit(port, found, self._driver)
             if not setup.is_zeroed(port, found):
                 raise PositionUnknown(
@@ -412,8 +414,8 @@ class BarrettArm(Arm):
         self.stop(StopKind.TORQUE_OFF)
         if self._bus is not None:
             if not self._looks:
-                for _ in range(_FAREWELL):
-                    if self._is_idle(self._bus):
+                for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
+                    if self._is_idle(self._bus) or (cycle >= _FAREWELL and not self._untold):
                         break
                     with suppress(Exception):
                         self._lower(self._bus)
@@ -528,13 +530,13 @@ class BarrettArm(Arm):
             self._lower(bus)
 
     def _lower(self, bus: PuckBus) -> None:
-        """Send IDLE to everybody; never raises."""
-        try:
-            if self._found is not None:
-                setup.lower(bus.link, self._found)
-            self._untold = False
-        except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
-            self._untold = True
+        """Send IDLE to everybody, every frame on its own; never raises."""
+        self._untold = False
+        for frame in () if self._found is None else setup.lowering(self._found):
+            try:
+                bus.link.send(frame)
+            except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
+                self._untold = True
 
     def _require_reachable(self, found: setup.FoundArm) -> None:
         if lost := setup.unreachable(found):

@@ -336,11 +336,10 @@ def is_zeroed(port: PropertyPort, arm: FoundArm) -> bool:
     return port.read(arm.safety_node, arm.safety, "ZERO") == 1
 
 
-def lower(link: Link, arm: FoundArm) -> None:
-    """Take all pucks out of torque: the motors themselves, and the safety puck, which may only be lowered."""
+def lowering(arm: FoundArm) -> tuple[Frame, Frame]:
+    """Return the frames that take the motors, and the safety puck, which may only be lowered, out of torque."""
     mode = _FIXED.number("MODE")
-    for frame in (put(Group.ALL, mode, Mode.IDLE, group=True), put(arm.safety_node, mode, SafetyMode.IDLE)):
-        link.send(frame)
+    return put(Group.ALL, mode, Mode.IDLE, group=True), put(arm.safety_node, mode, SafetyMode.IDLE)
 
 
 _REST_SECONDS = 0.2
