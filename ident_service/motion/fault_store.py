@@ -32,7 +32,13 @@ _ROOM: Final = 4096  # bytes of the mark for faults: ten and more
 _LONGEST: Final = 300  # characters of a cause there, so that none takes the room of all
 _ENDED: Final = {"ended": True}  # the mark's last line: all faults are stored, the arm is without torque
 _LAST_LINE: Final = 32  # bytes that are kept for it
-_UNREADABLE: Final = (KeyError, TypeError, ValueError, OverflowError, RecursionError)  # what JSON of anybody may lead to
+_UNREADABLE: Final = (
+    KeyError,
+    TypeError,
+    ValueError,
+    OverflowError,
+    RecursionError,
+)  # what JSON of anybody may lead to
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def test_an_arm_that_was_stopped_and_closed_is_enabled_again(kind: StopKind) -> 
 @pytest.mark.parametrize("full", [0.005, 0.14, 0.5])
 @pytest.mark.parametrize("kind", list(StopKind))
 def test_a_transmit_queue_that_is_full_for_a_moment_loses_no_stop(kind: StopKind, full: float) -> None:
-    """For 5 ms, within the tries of a stop, and for longer than these, so that closing goes on with them, for a second."""
+    """For 5 ms, within the tries of a stop, and for longer than these, so that closing goes on with them."""
     config = weightless_config(torque_deadline=1.0)  # the drives' own watchdog does not help
     behind = LockStepArm(config)
     taps = tapped(behind, config)
