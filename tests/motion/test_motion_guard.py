@@ -17,6 +17,7 @@ from ident_service.motion.safety_monitor import (
     FROZEN_CYCLES,
     FROZEN_EFFORT,
     MAX_AGE,
+    NOT_APPLIED,
     SUDDEN_CYCLES,
     SUDDEN_SPEED,
     VELOCITY_OFF,
@@ -394,3 +395,25 @@ def test_an_encoder_that_stops_in_full_motion_is_frozen(joint: int, share: float
         is_fault(fault, "frozen_encoder", joint)
     # A step forgives.
     assert bench.see(HOME + 2e-5, velocity=velocity)[1] is None
+
+
+@pytest.mark.parametrize(("first", "then", "frozen"), [(1.01, 0.0, True), (0.0, 1.01, False)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_what_counts_is_the_motion_in_which_an_encoder_stopped(
+    joint: int, first: float, then: float, frozen: bool
+) -> None:
+    bench, fast = Bench(), SUDDEN_SPEED * LIMITS.velocity * unit(joint)
+    assert bench.see(HOME + 1e-5, velocity=fast)[1] is None
+    faults = [bench.see(HOME + 1e-5, velocity=first * fast)[1]]
+    faults += [bench.see(HOME + 1e-5, velocity=then * fast)[1] for _ in range(SUDDEN_CYCLES - 1)]
+    assert faults[:-1] == [None] * (SUDDEN_CYCLES - 1)
+    assert (faults[-1] is not None) == frozen
+
+
+@pytest.mark.parametrize("joint", [0, 1])
+def test_a_measured_torque_is_compared_after_a_lost_sample_as_before(joint: int) -> None:
+    bench, allowed = Bench(), NOT_APPLIED * LIMITS.torque * unit(joint)
+    bench.see(HOME, valid=(joint != 0, joint != 1), torque_difference=STILL)
+    assert bench.see(HOME, torque_difference=0.99 * allowed)[1] is None
+    bench.see(HOME, valid=(joint != 0, joint != 1), torque_difference=STILL)
+    is_fault(bench.see(HOME, torque_difference=1.01 * allowed)[1], "torque_not_applied", joint)
