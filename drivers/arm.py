@@ -11,7 +11,7 @@ after clipping and quantisation. Sample-to-actuation is therefore exactly one pe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -92,8 +92,8 @@ class Sample:
         position: [rad or m], shape (joints,).
         velocity: measured by the drive [rad/s or m/s], shape (joints,), or None where the drive gives none.
         torque: the torque that acts from this stamp to the next one, clipped and quantised [N m or N], (joints,).
-        valid: which axes answered in this cycle, shape (joints,).
-        age: cycles since each axis answered, shape (joints,); 0 where `valid`.
+        valid: which axes' positions are of this cycle, shape (joints,).
+        age: how many cycles old each position is, shape (joints,); 0 where `valid`.
         lost: frames lost since `open`.
         status: slow per-axis status words, with `status_age` cycles since they were read.
         events: of the bus since the sample before.
@@ -169,6 +169,13 @@ class SetupCheck:
         return f"{self.what} is {self.found}" + ("" if self.good else f", expected {self.expected}")
 
 
+def require_set_up(checks: Iterable[SetupCheck]) -> None:
+    """Raise DriverError, which says what to do, where a value is not the expected one."""
+    if wrong := [one for one in checks if not one.good]:
+        remedies = dict.fromkeys(one.remedy for one in wrong if one.remedy)
+        raise DriverError(". ".join((f"cannot be enabled: {'; '.join(map(str, wrong))}", *remedies)))
+
+
 class Arm(ABC):
     """Define an arm as a context manager: entering opens it, leaving closes it; closing stops torque first."""
 
@@ -237,7 +244,7 @@ class Arm(ABC):
         return None
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the drives of the open arm report of their set-up, compared with the description.
+        """Return what drives and buses of the open arm report of themselves, compared with what they must.
 
         An arm of which one is not `good` refuses to be enabled.
         """

@@ -40,6 +40,7 @@ class AxisEventCode(StrEnum):
     DRIVE_NOTICE = "drive_notice"  # a drive informs of something that is no error
     TORQUE_LIMITED = "torque_limited"  # the drive gives less than it was asked for
     TRANSMISSION_SLIPPED = "transmission_slipped"  # joint and motor have not moved by the same
+    JOINT_ENCODER_LOST = "joint_encoder_lost"  # no encoder guards the joint's cables any more
     STRANGE_FRAME = "strange_frame"  # of an unknown node, of a wrong length, or at a wrong time
 
 

@@ -3,7 +3,8 @@
 A cycle begins with one GET of the position to the whole arm, which every puck answers, and with one or two frames of
 torques right behind it. A puck samples its encoder about 75 us after it was asked, when the first torque frame has just
 passed, so that position and change of torque are of one time, to about 0.15 ms. Positions carry no number: those that
-came before the request are dropped, and one that comes second or late is not used.
+came before the request are dropped, one that comes second or late is not used, and of which request one is that comes
+behind a missing one `drivers/can/answer_order.py` tells.
 
 MODE, STAT and the pendant are asked for beside the cycle, behind its positions, one or a few properties at a time: what
 was asked of the safety puck comes between what was asked of the others. The safety puck watches positions and torques,
@@ -44,9 +45,19 @@ from drivers.barrett.protocol import (
     torque_frame,
 )
 from drivers.barrett.setup import TIMEOUT
+from drivers.can.answer_order import AnswerOrder
 from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, mean_bits, shares, worst
 from drivers.can.bus_state import HOST as BUS
-from drivers.can.bus_state import MILD, ControllerState, Event, EventCode, controller_state, error_words, overflowed
+from drivers.can.bus_state import (
+    LEFT_NORMAL,
+    MILD,
+    ControllerState,
+    Event,
+    EventCode,
+    controller_state,
+    error_words,
+    overflowed,
+)
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from ident_service.config.barrett import BarrettDriver
@@ -71,7 +82,8 @@ class MotorPuck:
         position: of the last answer [counts], as a signed number of 22 bits.
         encoder: of the last answer, the joint encoder's position [counts], likewise; None where it has told none.
         answered: in this cycle.
-        age: cycles since it answered, 0 in a cycle in which it did.
+        age: cycles since the request that `position` is of, 0 where that is the latest one.
+        order: which request an answer is of.
         mode: MODE; None while unknown.
         stat: STAT; None while unknown.
         status_age: cycles since the last answer about MODE.
@@ -82,6 +94,7 @@ class MotorPuck:
     encoder: int | None = None
     answered: bool = False
     age: int = 0
+    order: AnswerOrder = field(default_factory=AnswerOrder)
     mode: int | None = None
     stat: int | None = None
     status_age: int = 0
@@ -105,19 +118,21 @@ class PuckCodec:
     Attributes:
         pucks: the motor pucks, in the arm's order.
         safety: the safety puck.
+        controller: state of the host's CAN controller.
         late: positions that came outside a cycle, or second in one.
         unexplained: cycles since an arm was seen to leave ACTIVE while the pendant has not said why; None for no such.
     """
 
-    def __init__(self, driver: BarrettDriver, motors: Properties, safety: Properties) -> None:
+    def __init__(self, driver: BarrettDriver, motors: Properties, safety: Properties, period: float) -> None:
         """Start with pucks of unknown state.
 
         Args:
             driver: the section `driver`.
             motors: properties by which all motor pucks are asked.
             safety: the safety puck's.
+            period: of a cycle [s].
         """
-        self.pucks = tuple(MotorPuck(puck.node) for puck in driver.pucks)
+        self.pucks = tuple(MotorPuck(puck.node, order=AnswerOrder(period)) for puck in driver.pucks)
         self.safety = SafetyPuck(driver.safety_node)
         self.late = 0
         self.unexplained: int | None = None
@@ -133,7 +148,7 @@ class PuckCodec:
         ]
         self._slots = [(group, members) for group, members in self._slots if members]
         self._by_node = {puck.node: puck for puck in self.pucks}
-        self._open, self._missing = False, len(self.pucks)
+        self._open, self._missing, self._now_ns = False, len(self.pucks), 0
         self._events: list[Event] = []
         self._told: set[int] = set()
 
@@ -170,9 +185,14 @@ class PuckCodec:
                 frames.append(mode)
         return [*frames, pendant]
 
-    def begin_cycle(self) -> None:
-        """Open a cycle after positions have been asked for: from now on each puck may answer once."""
-        self._open, self._missing = True, len(self.pucks)
+    def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
+        """Open a cycle after positions have been asked for: from now on each puck may answer once.
+
+        Args:
+            now_ns: when they were [ns of the link's clock].
+            asks: whether they were at all.
+        """
+        self._open, self._now_ns, self._missing = True, now_ns, len(self.pucks)
         self.safety.status_age += 1
         if self.unexplained is not None:
             self.unexplained += 1
@@ -180,10 +200,20 @@ class PuckCodec:
             puck.answered = False
             puck.age += 1
             puck.status_age += 1
+            puck.order.behind += asks
 
     def end_cycle(self) -> None:
         """Close the cycle at its deadline: answers from now on are late."""
         self._open = False
+        for puck in self.pucks if self._missing else ():
+            if not puck.order.uncertain:
+                continue
+            if puck.order.settle():
+                puck.answered, puck.age = True, 0
+                self._missing -= 1
+            else:
+                self.late += 1
+                self._tell(EventCode.LATE, puck.node, f"its position is {puck.age} cycles old")
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call, oldest first, and forget them."""
@@ -191,9 +221,11 @@ class PuckCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard the events so far; nodes that still disturb the bus report anew."""
+        """Discard the events so far; what still ails the bus is reported anew."""
         self._events = []
         self._told.clear()
+        if self.controller in LEFT_NORMAL:
+            self._tell_controller()
 
     def receive(self, frame: Frame) -> None:
         """Take one frame, whatever it is; never raises."""
@@ -204,23 +236,28 @@ class PuckCodec:
             return
         answer = decoded(frame)
         if isinstance(answer, Position):
-            self._on_position(answer)
+            self._on_position(answer, frame.stamp_ns)
         elif isinstance(answer, Reply):
             self._on_reply(answer)
         else:
             self._on_other(frame)
 
-    def _on_position(self, answer: Position) -> None:
+    def _on_position(self, answer: Position, stamp_ns: int) -> None:
         puck = self._by_node.get(answer.node)
         if puck is None:
             self._tell_once(answer.node, EventCode.STRANGER, "a position of a puck that is not ours")
-        elif not self._open or puck.answered:
+        elif not self._open:
             self.late += 1
-            words = "a second position in one cycle" if self._open else "its position came after its cycle"
-            self._tell(EventCode.DUPLICATE if self._open else EventCode.LATE, puck.node, words)
+            puck.order.take_late()
+            self._tell(EventCode.LATE, puck.node, "its position came after its cycle")
+        elif (age := puck.order.take(stamp_ns - self._now_ns if stamp_ns else None)) is None:
+            self.late += 1
+            self._tell(EventCode.DUPLICATE, puck.node, "a second position in one cycle")
         else:
-            puck.position, puck.encoder, puck.answered, puck.age = answer.counts, answer.encoder, True, 0
-            self._missing -= 1
+            puck.position, puck.encoder, puck.age = answer.counts, answer.encoder, age
+            if age == 0:
+                puck.answered = True
+                self._missing -= 1
 
     def _on_reply(self, answer: Reply) -> None:
         if (puck := self._by_node.get(answer.node)) is not None:
@@ -272,12 +309,15 @@ class PuckCodec:
     def _on_error(self, frame: Frame) -> None:
         before, self.controller = self.controller, controller_state(frame, self.controller)
         if self.controller is not before:
-            words = f"the host's CAN controller is {self.controller.name.lower().replace('_', '-')}"
-            self._tell(_CONTROLLER.get(self.controller, EventCode.CONTROLLER), BUS, words)
+            self._tell_controller()
         if overflowed(frame):
             self._tell(EventCode.OVERFLOW, BUS, "frames were lost in the host's CAN controller")
         if words := error_words(frame):
             self._tell(EventCode.BUS_ERROR, BUS, words)
+
+    def _tell_controller(self) -> None:
+        words = f"the host's CAN controller is {self.controller.name.lower().replace('_', '-')}"
+        self._tell(_CONTROLLER.get(self.controller, EventCode.CONTROLLER), BUS, words)
 
     def _tell_once(self, what: int, code: EventCode, words: str) -> None:
         if what not in self._told:
@@ -383,7 +423,7 @@ class PuckBus:
             for frame in torques:
                 link.send(frame)
         self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
-        codec.begin_cycle()
+        codec.begin_cycle(stamp_ns, asks=not silent)
         deadline = max(begin_ns + round(_RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         while not codec.complete:
             answer = link.receive(deadline)
@@ -396,6 +436,13 @@ class PuckBus:
             self.lost += sum(not puck.answered for puck in codec.pucks)
         self._ask(asks_safety)
         return stamp_ns
+
+    def answers_late(self) -> bool:
+        """Leave out a request; return whether positions came all the same: answers are of a request before."""
+        before = self.codec.late
+        self._next_ns = (self._next_ns or 0) + self._period_ns
+        self.cycle(None)
+        return self.codec.late > before
 
     def _require_inactive(self) -> None:
         """Raise DriverError unless the safety puck says, now, that the arm is not active."""

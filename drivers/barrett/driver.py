@@ -20,13 +20,23 @@ from typing import Final
 
 import numpy as np
 
-from drivers.arm import Arm, ArmDescription, Sample, SetupCheck, StopKind, Vector, Watchdog, read_only
+from drivers.arm import (
+    Arm,
+    ArmDescription,
+    Sample,
+    SetupCheck,
+    StopKind,
+    Vector,
+    Watchdog,
+    read_only,
+    require_set_up,
+)
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
 from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
-from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode
+from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import BusSession
 from drivers.clock import Clock, RealClock, VirtualClock
@@ -59,7 +69,7 @@ class JointEncoders:
         self._motors_of = coordinates.motors_of
         self._counts: dict[int, int] = {}
         self._origin: dict[int, float] = {}
-        self._beyond = dict.fromkeys(self._radians, 0)
+        self.forget_told()
         self._position = np.full(len(names), np.nan)
 
     def checks(self, pucks: Sequence[MotorPuck]) -> tuple[SetupCheck, ...]:
@@ -83,14 +93,15 @@ class JointEncoders:
         for k in self._radians:
             self._counts[k] = pucks[k].encoder or 0
             self._origin[k] = float(position[k]) - self._counts[k] * self._radians[k]
-            self._beyond[k] = 0
+        self.forget_told()
 
     def forget_told(self) -> None:
-        """Tell of joints that are still apart from their motors anew: of an idle arm nobody may have acted upon it."""
+        """Tell anew of what has not changed: of an idle arm nobody may have acted upon it."""
         self._beyond = dict.fromkeys(self._radians, 0)
+        self._without = dict.fromkeys(self._radians, 0)
 
     def update(self, pucks: Sequence[MotorPuck], position: Vector) -> tuple[Vector | None, list[AxisEvent]]:
-        """Return joint positions by the encoders, and an event of each joint that has come apart from its motors.
+        """Return joint positions by the encoders, and an event of each joint whose cables they no longer guard.
 
         Args:
             pucks: at the end of a cycle.
@@ -98,7 +109,7 @@ class JointEncoders:
 
         Returns:
             Positions by the encoders [rad], shape (joints,), NaN for joints without one; None for an arm without any.
-            And an event of each joint that has come apart from its motors.
+            And an event of each joint that has come apart from its motors, or whose puck tells its encoder no more.
         """
         if not self._radians:
             return None, []
@@ -106,7 +117,12 @@ class JointEncoders:
         for k, radians in self._radians.items():
             encoder = pucks[k].encoder
             if encoder is None:
+                self._without[k] += pucks[k].answered
+                if self._without[k] == _CYCLES and pucks[k].answered:
+                    words = f"puck {pucks[k].node} tells its position without that of its joint encoder"
+                    told.append(AxisEvent(AxisEventCode.JOINT_ENCODER_LOST, k, words))
                 continue
+            self._without[k] = 0
             self._counts[k] = unwrapped(self._counts[k], encoder, POSITION_BITS)
             found[k] = self._counts[k] * radians + self._origin[k]
             if not all(pucks[motor].answered for motor in (*self._motors_of[k], k)):
@@ -128,6 +144,7 @@ _SETTLED = 5  # cycles in a row with everybody's position before an arm counts a
 _AWAKE = 2.0  # s within which they must come
 _TRIES, _AGAIN = 75, 0.001  # s between two tries to stop
 _FAREWELL = 20  # cycles, at most, in which pucks report that they are idle
+_CLOSING = 1.0  # s, at most, in which a stop that the link does not take is sent again before the arm is left
 _RAISED = 0.5  # s that all motors may take to follow the safety puck
 _RESET = 1.0  # s
 _LOWER_EVERY = 5  # cycles between two commands to an arm that is active while nobody drives it
@@ -250,18 +267,20 @@ class BarrettArm(Arm):
             self._checks = setup.checks(found, self._driver)
             self._require_reachable(found)
             if not self._looks:
-                setup.lower(port.link, found)
+                for frame in setup.lowering(found):
+                    port.link.send(frame)
                 setup.limit(port, found, self._driver)
             if not setup.is_zeroed(port, found):
                 raise PositionUnknown(
                     f"{self._config.name} has not been zeroed since its pucks have power (ZERO is 0): lead it home by "
                     "hand, then `ident set-home ARM`"
                 )
-            codec = PuckCodec(self._driver, found.motors, found.safety)
+            codec = PuckCodec(self._driver, found.motors, found.safety, self._period_ns * 1e-9)
             self._bus = PuckBus(port.link, codec, self._driver, self._period_ns)
             self._bus.looks = self._looks
             if not self._looks:
                 setup.ignore_jumps(port, found)
+            codec.controller = port.controller
             self._begin(self._bus)
         except BaseException:
             self.close()
@@ -290,8 +309,8 @@ class BarrettArm(Arm):
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
     def setup_checks(self) -> tuple[SetupCheck, ...]:
-        """Return what the pucks report of themselves, see `Arm`."""
-        return self._checks
+        """Return what the pucks report of themselves, and the host's controller that cannot be used, see `Arm`."""
+        return self._checks + controller_checks(self._driver.bus.channel, self._require_open().codec.controller)
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
         """Return the safety puck's watch over every puck, see `Arm`."""
@@ -319,8 +338,7 @@ class BarrettArm(Arm):
         self._require_driven()
         self._no_torque()
         try:
-            if wrong := [str(one) for one in self._checks if not one.good]:
-                raise DriverError(f"cannot be enabled: {'; '.join(wrong)}")
+            require_set_up(self.setup_checks())
             self._require_sound()
             if not self._enabled:
                 self._wait_until_active(bus)
@@ -396,8 +414,8 @@ class BarrettArm(Arm):
         self.stop(StopKind.TORQUE_OFF)
         if self._bus is not None:
             if not self._looks:
-                for _ in range(_FAREWELL):
-                    if self._is_idle(self._bus):
+                for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
+                    if self._is_idle(self._bus) or (cycle >= _FAREWELL and not self._untold):
                         break
                     with suppress(Exception):
                         self._lower(self._bus)
@@ -430,6 +448,8 @@ class BarrettArm(Arm):
                 raise DriverError(f"pucks {', '.join(map(str, bad)) or 'of all kinds'} do not answer in time")
             bus.cycle(None)
             settled = settled + 1 if bus.complete else 0
+            if settled == _SETTLED and bus.answers_late():
+                settled = 0
         nearest = zip(self._coordinates.zero, bus.codec.pucks, strict=True)
         self._unwrapped = [zero + puck.position for zero, puck in nearest]  # 22 bits are 512 turns: no arm wraps
         self._checks += self._joint_encoders.checks(bus.codec.pucks)
@@ -510,13 +530,13 @@ class BarrettArm(Arm):
             self._lower(bus)
 
     def _lower(self, bus: PuckBus) -> None:
-        """Send IDLE to everybody; never raises."""
-        try:
-            if self._found is not None:
-                setup.lower(bus.link, self._found)
-            self._untold = False
-        except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
-            self._untold = True
+        """Send IDLE to everybody, every frame on its own; never raises."""
+        self._untold = False
+        for frame in () if self._found is None else setup.lowering(self._found):
+            try:
+                bus.link.send(frame)
+            except Exception:  # noqa: BLE001 - whatever the link died of, it is tried again
+                self._untold = True
 
     def _require_reachable(self, found: setup.FoundArm) -> None:
         if lost := setup.unreachable(found):

@@ -43,6 +43,7 @@ from drivers.barrett.protocol import (
     get,
     put,
 )
+from drivers.can.bus_state import ControllerState, controller_state
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
 from drivers.motor_units import Coordinates, Vector
@@ -63,12 +64,17 @@ DEFAULT_IPNM: Final = 2700  # libbarrett's, of firmware that has none to tell
 
 
 class PropertyPort:
-    """Read and write single properties over an open link, while nothing streams."""
+    """Read and write single properties over an open link, while nothing streams.
+
+    Attributes:
+        controller: state of the host's CAN controller, as far as it was heard.
+    """
 
     def __init__(self, link: Link) -> None:
         """Use an open link, which stays open."""
         self.link = link
         self.clock = link.clock
+        self.controller = ControllerState.ACTIVE
 
     def ask(self, node: int, number: int) -> int | None:
         """Return the value of a property; None where no answer comes within a few tries.
@@ -80,7 +86,7 @@ class PropertyPort:
         for _ in range(_TRIES):
             self.link.send(get(node, number))
             until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
-            while (frame := self.link.receive(until_ns)) is not None:
+            while (frame := self._received(until_ns)) is not None:
                 answer = decoded(frame)
                 if isinstance(answer, Reply) and (answer.node, answer.number) == (node, number):
                     return answer.value
@@ -109,7 +115,7 @@ class PropertyPort:
         self.link.send(get(Group.ARM, properties.number("P"), group=True))
         wanted, found = set(nodes), dict[int, int]()
         until_ns = self.clock.now_ns() + round(TIMEOUT * 1e9)
-        while wanted - set(found) and (frame := self.link.receive(until_ns)) is not None:
+        while wanted - set(found) and (frame := self._received(until_ns)) is not None:
             if isinstance(answer := decoded(frame), Position) and answer.node in wanted:
                 found[answer.node] = answer.counts
         return found
@@ -121,14 +127,31 @@ class PropertyPort:
     def listen(self) -> None:
         """Listen whether another host talks to pucks; raises DriverError where one does. Nothing is sent."""
         self.pause(_HUSH)
-        self.link.drain()
+        self._drained()
         self.pause(_LISTEN)
-        others = [one for one in self.link.drain() if _of_a_host(one)]
+        others = [one for one in self._drained() if _of_a_host(one)]
         if others:
             raise DriverError(
                 f"somebody else sends frames {others[0].identifier:03X}h on this bus: another program or device drives "
                 "this arm"
             )
+
+    def _received(self, until_ns: int) -> Frame | None:
+        """Return the next frame, None when there is none until this time [ns]."""
+        frame = self.link.receive(until_ns)
+        self._hear(() if frame is None else (frame,))
+        return frame
+
+    def _drained(self) -> Sequence[Frame]:
+        """Return all frames that have been received and not returned yet."""
+        frames = self.link.drain()
+        self._hear(frames)
+        return frames
+
+    def _hear(self, frames: Sequence[Frame]) -> None:
+        for frame in frames:
+            if frame.error:
+                self.controller = controller_state(frame, self.controller)
 
 
 def _of_a_host(frame: Frame) -> bool:
@@ -312,11 +335,10 @@ def is_zeroed(port: PropertyPort, arm: FoundArm) -> bool:
     return port.read(arm.safety_node, arm.safety, "ZERO") == 1
 
 
-def lower(link: Link, arm: FoundArm) -> None:
-    """Take all pucks out of torque: the motors themselves, and the safety puck, which may only be lowered."""
+def lowering(arm: FoundArm) -> tuple[Frame, Frame]:
+    """Return the frames that take the motors, and the safety puck, which may only be lowered, out of torque."""
     mode = _FIXED.number("MODE")
-    for frame in (put(Group.ALL, mode, Mode.IDLE, group=True), put(arm.safety_node, mode, SafetyMode.IDLE)):
-        link.send(frame)
+    return put(Group.ALL, mode, Mode.IDLE, group=True), put(arm.safety_node, mode, SafetyMode.IDLE)
 
 
 _REST_SECONDS = 0.2

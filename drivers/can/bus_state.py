@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Literal
 
+from drivers.arm import SetupCheck
 from drivers.axis_status import AxisEventCode
 from drivers.can.can_frame import Frame
 from ident_service.errors import DriverError
@@ -138,6 +139,26 @@ def controller_state(frame: Frame, before: ControllerState) -> ControllerState:
     if detail & _WARNING:
         return ControllerState.WARNING
     return ControllerState.ACTIVE if detail & _ACTIVE else before
+
+
+LEFT_NORMAL = {ControllerState.PASSIVE: "error-passive", ControllerState.BUS_OFF: "bus-off"}
+"""States in which nothing may be moved, in words: such a controller's frames are destroyed by others, or not sent."""
+
+
+def controller_checks(channel: str, state: ControllerState) -> tuple[SetupCheck, ...]:
+    """Return the check of a host's controller that is error-passive or bus-off; none of any other.
+
+    Args:
+        channel: of the bus, as it is configured.
+        state: of the host's controller on it.
+    """
+    if state not in LEFT_NORMAL:
+        return ()
+    remedy = (
+        f"Check termination, connectors, cable and bit rate of every node on {channel}, and that drives have power; "
+        f"then bring the interface down and up (`ip -details link show {channel}` tells its state)."
+    )
+    return (SetupCheck(f"the host's CAN controller on {channel}", LEFT_NORMAL[state], "error-active", remedy),)
 
 
 def overflowed(frame: Frame) -> bool:

@@ -21,7 +21,7 @@ import can
 
 from drivers.can.bus_state import BusError, BusOffWatch, Kind, kind_of
 from drivers.can.can_frame import MOST_AT_ONCE, RECEIVE_FILTER, Frame, check_sendable
-from drivers.can.socketcan_link import check_interface
+from drivers.can.socketcan_link import check_interface, controller_state_frame
 from drivers.clock import RealClock
 from ident_service.config.arm import ArmConfig
 from ident_service.config.can_bus import CanBus
@@ -50,6 +50,8 @@ def from_config(config: ArmConfig, bus_number: int) -> PythonCanLink:
     try:
         # The kernel's error of an interface that is down waits, and so do frames that came before the filters.
         link.drain()
+        if bus.interface == _KERNELS and (state := controller_state_frame(bus.channel)) is not None:
+            link.hear(state)
     except BaseException:
         link.close()
         raise
@@ -166,6 +168,11 @@ class PythonCanLink:
             if (frame := self._frame(message)) is not None:
                 frames.append(frame)
         return frames
+
+    def hear(self, frame: Frame) -> None:
+        """Let a frame be the next to be received: what the kernel tells of the controller beside the socket."""
+        self._watch.observe(frame)
+        self._waiting.append(frame._replace(stamp_ns=time.monotonic_ns()))
 
     def close(self) -> None:
         """Shut the bus down."""

@@ -1,5 +1,9 @@
 """Use a CAN socket of the kernel without python-can (interface `raw`), and ask the kernel about its interfaces.
 
+Error frames tell changes of a controller's state only. What it is when a link is opened the kernel tells by rtnetlink,
+as `ip -details link show` does (linux/rtnetlink.h, linux/if_link.h, linux/can/netlink.h); drivers of adapters that are
+no network interfaces do not tell it.
+
 One system call a frame. Stamps are the kernel's, taken when the frame arrived, turned from wall-clock to monotonic time
 by their age. Frames that the kernel dropped are reported as an error frame of receive overflow.
 """
@@ -12,12 +16,22 @@ import os
 import select
 import socket
 import struct
+import sys
 import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 
-from drivers.can.bus_state import CONTROLLER, RX_OVERFLOW, BusError, BusOffWatch, kind_of
+from drivers.can.bus_state import (
+    BUS_OFF,
+    CONTROLLER,
+    PASSIVE_RX,
+    PASSIVE_TX,
+    RX_OVERFLOW,
+    BusError,
+    BusOffWatch,
+    kind_of,
+)
 from drivers.can.can_frame import (
     EXTENDED,
     FD_BYTES,
@@ -61,6 +75,60 @@ def check_interface(bus: CanBus) -> None:
         raise BusError("refused", bus.channel, remedy=remedy)
 
 
+_NETLINK_ROUTE, _GET_LINK, _NEW_LINK, _IS_REQUEST = 0, 18, 16, 1
+_HEADER, _LINK, _ATTRIBUTE = struct.Struct("=IHHII"), struct.Struct("=BxHiII"), struct.Struct("=HH")
+_LINK_INFO, _INFO_DATA, _CAN_STATE, _TYPE = 18, 2, 4, 0x3FFF  # attributes, and the bits that are an attribute's type
+_MOST_BYTES, _PATIENCE = 1 << 16, 0.5  # s that the kernel may take to answer
+# enum can_state; an interface that is stopped or asleep says so when it is used.
+_STATES = {
+    2: Frame(CONTROLLER, bytes((0, PASSIVE_TX | PASSIVE_RX)) + bytes(6), error=True),
+    3: Frame(BUS_OFF, bytes(8), error=True),
+}
+
+
+def controller_state_frame(channel: str) -> Frame | None:
+    """Return the error frame that tells the present state of an interface's controller, None where all is well.
+
+    Args:
+        channel: name of the interface.
+
+    Returns:
+        An error frame if the controller is error-passive or bus-off; None for any other state, and where the kernel
+        knows none, as of virtual interfaces.
+    """
+    try:
+        request = _LINK.pack(0, 0, socket.if_nametoindex(channel), 0, 0)
+        with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETLINK_ROUTE) as sock:
+            sock.settimeout(_PATIENCE)
+            sock.send(_HEADER.pack(_HEADER.size + len(request), _GET_LINK, _IS_REQUEST, 1, 0) + request)
+            answer = sock.recv(_MOST_BYTES)
+    except OSError:  # the link itself says what is wrong with its interface
+        return None
+    return state_in_link_message(answer)
+
+
+def state_in_link_message(message: bytes) -> Frame | None:
+    """Return the error frame for the state of a controller in an answer of rtnetlink; see `controller_state_frame`."""
+    if len(message) < _HEADER.size or _HEADER.unpack_from(message)[1] != _NEW_LINK:
+        return None
+    found = message[_HEADER.size + _LINK.size :]
+    for wanted in (_LINK_INFO, _INFO_DATA, _CAN_STATE):
+        found = _attributes(found).get(wanted, b"")
+    return _STATES.get(int.from_bytes(found, sys.byteorder)) if len(found) == 4 else None
+
+
+def _attributes(data: bytes) -> dict[int, bytes]:
+    """Return attributes of netlink by their type; each begins at a multiple of 4 bytes."""
+    found = {}
+    while len(data) >= _ATTRIBUTE.size:
+        length, kind = _ATTRIBUTE.unpack_from(data)
+        if length < _ATTRIBUTE.size:
+            break
+        found[kind & _TYPE] = data[_ATTRIBUTE.size : length]
+        data = data[(length + 3) & ~3 :]
+    return found
+
+
 def _largest_packet(channel: str) -> int:
     """Return the largest packet of an interface [bytes]; raises OSError where the kernel does not say."""
     with socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW) as sock:
@@ -93,7 +161,10 @@ def from_config(config: ArmConfig, bus_number: int) -> RawLink:
         raise DriverError(f"driver.buses.{bus_number}.options: interface raw has none, found {', '.join(bus.options)}")
     check_interface(bus)
     fd = bus.data_bitrate is not None
-    return RawLink(open_socket(bus.channel, bus.bitrate, fd=fd), bus.channel, bus.bitrate, fd=fd)
+    link = RawLink(open_socket(bus.channel, bus.bitrate, fd=fd), bus.channel, bus.bitrate, fd=fd)
+    if (state := controller_state_frame(bus.channel)) is not None:
+        link.hear(state)
+    return link
 
 
 def open_socket(channel: str, bitrate: int = 1_000_000, *, fd: bool = False) -> socket.socket:
@@ -200,6 +271,11 @@ class RawLink:
         frames = tuple(self._waiting)
         self._waiting.clear()
         return frames
+
+    def hear(self, frame: Frame) -> None:
+        """Let a frame be the next to be received: what the kernel tells of the controller beside the socket."""
+        self._watch.observe(frame)
+        self._waiting.append(frame._replace(stamp_ns=time.monotonic_ns()))
 
     def close(self) -> None:
         """Close the socket."""

@@ -1,7 +1,8 @@
 """Drive an arm of CANopen drives in cyclic synchronous torque mode.
 
 A transmit queue that is full for a moment, or one bus of two that has failed, must not lose the stop of any drive. The
-drives' own deadline for torque frames comes before the last try, so that nobody waits for this.
+drives' own deadline for torque frames comes before the last try, so that nobody waits for this. Closing goes on with it
+for a second.
 
 A drive's torque follows its command within a millisecond or two, and many drives average what they report over some
 more. So a measured torque is compared with all that the drive was told within the last `WINDOW`. Only what lies outside
@@ -22,10 +23,20 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind, Vector, Watchdog, read_only
+from drivers.arm import (
+    Arm,
+    ArmDescription,
+    Sample,
+    SetupCheck,
+    StopKind,
+    Vector,
+    Watchdog,
+    read_only,
+    require_set_up,
+)
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.can.bus_load import Budget
-from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode
+from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
 from drivers.can.frame_log import BusSession
 from drivers.canopen import object_dictionary as od
@@ -56,7 +67,7 @@ from ident_service.config.canopen import CanopenDriver
 from ident_service.errors import DriverError, PositionUnknown
 
 _TRIES, _AGAIN = 75, 0.001  # s between them
-_BRAKING = 1.0  # s that drives may take for a quick stop before the arm is left to them
+_BRAKING = 1.0  # s that drives may take for a quick stop, or a link for a stop, before the arm is left to its drives
 _FAREWELL = 5  # cycles after the last control words, in which drives report that they are off
 _ENDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
 
@@ -93,14 +104,14 @@ class StopCommand:
                 self._untold.append(number)
 
     def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
-        """Return the torques to send: zero, or None for no torque frames before all drives were told to brake.
+        """Return the torques to send: zero, or None for no torque frames before all drives were told to stop.
 
-        By zero torque alone an arm without brakes would fall.
+        By zero torque alone an arm would fall, whose drives or brakes are to hold it.
 
         Args:
             zero: torque of every drive [per mille of rated torque].
         """
-        return None if self.braking and self._untold else zero
+        return None if self._untold else zero
 
     def wait_until_off(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
         """Cycle until the drives report that they are off, or have had their time; a lost command is sent again.
@@ -115,10 +126,10 @@ class StopCommand:
             with suppress(Exception):  # of one cycle: the next one may be possible
                 buses.cycle(None if zero is None else self.counts(zero))
             brakes = self.braking and any(drive.state in _ENDING for drive in buses.drives)
+            if cycle >= _FAREWELL and not brakes and not self._untold:
+                break
             if brakes and cycle % _FAREWELL == 0:
                 self._untold = list(range(len(buses.drives)))  # what was sent may have been lost
-            if cycle >= _FAREWELL and not brakes:
-                break
         self._untold = []
 
 
@@ -405,19 +416,26 @@ class CanopenArm(Arm):
         """Return the load of the buses, see `Arm`."""
         return budget(self._driver, self._config.control.rate if rate is None else rate)
 
+    def setup_checks(self) -> tuple[SetupCheck, ...]:
+        """Return a check of each controller of the host that is error-passive or bus-off, see `Arm`."""
+        codecs = self._open().codecs
+        return tuple(one for codec in codecs for one in controller_checks(codec.profile.bus.channel, codec.controller))
+
     def enable(self) -> None:
         """Energise all drives together with zero torque, through the states of CiA 402.
 
         Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
 
         Raises:
-            DriverError: not open, a drive has a fault, or does not follow in time; only what held the arm still does.
+            DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, or does not
+                follow in time; only what held the arm still does.
         """
         buses = self._open()
         held = hold(buses.drives)
         self._no_torque()
         self._streaming, self._stop = True, StopCommand()
         try:
+            require_set_up(self.setup_checks())
             reports = self._driver.report_delay, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
             buses.forget_modes()

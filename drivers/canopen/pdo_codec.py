@@ -2,7 +2,8 @@
 
 Cycle: torque frames and SYNC go out, `begin_cycle` opens it, the frames that are received go through `receive`, and
 `end_cycle` closes it. A drive answers once a cycle: a second position is a duplicate, one outside a cycle is late, and
-neither is used. What must not be missed is reported as events (`take_events`), in words and with a code for the guard.
+neither is used. One that comes behind a missing one may be of an earlier SYNC (`drivers/can/answer_order.py`). What
+must not be missed is reported as events (`take_events`), in words and with a code for the guard.
 
 There is no I/O, no clock and no decision here. `receive` takes any frame and never raises; nothing that is received
 changes a torque. This runs in every cycle: `struct` and one look-up by identifier, no arrays.
@@ -16,8 +17,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axis_status import AxisStatus
+from drivers.can.answer_order import AnswerOrder
 from drivers.can.bus_state import (
     HOST,
+    LEFT_NORMAL,
     MILD,
     ControllerState,
     Event,
@@ -82,10 +85,11 @@ class Drive:
         position: of the last answer [counts], as a signed number of 32 bits that wraps around.
         seen: whether it has ever answered.
         answered: in this cycle.
-        age: cycles since it answered, 0 in a cycle in which it did.
+        age: cycles since the SYNC that `position` is of, 0 where that is the latest one.
+        order: which SYNC an answer is of.
         answers: positions that were accepted.
         duplicates: positions that came second in a cycle.
-        late: positions that came outside a cycle.
+        late: positions that came outside of the cycle that they are of.
         status: the last status word (6041h), None before the first.
         torque: the last one that it measured [per mille of rated torque] (6077h).
         torques: how often that was told.
@@ -102,6 +106,7 @@ class Drive:
     seen: bool = False
     answered: bool = False
     age: int = 0
+    order: AnswerOrder = field(default_factory=AnswerOrder)
     answers: int = 0
     duplicates: int = 0
     late: int = 0
@@ -182,7 +187,7 @@ class BusCodec:
     def __init__(self, profile: BusProfile) -> None:
         self.profile = profile
         self.asked = {od.STATUS_WORD.key}
-        self.drives = tuple(Drive(node) for node in profile.nodes)
+        self.drives = tuple(Drive(node, order=AnswerOrder(1.0 / profile.rate)) for node in profile.nodes)
         self.controller = ControllerState.ACTIVE
         self.counters = Counters()
         self._open = False
@@ -259,21 +264,32 @@ class BusCodec:
         """Return the frame with an NMT command for one node, or for all (0)."""
         return Frame(NMT, bytes([command, node]))
 
-    def begin_cycle(self, now_ns: int = 0) -> None:
+    def begin_cycle(self, now_ns: int = 0, *, asks: bool = True) -> None:
         """Open a cycle after SYNC has been sent: from now on each drive may answer once.
 
         Args:
             now_ns: time of SYNC [ns of the link's clock], for frames without a stamp.
+            asks: whether SYNC has been sent in it at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.drives)
         for drive in self.drives:
             drive.answered = False
             drive.age += 1
             drive.status_age += 1
+            drive.order.behind += asks
 
     def end_cycle(self) -> None:
         """Close the cycle at its deadline: answers from now on are late."""
         self._open = False
+        for drive in self.drives if self._missing else ():
+            if not drive.order.uncertain:
+                continue
+            if drive.order.settle():
+                drive.answered, drive.age = True, 0
+                self._missing -= 1
+            else:
+                drive.late += 1
+                self._tell(EventCode.LATE, drive.node, f"its position is {drive.age} cycles old")
 
     @property
     def complete(self) -> bool:
@@ -297,10 +313,12 @@ class BusCodec:
         return taken
 
     def forget_events(self) -> None:
-        """Discard the events so far, expected or reported otherwise; nodes that still disturb the bus report anew."""
+        """Discard the events so far, expected or reported otherwise; what still ails the bus is reported anew."""
         self._events = []
         self._strangers.clear()
         self._foreign.clear()
+        if self.controller in LEFT_NORMAL:
+            self._tell_controller()
 
     def receive(self, frame: Frame) -> None:
         """Take one frame, whatever it is; never raises."""
@@ -322,8 +340,9 @@ class BusCodec:
             self._wrong_length(drive, frame, "position", self._position_bytes)
         elif not self._open:
             drive.late += 1
+            drive.order.take_late()
             self._tell(EventCode.LATE, drive.node, "its position came after its cycle")
-        elif drive.answered:
+        elif (age := drive.order.take(frame.stamp_ns - self._now_ns if frame.stamp_ns else None)) is None:
             drive.duplicates += 1
             self._tell(EventCode.DUPLICATE, drive.node, "a second position in one cycle")
         else:
@@ -334,10 +353,12 @@ class BusCodec:
                     drive.torque, drive.torques = values[-1], drive.torques + 1
                 if self._tells_status:
                     self._take_status(drive, values[1])
-            drive.seen = drive.answered = True
-            self._missing -= 1
-            drive.age = 0
+            drive.seen = True
+            drive.age = age
             drive.answers += 1
+            if age == 0:
+                drive.answered = True
+                self._missing -= 1
 
     def _on_status(self, drive: Drive, frame: Frame) -> None:
         if len(frame.data) != self._reports.size:
@@ -434,12 +455,15 @@ class BusCodec:
         self.counters.errors += 1
         before, self.controller = self.controller, controller_state(frame, self.controller)
         if self.controller is not before:
-            words = f"the host's CAN controller is {self.controller.name.lower().replace('_', '-')}"
-            self._tell(_CONTROLLER.get(self.controller, EventCode.CONTROLLER), HOST, words)
+            self._tell_controller()
         if overflowed(frame):
             self._tell(EventCode.OVERFLOW, HOST, "frames were lost in the host's CAN controller")
         if words := error_words(frame):
             self._tell(EventCode.BUS_ERROR, HOST, words)
+
+    def _tell_controller(self) -> None:
+        words = f"the host's CAN controller is {self.controller.name.lower().replace('_', '-')}"
+        self._tell(_CONTROLLER.get(self.controller, EventCode.CONTROLLER), HOST, words)
 
     def _wrong_length(self, drive: Drive, frame: Frame, what: str, length: int) -> None:
         self.counters.wrong_length += 1

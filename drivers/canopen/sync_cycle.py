@@ -2,7 +2,7 @@
 
 A cycle begins one period after the one before; periods that are over are skipped, never made up for. While positions
 are missing, one that began late waits for them half a period, or as long as its frames need on the wire: positions
-carry no number, and one that came after the next SYNC would count for it. On every bus the
+carry no number, and of which SYNC one is that comes after the next is not certain. On every bus the
 torques go first, then SYNC on all of them back to back, so that all drives act and sample at one time. Our heartbeat is
 sent behind the answers, by this loop alone: drives notice a loop that stops.
 
@@ -201,8 +201,7 @@ class Buses:
             DriverError: one does; nothing has been sent.
         """
         self.clock.sleep_until_ns(self.clock.now_ns() + round(HUSH * 1e9))
-        for link in self._links:
-            link.drain()
+        self._discard_received()
         self.clock.sleep_until_ns(self.clock.now_ns() + round(LISTEN * 1e9))
         for codec, link in self._pairs:
             for frame in link.drain():
@@ -213,6 +212,13 @@ class Buses:
                     f"bus {codec.profile.bus.channel}: {'; '.join(others)}: another program or device drives this arm"
                 )
 
+    def _discard_received(self) -> None:
+        """Discard what has been received so far, but for what the host's controller says of itself."""
+        for codec, link in self._pairs:
+            for frame in link.drain():
+                if frame.error:
+                    codec.receive(frame)
+
     def call(self) -> None:
         """Bring every drive to the NMT state in which it is configured, and wait until all of them answer.
 
@@ -222,8 +228,7 @@ class Buses:
         Raises:
             DriverError: some do not answer; the message names them.
         """
-        for link in self._links:
-            link.drain()
+        self._discard_received()
         self.command(NmtCommand.ENTER_PRE_OPERATIONAL)
         missing = {drive.node for drive in self.drives}
         last = self.clock.now_ns() + round(AWAKE * 1e9)
@@ -246,7 +251,8 @@ class Buses:
     def begin(self) -> None:
         """Start PDOs once drives and host are configured, and wait until all drives answer every SYNC in time.
 
-        At first every drive reports its state, which takes the bus longer than a cycle.
+        At first every drive reports its state, which takes the bus longer than a cycle. Whether answers are of the SYNC
+        before them shows when one is left out.
 
         Raises:
             DriverError: some do not get there.
@@ -256,16 +262,22 @@ class Buses:
             drive.nmt = None
         slowest = max(codec.profile.heartbeat_drives for codec in self.codecs)
         last = self.clock.now_ns() + round((AWAKE + slowest) * 1e9)
-        settled = 0
+        settled, late = 0, [0] * len(self.drives)
         while settled < SETTLED:
             if self.clock.now_ns() > last:
-                bad = [drive.node for drive in self.drives if drive.nmt != NmtState.OPERATIONAL or not drive.answered]
+                bad = [one.node for one in self.drives if one.nmt != NmtState.OPERATIONAL or not one.answered]
+                bad = bad or [one.node for one, before in zip(self.drives, late, strict=True) if one.late > before]
                 raise DriverError(
                     f"drives {', '.join(map(str, bad)) or 'of all kinds'} do not answer every SYNC in time"
                 )
             self.cycle(None)
             there = all(drive.nmt == NmtState.OPERATIONAL and drive.answered for drive in self.drives)
             settled = settled + 1 if there else 0
+            if settled == SETTLED:
+                late = [drive.late for drive in self.drives]
+                self._next_ns = (self._next_ns or 0) + self._period_ns
+                self.cycle(None)
+                settled = SETTLED if late == [drive.late for drive in self.drives] else 0
         self.forget_events()
 
     def forget_events(self) -> None:
@@ -307,7 +319,7 @@ class Buses:
         stamp_ns = self.clock.now_ns()
         self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
         for codec in self.codecs:
-            codec.begin_cycle(stamp_ns)
+            codec.begin_cycle(stamp_ns, asks="sync_loss" not in self.withheld)
         deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         for codec, link in self._pairs:
             while not codec.complete:

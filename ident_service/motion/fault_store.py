@@ -32,6 +32,13 @@ _ROOM: Final = 4096  # bytes of the mark for faults: ten and more
 _LONGEST: Final = 300  # characters of a cause there, so that none takes the room of all
 _ENDED: Final = {"ended": True}  # the mark's last line: all faults are stored, the arm is without torque
 _LAST_LINE: Final = 32  # bytes that are kept for it
+_UNREADABLE: Final = (
+    KeyError,
+    TypeError,
+    ValueError,
+    OverflowError,
+    RecursionError,
+)  # what JSON of anybody may lead to
 
 
 @dataclass(frozen=True)
@@ -54,7 +61,7 @@ class StoredFault:
 
     @classmethod
     def from_document(cls, document: Any) -> Self:
-        """Return the fault of JSON values; raises KeyError, TypeError or ValueError."""
+        """Return the fault of JSON values; raises one of `_UNREADABLE`."""
         return cls(str(document["code"]), str(document["cause"]), float(document["written"]))
 
 
@@ -225,7 +232,7 @@ class FaultStore:
         try:
             document, end = json.JSONDecoder().raw_decode(text)
             pid, run, began = int(document["pid"]), str(document["run"]), float(document["began"])
-        except (KeyError, TypeError, ValueError) as error:
+        except _UNREADABLE as error:
             raise self._damaged(self._mark, error) from None
         faults: list[StoredFault] = []
         ended, free = False, end + 1
@@ -235,7 +242,7 @@ class FaultStore:
                 ended = ended or row == _ENDED
                 if not ended:
                     faults.append(StoredFault.from_document(row))
-            except (KeyError, TypeError, ValueError):
+            except _UNREADABLE:
                 break  # blanks, or a line that a failing machine left in pieces: what it meant is `motion_process` then
             free += len(line) + 1
         cause = f"process {pid} died, or could not store why it stopped, while it had the arm, in the run {run}"
@@ -260,8 +267,11 @@ class FaultStore:
         if (text := self._text(self._faults)) is None:
             return ()
         try:
-            return tuple(StoredFault.from_document(row) for row in json.loads(text)["faults"])
-        except (KeyError, TypeError, ValueError) as error:
+            rows = json.loads(text)["faults"]
+            if not isinstance(rows, list):  # of which nobody knows whether it stands for faults
+                raise TypeError("faults is no list")
+            return tuple(StoredFault.from_document(row) for row in rows)
+        except _UNREADABLE as error:
             raise self._damaged(self._faults, error) from None
 
     def _text(self, path: Path) -> str | None:

@@ -122,6 +122,7 @@ FAULTS: dict[str, Rule] = {
     "status_stale": Rule(
         _STOP, "a drive that switches off would go unnoticed; its report is lost, or the bus too full"
     ),
+    "joint_encoder_lost": Rule(_STOP, "a cable that slips would go unnoticed; the encoder or its cable failed"),
     "bus_degraded": Rule(_STOP, "a bad cable, connector or termination, or a wrong bit rate"),
     "recorder_behind": Rule(_STOP, "the motion would not be recorded"),
     # The arm can be measured, but does not follow.

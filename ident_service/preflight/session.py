@@ -76,6 +76,7 @@ REMEDIES: dict[str, str] = {
     "bus_degraded": _LINK,
     "second_host": "Stop or disconnect whatever else commands the arm.",
     "transmission_slipped": "Check the cables or belts of the joint named, then its encoder and the motors'.",
+    "joint_encoder_lost": "Check the joint's own encoder and its cable to the puck named.",
     "frozen_encoder": _ENCODER,
     "feedback_not_finite": _ENCODER,
     "encoder_jumps": _ENCODER,

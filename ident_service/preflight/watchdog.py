@@ -7,6 +7,7 @@ person must have typed the arm's name first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
@@ -14,12 +15,13 @@ import numpy as np
 
 from drivers.arm import Arm, Flags, Sample, StopKind, Vector, Watchdog
 from drivers.axis_status import AxisStatus
+from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import ArmFault
 from ident_service.model.arm_model import ArmModel
 from ident_service.motion.ticket import Check, Verdict, check_from_measures, failed, measure
 from ident_service.motion.trajectory import Setpoint
 from ident_service.preflight.session import REMEDIES, Session
-from ident_service.preflight.static_checks import LONGEST_SILENCE
+from ident_service.preflight.static_checks import LONGEST_SILENCE, long_silence
 
 CODE = "watchdog"
 _STOPS = 0.5  # s that a slow joint is given to come to rest
@@ -164,10 +166,14 @@ def watchdog_check(
     finally:
         arm.stop(StopKind.TORQUE_OFF)
     found = []
+    falls = bool(long_silence(model, motion_limits(model.config), math.inf))
     for number, dog in enumerate(dogs):
         seconds, word = watchdog_expired.get(number, (None, AxisStatus(0)))
         what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
-        found.append(measure(what, seconds, "s", joint=dog.drive, most=_most(dog, period, reported)))
+        most = _most(dog, period, reported)
+        if falls:  # however long its description says, nobody holds the arm meanwhile
+            most = min(most, LONGEST_SILENCE + _CYCLES * period + reported)
+        found.append(measure(what, seconds, "s", joint=dog.drive, most=most))
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
         if fault:

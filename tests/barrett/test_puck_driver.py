@@ -552,6 +552,51 @@ def test_a_cable_that_slips_shows_in_the_joints_that_its_motor_moves(motor: int,
     assert "rad further than its motors since the arm was opened, 0.05 rad are tolerated" in slipped[0].words
 
 
+@pytest.mark.parametrize("full", [0.05, 0.2, 0.5])
+def test_a_transmit_queue_that_is_full_loses_no_stop(full: float) -> None:
+    """Within the tries of a stop, and for longer than these: closing goes on with them, for a second."""
+    bench = Bench(wam(heartbeat=2.0, watchdog_reason="the safety puck does not help here"))
+    with bench.arm as arm:
+        arm.enable()
+        bench.cycles(3, NONE)
+        begun = arm.clock.now_ns()
+        bench.taps[-1].full_until_ns = begun + round(full * 1e9)
+        arm.stop(StopKind.QUICK_STOP)
+    assert (bench.behind.clock.now_ns() - begun) * 1e-9 < full + 0.06
+    assert bench.safety.mode is SafetyMode.IDLE
+    assert all(puck.motor.power is Power.BRAKE for puck in bench.pucks)
+
+
+def test_a_frame_that_is_refused_does_not_keep_the_other_from_the_safety_puck() -> None:
+    bench = Bench(wam(heartbeat=2.0, watchdog_reason="the safety puck does not help here"))
+    with bench.arm as arm:
+        arm.enable()
+        send = bench.taps[-1].send
+
+        def refusing(frame: Frame) -> None:
+            if address_of(frame.identifier).group and request_of(frame.data) is not None:
+                raise BusError("full", "tap")
+            send(frame)
+
+        bench.taps[-1].send = refusing  # type: ignore[method-assign]
+        arm.stop(StopKind.QUICK_STOP)
+        assert bench.safety.mode is SafetyMode.IDLE
+
+
+def test_a_puck_that_ceases_to_tell_its_joint_encoder_is_told_once_and_anew_to_whoever_enables_the_arm() -> None:
+    bench = encoded()
+    with bench.arm as arm:
+        bench.cycles(3)
+        bench.pucks[1]._joint = None
+        found = [arm.exchange(None).events for _ in range(20)]
+        arm.enable()
+        again = [event for _ in range(5) for event in arm.exchange(NONE).events]
+    told = [(cycle, event) for cycle, events in enumerate(found) for event in events]
+    assert [(cycle, event.code, event.axis) for cycle, event in told] == [(2, AxisEventCode.JOINT_ENCODER_LOST, 1)]
+    assert told[0][1].words == "puck 2 tells its position without that of its joint encoder"
+    assert [event.code for event in again] == [AxisEventCode.JOINT_ENCODER_LOST]
+
+
 def test_an_encoder_that_freezes_at_a_differential_shows_in_the_joints_own() -> None:
     # Both joints seem to move, by their other motor: no position stands still.
     bench = encoded()

@@ -7,15 +7,16 @@ A pair of local packet sockets stands in for the kernel: it carries the same str
 from __future__ import annotations
 
 import socket
+import struct
 from collections.abc import Iterator
 
 import pytest
 from link_bench import arm_on_bus, soon
 
-from drivers.can.bus_state import BUS_OFF, BusError
+from drivers.can.bus_state import BUS_OFF, BusError, ControllerState, controller_state
 from drivers.can.can_frame import Frame, from_kernel, to_kernel
 from drivers.can.can_link import open_links
-from drivers.can.socketcan_link import RawLink
+from drivers.can.socketcan_link import RawLink, controller_state_frame, state_in_link_message
 from ident_service.errors import DriverError
 
 
@@ -41,6 +42,46 @@ def test_the_message_where_the_interface_or_the_kernel_has_none() -> None:
     says = "no such CAN interface" if has_can() else "no CAN sockets; load the modules: `modprobe can-raw`"
     with pytest.raises(BusError, match=f"nowhere0: .*{says}"):
         open_links(arm_on_bus(interface="raw", channel="nowhere0"))
+
+
+def attribute(kind: int, data: bytes) -> bytes:
+    """An attribute of netlink: length and type of 16 bits, padded to 4 bytes (linux/netlink.h)."""
+    return struct.pack("=HH", 4 + len(data), kind) + data + bytes(-len(data) % 4)
+
+
+def link_message(state: int) -> bytes:
+    """What the kernel answers of a CAN interface (linux/rtnetlink.h, if_link.h, can/netlink.h), shortened."""
+    of_can = attribute(1, bytes(32)) + attribute(4, struct.pack("=I", state)) + attribute(6, struct.pack("=I", 100))
+    info = attribute(1, b"can\0") + attribute(2, of_can)
+    body = struct.pack("=BxHiII", 0, 280, 5, 0x100C1, 0) + attribute(3, b"can0\0") + attribute(0x8000 | 18, info)
+    return struct.pack("=IHHII", 16 + len(body), 16, 0, 1, 0) + body
+
+
+def test_the_kernel_tells_the_state_of_a_controller_that_had_it_before() -> None:
+    states = {}
+    for number in range(6):
+        frame = state_in_link_message(link_message(number))
+        states[number] = None if frame is None else controller_state(frame, ControllerState.ACTIVE)
+    assert {number: state for number, state in states.items() if state} == {
+        2: ControllerState.PASSIVE,
+        3: ControllerState.BUS_OFF,
+    }
+    whole = link_message(2)
+    for length in range(len(whole)):
+        state_in_link_message(whole[:length])  # never raises
+    assert controller_state_frame("lo") is None  # asks this kernel, whose answer has no such state
+    assert controller_state_frame("nowhere0") is None
+
+
+def test_what_the_kernel_tells_beside_the_socket_is_received_first(ends: tuple[RawLink, socket.socket]) -> None:
+    link, kernel = ends
+    kernel.send(to_kernel(Frame(0x181, b"1234")))
+    off = state_in_link_message(link_message(3))
+    assert off is not None
+    link.hear(off)
+    assert [(frame.error, frame.identifier) for frame in link.drain()] == [(True, BUS_OFF), (False, 0x181)]
+    with pytest.raises(BusError, match="bus-off"):
+        link.send(Frame(0x201))
 
 
 def test_options_are_refused() -> None:

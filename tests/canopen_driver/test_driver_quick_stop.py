@@ -60,6 +60,19 @@ def test_a_quick_stop_that_was_lost_is_sent_again() -> None:
     assert (np.abs(truths[-1].velocity) < 0.7 * np.abs(moving)).all()
 
 
+def test_a_torque_off_that_one_drive_did_not_hear_is_sent_again() -> None:
+    config = weightless_config(torque_deadline=1.0)
+    behind = LockStepArm(config)
+    taps = tapped(behind, config)
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        arm.exchange(PUSH)
+        taps[0].loses = lambda frame: frame.identifier == 0x302
+        arm.stop(StopKind.TORQUE_OFF)
+        taps[0].loses = lambda frame: False
+    assert held(behind) == [PowerState.SWITCH_ON_DISABLED] * 2
+
+
 def test_without_torque_the_arm_coasts() -> None:
     moving, after = speeds(StopKind.TORQUE_OFF)
     np.testing.assert_allclose(after, moving, rtol=0.05)
@@ -76,7 +89,7 @@ def test_an_arm_that_was_stopped_and_closed_is_enabled_again(kind: StopKind) -> 
             arm.stop(kind)
 
 
-@pytest.mark.parametrize("full", [0.005, 0.14])
+@pytest.mark.parametrize("full", [0.005, 0.14, 0.5])
 @pytest.mark.parametrize("kind", list(StopKind))
 def test_a_transmit_queue_that_is_full_for_a_moment_loses_no_stop(kind: StopKind, full: float) -> None:
     """For 5 ms, within the tries of a stop, and for longer than these, so that closing goes on with them."""

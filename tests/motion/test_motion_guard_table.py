@@ -286,7 +286,7 @@ def test_the_reactions_are_those_of_the_fault_table() -> None:
     assert by_reaction[STOP] == {
         *("repeated_warnings", "late_cycles", "encoder_jumps", "position_envelope", "position_limit", "over_velocity"),
         *("following_error", "workspace", "lease_lost", "controls_failed", "no_way_back", "recorder_behind"),
-        *("bus_degraded", "status_stale"),
+        *("bus_degraded", "status_stale", "joint_encoder_lost"),
     }
     assert by_reaction[LOWER] == {"following_lost"}
     assert by_reaction[OFF] == {"emergency_stop", "feedback_not_finite", "frozen_encoder", "far_outside", "runaway"}

@@ -463,6 +463,21 @@ def test_drives_without_a_watchdog_are_refused() -> None:
 
 
 @pytest.mark.slow
+def test_drives_that_give_up_later_than_an_arm_that_falls_may_be_alone_are_refused() -> None:
+    """Twice as late as they say is told of any drive; with 0.1 s, which is allowed, that were 0.2 s."""
+    driver = {"kind": "simulated", "truth": TRUTH, "encoder_resolution": 2e-5}
+    flight = Flight(changes={"driver": driver | {"watchdog": 0.19}})
+    promised = flight.model.config.model_copy(
+        update={"driver": flight.model.config.driver.model_copy(update={"watchdog": 0.1})}
+    )
+    flight.model = replace(flight.model, config=promised)
+    flight.arm.description = lambda says: replace(says, watchdog=0.1)
+    check = only_failure(flight.ticket(), "watchdog")
+    assert "quick stop after 0.188 s, at most 0.12" in check.reason
+    assert all(one.value == pytest.approx(0.19, abs=0.01) and one.most == pytest.approx(0.12) for one in check.measures)
+
+
+@pytest.mark.slow
 def test_drives_that_say_themselves_that_they_go_on_for_long_are_refused_before_they_are_energised() -> None:
     flight = Flight()
     flight.arm.description = lambda says: replace(says, watchdog=0.5)

@@ -153,7 +153,15 @@ def test_a_mark_of_earlier_software_has_no_room_and_says_that_it_has_none(folder
 
 
 @pytest.mark.parametrize("name", ["faults.json", "moving.json"])
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"faults": [3], "pid": null}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        *("", "[]", "{}", '{"faults": [3], "pid": null}', '{"faults": {}, "pid": {}}', '{"faults": "", "pid": ""}'),
+        pytest.param("[" * 100_000, id="deep"),
+        pytest.param('{"faults": [{"code": "a", "cause": "b", "written": 1' + "0" * 400 + "}]}", id="number"),
+        pytest.param('{"pid": 1, "run": "7", "began": 1' + "0" * 400 + "}", id="time"),
+    ],
+)
 def test_a_damaged_file_is_not_taken_for_none(folder: Path, name: str, content: str) -> None:
     folder.mkdir(parents=True)
     (folder / name).write_text(content)

@@ -1,0 +1,118 @@
+"""A CAN controller of the host that is error-passive before the arm is enabled: told before anything moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from campaign_canopen import bench_canopen_config
+from campaign_pucks import bench_puck_config
+from helpers.emulated_arms import Tapped
+from motion_bench import Story
+
+from drivers.arm import Arm
+from drivers.axis_status import AxisEventCode
+from drivers.barrett.driver import BarrettArm
+from drivers.can.bus_state import ACTIVE, CONTROLLER, PASSIVE_TX
+from drivers.can.can_frame import Frame
+from drivers.canopen.driver import CanopenArm
+from ident_service.config.arm import ArmConfig
+from ident_service.errors import DriverError
+from ident_service.excitation.described_motion import excitation
+from ident_service.model.arm_model import arm_model
+from ident_service.motion.faults import ActiveFaults
+from ident_service.motion.run import run
+from ident_service.motion.ticket import Verdict
+from ident_service.preflight.preflight import preflight
+from sim_backend.emulator.lock_step import LockStepArm
+
+SAID = "the host's CAN controller on bench is error-passive, expected error-active"
+PASSIVE, RECOVERED = (
+    Frame(CONTROLLER, bytes((0, what, 0, 0, 0, 0, 0, 0)), error=True) for what in (PASSIVE_TX, ACTIVE)
+)
+KINDS = pytest.mark.parametrize(
+    ("build", "config"),
+    [
+        pytest.param(CanopenArm, bench_canopen_config, id="canopen"),
+        pytest.param(BarrettArm, bench_puck_config, id="pucks"),
+    ],
+)
+Build = Callable[..., Arm]
+
+
+def passive_bus(config: ArmConfig, build: Build) -> tuple[Arm, list[Tapped]]:
+    """An arm, not open, whose link tells first of all that the controller is error-passive."""
+    behind, taps = LockStepArm(config), list[Tapped]()
+
+    def links(_: ArmConfig) -> list[Tapped]:
+        taps[:] = [Tapped(behind.link(0))]
+        taps[0].disturb([PASSIVE], drives_hear=False)
+        return taps
+
+    return build(config, links), taps
+
+
+@contextmanager
+def opened(config: ArmConfig, build: Build) -> Iterator[tuple[Arm, Tapped]]:
+    arm, taps = passive_bus(config, build)
+    with arm:
+        yield arm, taps[0]
+
+
+@KINDS
+def test_a_run_is_refused_before_anything_is_energised_and_its_recording_says_why(
+    build: Build, config: Callable[[], ArmConfig]
+) -> None:
+    described, story, latch = config(), Story(), ActiveFaults()
+    model = arm_model(described)
+    with opened(described, build) as (arm, _):
+        with pytest.raises(DriverError, match=SAID) as refused:
+            run(arm, model, excitation(model, "identification"), story, latch=latch)
+        assert "Check termination, connectors, cable and bit rate of every node on bench" in str(refused.value)
+        assert not any(word & 1 for word in arm.exchange(None).status)
+    assert story.samples == []
+    assert SAID in story.events[-1][2]
+    assert SAID in latch.faults[0].cause
+
+
+@KINDS
+def test_preflight_says_so_before_a_person_is_asked_for_anything(build: Build, config: Callable[[], ArmConfig]) -> None:
+    described, asked = config(), list[str]()
+    arm, _ = passive_bus(described, build)
+    ticket = preflight(arm, arm_model(described), None, confirm=lambda text: asked.append(text) or "", look_seconds=0.2)
+    (check,) = [one for one in ticket.checks if one.verdict is Verdict.FAILED]
+    assert (check.code, check.reason) == ("identities", SAID)
+    assert check.remedy.startswith("Check termination")
+    assert asked == []
+
+
+@KINDS
+def test_a_controller_that_has_recovered_is_no_reason(build: Build, config: Callable[[], ArmConfig]) -> None:
+    with opened(config(), build) as (arm, tap):
+        arm.exchange(None)
+        tap.disturb([RECOVERED], drives_hear=False)
+        arm.exchange(None)
+        assert all(check.good for check in arm.setup_checks())
+        arm.enable()
+
+
+@KINDS
+def test_one_that_becomes_so_while_drives_are_enabled_shows_in_the_first_cycle(
+    build: Build, config: Callable[[], ArmConfig]
+) -> None:
+    with opened(config(), build) as (arm, tap):
+        tap.disturb([RECOVERED], drives_hear=False)
+        told = [event.code for _ in range(3) for event in arm.exchange(None).events]
+        assert told == [AxisEventCode.BUS_DEGRADED]  # what was found when it was opened
+        send, tap.sent = tap.send, []
+
+        def sends(frame: Frame) -> None:
+            if len(tap.sent) == 10:
+                tap.disturb([PASSIVE], drives_hear=False)
+            send(frame)
+
+        tap.send = sends  # type: ignore[method-assign]
+        arm.enable()
+        found = [(event.code, event.words) for event in arm.exchange(None).events]
+    assert found == [(AxisEventCode.BUS_DEGRADED, "bench: the host's CAN controller is passive")]
