@@ -78,9 +78,11 @@ def on_a_core() -> Iterator[RealtimePrivileges]:
     deadline = time.monotonic() + 60.0
     while True:
         with temporary_privileges(settings=Realtime(cores=tuple(CORES))) as granted:
-            if granted.core is not None or time.monotonic() > deadline:
+            if granted.core is not None:
                 yield granted
                 return
+        if time.monotonic() > deadline:
+            pytest.skip("loops outside of this test have every core")
         time.sleep(0.1)
 
 
