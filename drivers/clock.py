@@ -69,29 +69,6 @@ class VirtualClock:
         self._now = max(self._now, deadline_ns)
 
 
-_DOUBT: Final = 0.25  # of a period: sending a request takes less, unless this computer stalls
-
-
-def stamp_of_request(before_ns: int, after_ns: int, period_ns: int) -> tuple[int, int]:
-    """Return when a request was on the bus, and by how much earlier it may have been [ns].
-
-    The frame leaves soon after its system call begins; what the call takes beyond that, such as waking whoever waits
-    for the frame, differs from cycle to cycle. Taken for the motion's time, 0.2 ms of it at 500 Hz are a tenth of the
-    velocity.
-
-    Args:
-        before_ns: time before the request was sent [ns].
-        after_ns: time afterwards [ns].
-        period_ns: of the loop [ns].
-
-    Returns:
-        The time before and no doubt; where sending took more than a quarter of a period, the time afterwards and how
-        long it took, as nobody knows when in between the frame left.
-    """
-    took = after_ns - before_ns
-    return (before_ns, 0) if took <= _DOUBT * period_ns else (after_ns, took)
-
-
 def utc_offset_of_recording_ns(clock: Clock) -> int:
     """Return what a recording adds to a clock's stamps so that they are in UTC [ns].
 

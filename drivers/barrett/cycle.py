@@ -60,13 +60,13 @@ from drivers.can.bus_state import (
 )
 from drivers.can.can_frame import Frame
 from drivers.can.can_link import Link
-from drivers.clock import stamp_of_request
 from ident_service.config.barrett import BarrettDriver
 from ident_service.errors import DriverError
 
 _RECEIVE = 0.97  # of a period, within which a position counts for its cycle
 _LEAST = 0.5  # of a period, from the request on, that positions are waited for in any case
 _MISSED = 0.25  # of a period late, and the slot is left to the next
+_DOUBT = 0.25  # of a period: sending a request takes less, unless this computer stalls
 _MOST_EVENTS = 256  # that wait to be taken; a flood must neither eat the memory nor hide what matters
 _OF_SAFETY = 3  # questions a status period: MODE twice, and the pendant
 _STALE = 5.0  # status periods without an answer
@@ -418,10 +418,11 @@ class PuckBus:
         silent = self.silent and codec.safety.mode == SafetyMode.ACTIVE
         if not silent:
             link.send(codec.request)
-        stamp_ns, self.stamp_doubt_ns = stamp_of_request(before_ns, clock.now_ns(), self._period_ns)
+        stamp_ns = clock.now_ns()
         if not silent:
             for frame in torques:
                 link.send(frame)
+        self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
         codec.begin_cycle(stamp_ns, asks=not silent)
         deadline = max(begin_ns + round(_RECEIVE * self._period_ns), stamp_ns + self._least_ns)
         while not codec.complete:

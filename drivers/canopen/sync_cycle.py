@@ -39,7 +39,7 @@ from drivers.canopen.object_dictionary import CST, Entry, OperationMode
 from drivers.canopen.pdo_codec import BusCodec, Drive
 from drivers.canopen.pdo_mapping import GUARD_EARLY, HEARTBEAT, SDO_REPLY, SDO_REQUEST, BusProfile
 from drivers.canopen.sdo import TIMEOUT, Objects, upload_request
-from drivers.clock import Clock, stamp_of_request
+from drivers.clock import Clock
 from ident_service.errors import DriverError
 
 RECEIVE = 0.97  # of a period, within which a position counts for its cycle (FIELDBUS.md: the last is on the wire then)
@@ -52,6 +52,7 @@ SETTLED = 5  # cycles in a row with everybody's position before an arm counts as
 _ASK_EVERY_NS = 5_000_000
 _SILENT = 2  # cycles without a position, after which a drive may have left `operational`
 _MISSED = 0.25  # of a period late, and the slot is left to the next
+_DOUBT = 0.25  # of a period: sending a SYNC takes less, unless this computer stalls
 _ASK = bytes([0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0])  # SDO upload of the device type, which every node has
 
 
@@ -314,7 +315,9 @@ class Buses:
         if "sync_loss" not in self.withheld:
             for codec, link in self._pairs:
                 link.send(codec.sync())
-        stamp_ns, self.stamp_doubt_ns = stamp_of_request(before_ns, self.clock.now_ns(), self._period_ns)
+        # Not before: a drive acts when it hears SYNC.
+        stamp_ns = self.clock.now_ns()
+        self.stamp_doubt_ns = stamp_ns - before_ns if stamp_ns - before_ns > _DOUBT * self._period_ns else 0
         for codec in self.codecs:
             codec.begin_cycle(stamp_ns, asks="sync_loss" not in self.withheld)
         deadline = max(begin_ns + round(RECEIVE * self._period_ns), stamp_ns + self._least_ns)
