@@ -689,6 +689,7 @@ def _add_exports(verbs: VerbList) -> None:
         more="Each file is read back and checked.",
         examples=("result", "result --format urdf,mjcf --out models"),
     )
+    sub.add_argument("--anyway", action="store_true", help="also what must not be used; every file is marked then")
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--format", default=_FORMATS, metavar="LIST", help=f"comma-separated (default: {_FORMATS})")
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
@@ -700,7 +701,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
     formats = known_formats(arguments.format)
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "exports")
-    made = export_run(arguments.run, formats, folder, step_of(arguments))
+    made = export_run(arguments.run, formats, folder, step_of(arguments), anyway=arguments.anyway)
     lines, files = [f"files: {folder}"], []
     for export in made:
         lines.append(f"  {export.name} ({export.format})")
