@@ -662,7 +662,7 @@ def _verify(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.verify import verify_file
 
     result = verify_file(arguments.file, arguments.arm)
-    if result.verdict == "failed" and result.message.startswith("not a parameter file"):
+    if not result.about_parameters:
         raise ParameterError(f"{arguments.file}: {result.message}")
     if result.message == "feasibility: missing or not an object":
         words = "there is no certificate in it; `ident feasible` tests it, `ident project` writes one"
@@ -673,6 +673,7 @@ def _verify(arguments: argparse.Namespace) -> Answer:
         "verdict": result.verdict,
         "message": result.message,
         "checked": list(result.checked),
+        "notes": list(result.notes),
     }
     return (DONE if result.verdict == "feasible" else VERDICT_NO), answer_text(arguments.file, result), document
 
