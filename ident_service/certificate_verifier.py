@@ -1308,8 +1308,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="verify.py",
         description="Check the certificate of a parameter file in exact arithmetic, against the file's own conditions. "
         "Exit codes: 0 consistent, 3 not consistent or infeasible, 2 no parameter file, or cannot be read. Whether the "
-        "conditions are an arm's is checked by `ident verify FILE --arm ARM`. Take this program from where you trust it: a folder from "
-        "somebody else may hold another one.",
+        "conditions are an arm's is checked by `ident verify FILE --arm ARM`. Take this program from where you trust "
+        "it: a folder from somebody else may hold another one.",
     )
     parser.add_argument("path", type=Path, help="parameters.json, or the folder that holds it")
     path: Path = parser.parse_args(arguments).path
