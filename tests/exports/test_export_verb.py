@@ -14,6 +14,7 @@ from exports.export_bench import some_delta
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.daemon.jobs.outcome import ProcessOutput, outcome
 from ident_service.errors import ModelError
 from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
@@ -198,6 +199,11 @@ def test_what_must_not_be_used_is_not_exported(
     said = capsys.readouterr().err
     assert f"must not be used: {why.rstrip('.')}; nothing was exported; identify again" in said
     assert "--anyway" in said
+    # A daemon's job is this command with --json, and has no option for it.
+    assert code_of("export", folder, "--out", tmp_path / "out", "--json") == 3
+    job = outcome(ProcessOutput(json.loads(capsys.readouterr().out)), 3, "")
+    assert job.state == "refused"
+    assert why.rstrip(".") in job.detail
     assert not (tmp_path / "out").exists()
 
 
