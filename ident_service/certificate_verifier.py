@@ -31,7 +31,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Literal, NoReturn
@@ -817,6 +817,9 @@ def _printable(text: str) -> str:
 # The proof
 
 
+_NO_PARAMETERS = "not a parameter file"
+
+
 @dataclass(frozen=True)
 class Verification:
     """The answer about a file.
@@ -829,12 +832,19 @@ class Verification:
         checked: the conditions that hold, or that contradict the base parameters with their share of the
             contradiction; linear ones with their inequalities.
         arm: the arm that the verdict is about; None where it is about the file alone.
+        notes: what was not looked at, though one might think so.
     """
 
     verdict: Literal["feasible", "infeasible", "undecided", "failed"]
     message: str
     checked: tuple[str, ...] = ()
     arm: str | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def about_parameters(self) -> bool:
+        """Return whether the file is one of parameters at all; any other cannot be used, and is exit code 2."""
+        return not (self.verdict == "failed" and self.message.startswith(_NO_PARAMETERS))
 
 
 def verify(content: str, arm: Arm | None = None) -> Verification:
@@ -1217,9 +1227,10 @@ def require_folder(folder: Path) -> None:
     """Hold the files of a folder of results against its manifest, and its arm against its parameters.
 
     Raises:
-        OSError: a file cannot be read.
+        OSError: a file cannot be read, or `parameters.json` is not there.
         VerificationError: a file is not what the manifest names, or the parameters are about another arm.
     """
+    (folder / "parameters.json").stat()  # what is not there cannot be read, whatever the manifest names
     if (folder / "manifest.json").is_file():
         files = _as_object(load(read_file(folder / "manifest.json"), "a manifest").get("files"), "manifest.json: files")
         for name, digest in files.items():
@@ -1227,7 +1238,7 @@ def require_folder(folder: Path) -> None:
                 raise VerificationError(f"manifest.json: {name[:60]!r} is no name of a file in the folder")
             # A recording may have been pruned; what the answer is about may not.
             if not (folder / name).is_file():
-                if name in ("parameters.json", "arm.json"):
+                if name == "arm.json":
                     raise VerificationError(f"{name}: named by the manifest, but not there")
                 continue
             with (folder / name).open("rb") as file:
@@ -1251,6 +1262,9 @@ def _without_space(text: str) -> str:
     return "".join(re.findall(r'"(?:[^"\\]|\\.)*"|[^\s"]+', text))
 
 
+_WITHOUT_MANIFEST = "there is no manifest.json, so the other files of the folder were compared with nothing"
+
+
 def verify_path(path: Path, arm: Arm | None = None) -> Verification:
     """Check the certificate of a parameter file, or of the one in a folder of results.
 
@@ -1261,11 +1275,13 @@ def verify_path(path: Path, arm: Arm | None = None) -> Verification:
     Raises:
         OSError: it cannot be read.
     """
+    notes: tuple[str, ...] = ()
     try:
         if path.is_dir():
             require_folder(path)
+            notes = () if (path / "manifest.json").is_file() else (_WITHOUT_MANIFEST,)
             path = path / "parameters.json"
-        return verify(read_file(path), arm)
+        return replace(verify(read_file(path), arm), notes=notes)
     except VerificationError as error:
         return Verification("failed", clean(str(error)), arm=None if arm is None else arm.name)
 
@@ -1277,7 +1293,7 @@ def answer_text(path: Path, answer: Verification) -> str:
     """
     word = answer.verdict
     head = f"{word}: {answer.message}" if answer.arm or word in ("failed", "undecided") else answer.message
-    lines = (f"{path}: {head}", *(f"  {line}" for line in answer.checked))
+    lines = (f"{path}: {head}", *(f"  {line}" for line in answer.checked), *(f"note: {note}" for note in answer.notes))
     return "".join(f"{_printable(line)}\n" for line in lines)
 
 
@@ -1285,14 +1301,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Check a file or folder named on the command line.
 
     Returns:
-        0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read.
+        0: consistent with its own conditions, and these can be met. 3: not so. 2: the file cannot be read, or is
+        no parameter file.
     """
     parser = argparse.ArgumentParser(
         prog="verify.py",
         description="Check the certificate of a parameter file in exact arithmetic, against the file's own conditions. "
-        "Exit codes: 0 consistent, 3 not consistent or infeasible, 2 cannot be read. Whether the conditions are an "
-        "arm's is checked by `ident verify FILE --arm ARM`. Take this program from where you trust it: a folder from "
-        "somebody else may hold another one.",
+        "Exit codes: 0 consistent, 3 not consistent or infeasible, 2 no parameter file, or cannot be read. Whether the "
+        "conditions are an arm's is checked by `ident verify FILE --arm ARM`. Take this program from where you trust "
+        "it: a folder from somebody else may hold another one.",
     )
     parser.add_argument("path", type=Path, help="parameters.json, or the folder that holds it")
     path: Path = parser.parse_args(arguments).path
@@ -1300,6 +1317,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         answer = verify_path(path)
     except OSError as error:
         sys.stderr.write(f"{_printable(str(error.filename or path))}: {error.strerror or error}\n")
+        return 2
+    if not answer.about_parameters:
+        sys.stderr.write(answer_text(path, answer))
         return 2
     # A terminal may not have every letter of a file.
     encoding = sys.stdout.encoding or "utf-8"

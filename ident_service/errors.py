@@ -14,6 +14,7 @@
     ├── RecordingError (ValueError)    a recording that cannot be used: wrong joints, NaN, too short, torn row
     │   └── RecordingNotWritten        a recording cannot be written, as on a full disk
     ├── ParameterError (ValueError)    a parameter file or expression that does not parse or does not fit
+    │   └── MustNotBeUsed              parameters whose own file says that they must not be used
     ├── SolverError (RuntimeError)     the conic solver stopped anywhere but at an optimum
     ├── MotionRefused (ValueError)     a motion that would leave the arm's limits, refused before anything moves
     │   └── PersonNeeded               a re-identification without a verdict: a person must act first
@@ -191,6 +192,10 @@ class RecordingNotWritten(RecordingError):
 
 class ParameterError(IdentError, ValueError):
     """A parameter file, a parameter name or an expression does not parse or does not fit the arm."""
+
+
+class MustNotBeUsed(ParameterError):
+    """Parameters were not handed on, because their own file says that they must not be used."""
 
 
 class SolverError(IdentError, RuntimeError):

@@ -54,6 +54,7 @@ from ident_service.errors import (
     IdentError,
     ModelError,
     MotionRefused,
+    MustNotBeUsed,
     ParameterError,
     PersonNeeded,
     RecordingError,
@@ -82,6 +83,7 @@ GROUPS = {
 _BAD_INPUT: tuple[type[IdentError], ...] = (UsageError, ConfigError, ModelError, RecordingError, ParameterError)
 _EXIT_CODES: tuple[tuple[type[IdentError] | tuple[type[IdentError], ...], int], ...] = (
     (RecordingNotWritten, FAILED),
+    (MustNotBeUsed, VERDICT_NO),
     (_BAD_INPUT, USAGE),
     (PersonNeeded, PERSON_NEEDED),
     (MotionRefused, VERDICT_NO),

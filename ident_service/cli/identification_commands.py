@@ -662,7 +662,7 @@ def _verify(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.verify import verify_file
 
     result = verify_file(arguments.file, arguments.arm)
-    if result.verdict == "failed" and result.message.startswith("not a parameter file"):
+    if not result.about_parameters:
         raise ParameterError(f"{arguments.file}: {result.message}")
     if result.message == "feasibility: missing or not an object":
         words = "there is no certificate in it; `ident feasible` tests it, `ident project` writes one"
@@ -673,6 +673,7 @@ def _verify(arguments: argparse.Namespace) -> Answer:
         "verdict": result.verdict,
         "message": result.message,
         "checked": list(result.checked),
+        "notes": list(result.notes),
     }
     return (DONE if result.verdict == "feasible" else VERDICT_NO), answer_text(arguments.file, result), document
 
@@ -689,6 +690,7 @@ def _add_exports(verbs: VerbList) -> None:
         more="Each file is read back and checked.",
         examples=("result", "result --format urdf,mjcf --out models"),
     )
+    sub.add_argument("--anyway", action="store_true", help="also what must not be used; every file is marked then")
     sub.add_argument("run", type=Path, metavar="RUN", help="run folder of `identify` or `simulate`")
     sub.add_argument("--format", default=_FORMATS, metavar="LIST", help=f"comma-separated (default: {_FORMATS})")
     sub.add_argument("--out", type=Path, metavar="DIR", help="default: a new folder below the state folder")
@@ -700,7 +702,7 @@ def _export(arguments: argparse.Namespace) -> Answer:
 
     formats = known_formats(arguments.format)
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), arguments.run.resolve().name, "exports")
-    made = export_run(arguments.run, formats, folder, step_of(arguments))
+    made = export_run(arguments.run, formats, folder, step_of(arguments), anyway=arguments.anyway)
     lines, files = [f"files: {folder}"], []
     for export in made:
         lines.append(f"  {export.name} ({export.format})")

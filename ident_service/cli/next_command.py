@@ -226,6 +226,11 @@ def _identified(ended: Ended) -> list[str]:
     return ["accept", ended.run, "--note", how]
 
 
+def _reported(ended: Ended) -> list[str] | None:
+    # What must not be used is corrected first, as its reasons say; no one command does that.
+    return None if (ended.said.get("assessment") or {}).get("verdict") == "do not use" else ["export", ended.run]
+
+
 def _compared(ended: Ended) -> list[str]:
     # What has changed is looked at, and mended or accepted, by a person.
     return ["report", ended.short(ended.given.others[-1])]
@@ -337,7 +342,7 @@ _FOLLOWS: dict[str, Follows] = {
     "recover": _recovered,
     **dict.fromkeys(("home", "set-home"), _homed),
     **dict.fromkeys(("simulate", "identify"), _identified),
-    "report": lambda ended: ["export", ended.run],
+    "report": _reported,
     "view": lambda ended: (
         ["report", ended.short(ended.given.run)]
         if ended.said["residuals"]

@@ -41,6 +41,7 @@ RemoteVerb = tuple[Verb, frozenset[str]]  # and the arguments that are sent to a
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
+_TABLE = "\nbase parameter "  # begins the table of a report that the command does not print
 _JOB = "20261124T101500Z-planar2-7b2f10"  # of the examples
 _MOVE = (
     "check",
@@ -203,6 +204,20 @@ def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, A
     }
 
 
+def _identified(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """Return the answer with the text that the command prints at the daemon's machine, which its run has as a file."""
+    code, text, document = answer
+    run = document["job"]["run"]
+    if run is None or code not in (DONE, VERDICT_NO):
+        return with_answer_lines(client, arguments, answer)
+    files = f"/api/v1/runs/{word_of_address(str(run))}/files"
+    report = client.content(f"{files}/report.txt").decode("utf-8", "replace")
+    summary = report.rpartition(_TABLE)[0] or report
+    printed = "".join(letter for letter in summary if letter.isprintable() or letter == "\n")
+    names = "".join(f"  {name}\n" for name in document["answer"].get("files", ()))
+    return code, f"{text}\n{printed}\nfiles: {files}\n{names}", document
+
+
 def _seconds(_: IdentClient, arguments: argparse.Namespace) -> float | None:
     searched: float | None = arguments.search_time
     return 60.0 if searched is None and arguments.starts is None else searched
@@ -308,7 +323,7 @@ def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 REMOTE: dict[str, RemoteVerb] = {
     "simulate": job("arm seed feasible_set", more="motion", motion=motion_of),
-    "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
+    "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify, _identified)),
     "design": job(
         "arm starts seed criterion motion",
         more="after chosen search_time",

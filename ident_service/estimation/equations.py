@@ -33,6 +33,7 @@ from ident_service.recordings.resampling import grid
 MAX_BLOCKS = 256
 LEAST_BLOCKS = 12  # with fewer blocks the deviations themselves are hardly known
 _CHUNK = 4096  # samples whose regressor is computed at once
+_HARDLY_MOVED = 0.05  # rad or m of a joint's positions, where their unit is asked for
 _SLOWEST_SAMPLING = 0.2  # s; nobody samples an arm more slowly
 _DECAY = 28.0  # -ln(1e-12)
 _UNCOUPLED = 1e-12
@@ -227,9 +228,27 @@ def require_motion(recordings: Sequence[Recording], model: ArmModel, moved: NDAr
         )
     raise RecordingError(
         recordings[0].path,
-        f"{said}, so that neither its inertia nor its friction shows; record a motion of it, or, where it is held, "
+        f"{said}, so that neither its inertia nor its friction shows; {_question_of_unit(recordings, model, still)}"
+        "record a motion of it, or, where it is held, "
         f"take it out of the arm: kinematics.lock: {{{still[0]}: POSITION}}",
     )
+
+
+def _question_of_unit(recordings: Sequence[Recording], model: ArmModel, still: Sequence[str]) -> str:
+    """Ask for the unit of joints that seem to stand still, and would have moved in a coarser one; else empty."""
+    chain = model.chain
+    low, high = np.full(chain.joints, np.inf), np.full(chain.joints, -np.inf)
+    for recording in recordings:
+        for block in recording.blocks():
+            low, high = np.fmin(low, block.position.min(axis=0)), np.fmax(high, block.position.max(axis=0))
+    found = []
+    for name, span, turns in zip(chain.names, (high - low).tolist(), chain.revolute, strict=True):
+        unit, finer, factor = ("rad", "deg", 180.0 / np.pi) if turns else ("m", "mm", 1000.0)
+        if name in still and span < _HARDLY_MOVED <= span * factor:
+            found.append(f"the positions of {name} span {span:.2g} {unit}: are they in {unit}, and read as {finer}?")
+    if not found:
+        return ""
+    return f"{' '.join(found)} Then correct their unit in recording.columns; else "
 
 
 def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tuple[Stretches, ...]:

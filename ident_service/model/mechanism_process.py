@@ -100,8 +100,9 @@ def arm_part(
             held[name] = follower.multiplier * held[follower.joint] + follower.offset
     for name, follower in waiting.items():
         raise ModelError(
-            f"{file}: joint {name!r} mimics {follower.joint!r}, which moves with the arm; lock {follower.joint!r} at a"
-            f" value, as kinematics.lock: {{{follower.joint}: 0}}, or name base and tip so that it is not between them"
+            f"{file}: joint {name!r} mimics {follower.joint!r}, which moves with the arm; lock {follower.joint!r} in a"
+            f" description written by hand (`ident new` locks none), as kinematics.lock: {{{follower.joint}: 0}}, or"
+            " name base and tip, with `ident new` --base and --tip, so that it is not between them"
         )
     for name, follower in followers.items():
         if name in part.lock and model.existJointName(name):

@@ -103,8 +103,7 @@ def assess(content: Mapping[str, Any]) -> Assessment:
     """
     joints = joint_assessments(content)
     found = [
-        *((2, reason) for reason in content.get("unusable", ())),
-        *_second_opinion(content),
+        *((2, reason) for reason in forbidden_because(content)),
         *_prediction(content, joints),
         *_feasibility(content),
         *_knowledge(content),
@@ -114,6 +113,15 @@ def assess(content: Mapping[str, Any]) -> Assessment:
     word: Word = ("use", "use with care", "do not use")[max(weight for weight, _ in found)]
     sentences = tuple(sentence for _, sentence in found)
     return Assessment(word, _line(content, word), sentences[:REASONS], sentences[REASONS:], joints)
+
+
+def forbidden_because(content: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return why the values of a parameter file must not be used, infeasibility left out; empty where nothing says so.
+
+    Args:
+        content: of `parameters.json`.
+    """
+    return (*content.get("unusable", ()), *_second_opinion(content))
 
 
 def assess_estimate(estimate: Estimate, unusable: Sequence[str] = (), warnings: Sequence[str] = ()) -> Assessment:
@@ -264,11 +272,11 @@ def _feasibility(content: Mapping[str, Any]) -> Weighted:
     return [(0, "Physically feasible, and no constraint is active.")]
 
 
-def _second_opinion(content: Mapping[str, Any]) -> Weighted:
+def _second_opinion(content: Mapping[str, Any]) -> tuple[str, ...]:
     second = content.get("second_opinion", {})
     if second.get("conclusive") and not second.get("agrees", True):
-        return [(2, "A second solution of the constrained problem predicts other torques: use neither.")]
-    return []
+        return ("A second solution of the constrained problem predicts other torques: use neither.",)
+    return ()
 
 
 def _prediction(content: Mapping[str, Any], joints: Sequence[JointAssessment]) -> Weighted:

@@ -13,6 +13,7 @@ import pytest
 from certificate_samples import parameter_file, text
 
 from ident_service import certificate_verifier
+from ident_service.cli import main as ident_main
 from ident_service.config.load import load_arm
 from ident_service.estimation.certificate import certify
 from ident_service.estimation.feasible.feasible_set import feasible_set
@@ -80,17 +81,62 @@ def test_the_copy_says_what_a_forgery_is(copied: Path) -> None:
     )
 
 
+def test_a_folder_that_lacks_its_arm(copied: Path) -> None:
+    (copied / "arm.json").unlink()
+    answer = certificate_verifier.verify_path(copied)
+    assert (answer.verdict, answer.message) == ("failed", "arm.json: named by the manifest, but not there")
+
+
+def codes_of(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[set[int], str]:
+    """The exit codes of the three ways to check a file or folder, and all that they say on stderr."""
+    found = {certificate_verifier.main([str(path)])}
+    found |= {ident_main(["verify", str(path), *more]) for more in ([], ["--arm", "planar2"])}
+    return found, capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
-    ("name", "sentence"),
+    ("content", "said"),
     [
-        ("arm.json", "arm.json: named by the manifest, but not there"),
-        ("parameters.json", "parameters.json: named by the manifest, but not there"),
+        ('{"format": NaN}', "NaN is not a number that JSON knows"),
+        ('{"format": "ident-par', "not JSON"),
+        ('{"a":' * 100_000, "nested too deeply"),
+        ("[]", "not an object"),
+        ('{"format": "another"}', "format is not ident-parameters"),
     ],
 )
-def test_a_folder_that_lacks_what_it_is_about(copied: Path, name: str, sentence: str) -> None:
-    (copied / name).unlink()
-    answer = certificate_verifier.verify_path(copied)
-    assert (answer.verdict, answer.message) == ("failed", sentence)
+def test_what_is_no_parameter_file_has_one_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, said: str
+) -> None:
+    (tmp_path / "parameters.json").write_text(content)
+    codes, err = codes_of(tmp_path / "parameters.json", capsys)
+    assert codes == {2}
+    assert err.count(said) == 3
+
+
+@pytest.mark.parametrize("manifest", [True, False])
+def test_a_folder_without_parameters_has_one_exit_code(
+    copied: Path, capsys: pytest.CaptureFixture[str], manifest: bool
+) -> None:
+    (copied / "parameters.json").unlink()
+    if not manifest:
+        (copied / "manifest.json").unlink()
+    codes, err = codes_of(copied, capsys)
+    assert codes == {2}
+    assert err.count(f"{copied / 'parameters.json'}: No such file or directory") == 3
+
+
+def test_a_folder_without_a_manifest_is_said_to_be_compared_with_nothing(
+    copied: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note = "there is no manifest.json, so the other files of the folder were compared with nothing"
+    assert codes_of(copied, capsys) == ({0}, "")
+    assert certificate_verifier.main([str(copied)]) == 0
+    assert note not in capsys.readouterr().out
+    (copied / "manifest.json").unlink()
+    assert (certificate_verifier.main([str(copied)]), ident_main(["verify", str(copied)])) == (0, 0)
+    assert capsys.readouterr().out.count(f"\nnote: {note}\n") == 2
+    assert ident_main(["verify", str(copied), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == [note]
 
 
 def test_the_arm_beside_the_parameters_is_theirs(copied: Path) -> None:
@@ -124,7 +170,7 @@ def test_what_cannot_be_read_is_exit_code_2(copied: Path) -> None:
     assert (code, out, err) == (2, "", f"{copied / 'none.json'}: No such file or directory\n")
     assert run(program)[0] == 2
     (copied / "latin.json").write_bytes(b'{"a": "\xe9"}')
-    assert run(program, copied / "latin.json")[0] == 3
+    assert run(program, copied / "latin.json")[0] == 2
 
 
 def test_names_are_those_of_the_model() -> None:

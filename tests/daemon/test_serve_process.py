@@ -76,8 +76,15 @@ def test_the_command_drives_a_daemon(state: Path, commissioned: Path, capsys: py
         assert ident(capsys, "run", "quick", "--parameter", "fv1", "--confirm", "quick", *server)[0] == 2
         with Database(state) as db:
             run = import_run(db, state, commissioned, "test")["id"]
-        code, document = ident(capsys, "identify", f"{run}/identification.mcap", "--arm", "quick", *server)
-        assert (code, document["answer"]["feasible"]) == (0, True)
+        assert main(["identify", f"{run}/identification.mcap", "--arm", "quick", *map(str, server)]) == 0
+        said = capsys.readouterr().out
+        (made,) = {path.name for path in (state / "runs").iterdir()} & set(said.split())
+        # As at the daemon's machine: the text of its report but for the table, and no values by their keys.
+        summary, table = (state / "runs" / made / "report.txt").read_text().split("\nbase parameter ")
+        assert summary.startswith(("Use", "USE"))
+        assert f"run {made}\n\n{summary}\nfiles: /api/v1/runs/{made}/files\n  parameters.json\n" in said
+        assert "another_motion_mends" not in said
+        assert table.splitlines()[1] not in said
         code, document = ident(capsys, "simulate", "wam7", *server)
         assert (code, document["job"]["state"]) == (2, "failed")
         assert ident(capsys, "verify", "x.json", *server)[0] == 2

@@ -110,6 +110,13 @@ def test_a_joint_that_never_moves_is_named() -> None:
     nowhere = replace(recording, position=np.full_like(still, 0.3), sha256="2" * 64)
     with pytest.raises(RecordingError, match=r"are positions in the unit that recording\.columns names"):
         equations(nowhere, model, base)
+    # Radians that are read as degrees move, but hardly.
+    small = recording.position * np.where(np.arange(2) == 1, np.pi / 180.0, 1.0)
+    words = rf"the positions of {name} span 0\.0\d+ rad: are they in rad, and read as deg\? Then correct their unit in"
+    with pytest.raises(RecordingError, match=rf"{words} recording\.columns; else record a motion of it, .*kinematics"):
+        equations(replace(recording, position=small, sha256="3" * 64), model, base)
+    with pytest.raises(RecordingError, match="shows; record a motion of it"):
+        equations(held, model, base)
     # Another recording may move it, and whoever only judges needs no motion of it.
     assert equations([held, recording], model, base).samples > equations(recording, model, base).samples
     assert equations(held, model, base, judging=True).samples > 0

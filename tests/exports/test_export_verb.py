@@ -14,14 +14,18 @@ from exports.export_bench import some_delta
 
 from ident_service.cli import main
 from ident_service.config.load import load_arm
+from ident_service.daemon.jobs.outcome import ProcessOutput, outcome
 from ident_service.errors import ModelError
 from ident_service.estimation.identify import identify
 from ident_service.model.arm_model import arm_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
+from ident_service.results import report_files
+from ident_service.results.assessment import assess
 from ident_service.results.export import formats
 from ident_service.results.export.round_trip import RecordedMotion, unsupported_terms
+from ident_service.results.export.words import plain
 from ident_service.results.run_folder import write_manifest, write_results
 
 ALL = ["planar2.csv", "planar2.json", "planar2.sdf", "planar2.urdf", "planar2.xml", "planar2_dynamics.h"]
@@ -168,6 +172,65 @@ def test_what_no_body_has_goes_into_three_formats(
     assert code_of("export", unreal, "--format", "c,csv,json", "--out", tmp_path / "out") == 0
     assert names_in(tmp_path / "out") == ["planar2.csv", "planar2.json", "planar2_dynamics.h"]
     assert "not feasible: base parameters only" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module", params=["unusable", "second_opinion"])
+def forbidden(run: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> tuple[Path, str]:
+    """A result that must not be used, and why."""
+    folder = tmp_path_factory.mktemp("forbidden") / "run"
+    shutil.copytree(run, folder)
+    content = json.loads((folder / "parameters.json").read_text())
+    why = "torques of -- j1 have the wrong sign */ (17 % of all)"
+    if request.param == "unusable":
+        content["unusable"] = [why]
+    else:
+        content["second_opinion"] = {"agrees": False, "conclusive": True}
+        why = "A second solution of the constrained problem predicts other torques: use neither."
+    (folder / "parameters.json").write_text(json.dumps(content))
+    write_manifest(folder)
+    return folder, why
+
+
+def test_what_must_not_be_used_is_not_exported(
+    forbidden: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, why = forbidden
+    assert code_of("export", folder, "--out", tmp_path / "out") == 3
+    said = capsys.readouterr().err
+    assert f"must not be used: {why.rstrip('.')}; nothing was exported; identify again" in said
+    assert "--anyway" in said
+    # A daemon's job is this command with --json, and has no option for it.
+    assert code_of("export", folder, "--out", tmp_path / "out", "--json") == 3
+    job = outcome(ProcessOutput(json.loads(capsys.readouterr().out)), 3, "")
+    assert job.state == "refused"
+    assert why.rstrip(".") in job.detail
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_is_exported_anyway_is_marked_in_every_file(
+    forbidden: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, why = forbidden
+    assert code_of("export", folder, "--anyway", "--out", tmp_path / "out") == 0
+    assert capsys.readouterr().out.count(f"DO NOT USE: {why}") == len(ALL) == len(names_in(tmp_path / "out"))
+    texts = {path.suffix: path.read_text() for path in (tmp_path / "out").iterdir()}
+    assert json.loads(texts.pop(".json"))["unusable"] == [why]
+    assert texts.pop(".csv").splitlines()[1].startswith("do not use,")
+    for suffix, text in texts.items():
+        assert "DO NOT USE: " + plain(why) in " ".join(text.replace("\n * ", " ").split()), suffix
+
+
+def test_the_report_of_what_must_not_be_used_leads_to_no_export(
+    forbidden: tuple[Path, str], run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder, next_named in ((forbidden[0], False), (run, True)):
+        found = assess(json.loads((folder / "parameters.json").read_text()))
+        answer = folder / "report.html", found
+        monkeypatch.setattr(report_files, "make_report", lambda *_, answer=answer: answer)
+        answer[0].write_text("")
+        assert code_of("report", folder) == 0
+        assert ("next: ident export" in capsys.readouterr().out) is next_named
+        answer[0].unlink()
 
 
 @pytest.mark.parametrize("name", ["urdf", "mjcf", "sdf"])

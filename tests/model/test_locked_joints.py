@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from ident_service.model.chain import Chain
 from ident_service.model.collision import scene
 from ident_service.model.mechanism import read_mechanism
 from ident_service.model.regressor import joint_regressor
+from ident_service.operations.new_description import new_description
 from ident_service.results.export.urdf import urdf_export
 
 
@@ -249,6 +251,15 @@ def test_a_joint_outside_that_cannot_be_at_zero_is_at_its_nearest_limit() -> Non
 def test_what_is_no_arm_is_refused(text: str, kinematics: dict[str, Any], words: str) -> None:
     with pytest.raises(ModelError, match=words):
         arm(text, **kinematics)
+
+
+def test_whoever_has_no_description_yet_is_told_how_one_locks_a_joint(tmp_path: Path) -> None:
+    (tmp_path / "panda.urdf").write_text(PANDA)
+    with pytest.raises(ModelError) as caught:
+        new_description(tmp_path / "panda.urdf", tmp_path / "arm.yaml", tip="panda_leftfinger")
+    said = str(caught.value)
+    assert "lock 'panda_finger_joint1' in a description written by hand (`ident new` locks none), as" in said
+    assert "with `ident new` --base and --tip, so that it is not between them" in said
 
 
 def test_a_follower_of_the_arm_is_refused_locked_or_not() -> None:

@@ -179,11 +179,13 @@ def _preface(arm: IdentifiedArm, name: str) -> str:
     gravity = ", ".join(repr(float(g)) for g in arm.model.chain.gravity)
     terms = ", ".join(arm.model.layout.terms).replace("_", " ") or "none"
     sigma = f" * Mind: {plain(arm.deviations_note)}.\n *\n" if arm.deviations_note else ""
+    lines = textwrap.wrap(plain(arm.forbidden_note), 115)
+    forbidden = "".join(f" * {line}".rstrip() + "\n" for line in [*lines, ""] if lines)
     return f"""\
 /* Dynamics of the arm {plain(arm.model.config.name)} in identified base parameters.
  *
- * SI units: rad or m, rad/s or m/s, rad/s^2 or m/s^2, N m or N, kg, s. Torque and force are on the joint's side,
- * positive along the joint's axis. Gravity ({gravity}) m/s^2 in the base frame is part of the formulas.
+{forbidden} * SI units: rad or m, rad/s or m/s, rad/s^2 or m/s^2, N m or N, kg, s. Torque and force are on the
+ * joint's side, positive along the joint's axis. Gravity ({gravity}) m/s^2 in the base frame is part of the formulas.
  * Joint terms: {terms}. Dry friction has the sign of the velocity and is zero at rest.
  *
  *   {name}_inverse_dynamics(q, dq, ddq, tau)  tau = M(q) ddq + c(q, dq) + g(q) + friction(dq)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ident_service import __version__
 from ident_service.config.arm import Joint
-from ident_service.errors import ModelError, UsageError
+from ident_service.errors import ModelError, MustNotBeUsed, UsageError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.friction_state import presliding_distances
@@ -52,7 +52,8 @@ def csv_export(arm: IdentifiedArm, name: str) -> str:
     base, layout = arm.base, arm.model.layout
     sigma = ("" if deviation is None else repr(float(deviation)) for deviation in arm.sigma)
     free = [""] * base.size if arm.unconstrained is None else [repr(float(value)) for value in arm.unconstrained]
-    rows = [
+    rows = [("do not use", reason, "", "", "", "", "") for reason in arm.forbidden]
+    rows += [
         ("base", expression, unit, repr(float(value)), deviation, verdict, before)
         for expression, unit, value, deviation, verdict, before in zip(
             base.expressions, base.units, arm.beta, sigma, arm.verdicts, free, strict=True
@@ -65,7 +66,7 @@ def csv_export(arm: IdentifiedArm, name: str) -> str:
     rows += [("friction shape", parameter, unit, repr(value), "", "", "") for parameter, unit, value in shape]
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([_HEADER, *rows])
-    found = [row["value"] for row in csv.DictReader(io.StringIO(text.getvalue()))]
+    found = [row["value"] for row in csv.DictReader(io.StringIO(text.getvalue()))][len(arm.forbidden) :]
     meant = [*arm.beta.tolist(), *([] if arm.delta is None else arm.delta.tolist()), *(value for *_, value in shape)]
     if [float(value) for value in found] != meant:
         raise ModelError(f"{name}: the table read back differs from the parameters; it was not written")
@@ -135,6 +136,7 @@ def _document(arm: IdentifiedArm) -> dict[str, Any]:
         "arm": model.config.name,
         "software": f"ident-service {__version__}",
         "parameters_sha256": arm.source,
+        "unusable": list(arm.forbidden),
         "notes": [*body_notes(arm), *filter(None, (arm.deviations_note,))],
         "units": "SI: m, rad, kg, s, N m; torque positive along the joint's axis",
         "gravity": chain.gravity.tolist(),
@@ -223,21 +225,21 @@ _BASE_ONLY = "not feasible: base parameters only"
 
 def _urdf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.urdf"
-    said = body_notes(arm)
+    said = _said(arm)
     text, lost, notes = urdf_export(arm.model, arm.body(), name, said, arm.motion)
     return Export("urdf", name, text, lost, (*notes, *said))
 
 
 def _mjcf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.xml"
-    said = body_notes(arm)
+    said = _said(arm)
     text, lost = mjcf_export(arm.model, arm.body(), name, said, arm.motion)
     return Export("mjcf", name, text, lost, said)
 
 
 def _sdf(arm: IdentifiedArm) -> Export:
     name = f"{arm.model.config.name}.sdf"
-    said = body_notes(arm)
+    said = _said(arm)
     text, lost, notes = sdf_export(arm.model, arm.body(), name, said, arm.motion)
     return Export("sdf", name, text, lost, (*notes, *said))
 
@@ -254,14 +256,19 @@ def _csv(arm: IdentifiedArm) -> Export:
 
 
 def _c(arm: IdentifiedArm) -> Export:
-    notes = (*presliding_notes(arm), *filter(None, (arm.deviations_note,)))
-    return Export("c", f"{c_prefix(arm)}_dynamics.h", c_header(arm), notes=notes)
+    notes = (arm.forbidden_note, *presliding_notes(arm), arm.deviations_note)
+    return Export("c", f"{c_prefix(arm)}_dynamics.h", c_header(arm), notes=tuple(filter(None, notes)))
 
 
 def _notes(arm: IdentifiedArm) -> tuple[str, ...]:
     """Return the notes of the formats with base and link values."""
     notes = (_BASE_ONLY,) if arm.delta is None else body_notes(arm)
-    return (*notes, arm.deviations_note) if arm.deviations_note else notes
+    return tuple(filter(None, (arm.forbidden_note, *notes, arm.deviations_note)))
+
+
+def _said(arm: IdentifiedArm) -> tuple[str, ...]:
+    """Return the notes of the formats with link values, which are comments in the file too."""
+    return (*filter(None, (arm.forbidden_note,)), *body_notes(arm))
 
 
 FORMATS: dict[str, Callable[[IdentifiedArm], Export]] = {
@@ -299,7 +306,12 @@ def export_texts(arm: IdentifiedArm, formats: Sequence[str]) -> tuple[Export, ..
 
 
 def export_run(
-    run: Path, formats: Sequence[str], folder: Path, step: Callable[[str, float], None] = lambda words, share: None
+    run: Path,
+    formats: Sequence[str],
+    folder: Path,
+    step: Callable[[str, float], None] = lambda words, share: None,
+    *,
+    anyway: bool = False,
 ) -> tuple[Export, ...]:
     """Export a folder of results: all files, or none.
 
@@ -308,16 +320,23 @@ def export_run(
         formats: of `FORMATS`.
         folder: where the files appear; others in it stay.
         step: called with each format before it is made, and the share of them that is done, from 0 to 1.
+        anyway: whether to export parameters that must not be used; every file is marked then.
 
     Returns:
         What was written, without the texts.
 
     Raises:
         UsageError: no such format or folder, or nothing can be written there.
+        MustNotBeUsed: its parameters must not be, and they were not to be exported anyway.
         ParameterError: the files of the run are torn, changed or foreign.
         ConfigError, ModelError: the arm in it cannot be used, or a format cannot carry it.
     """
     arm, made = read_identified(run), list[Export]()
+    if arm.forbidden and not anyway:
+        raise MustNotBeUsed(
+            f"{run}: must not be used: {'; '.join(reason.rstrip('.') for reason in arm.forbidden)}; nothing was "
+            "exported; identify again and export that, or export it marked, with --anyway, where the folder is"
+        )
     for name in known_formats(",".join(formats)):
         step(f"exporting {name}", len(made) / len(formats))
         made += export_texts(arm, [name])

@@ -15,6 +15,7 @@ from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.model.base_parameters import BaseParameters, base_from_expressions
 from ident_service.model.chain import Array
 from ident_service.model.regressor import joint_regressor
+from ident_service.results.assessment import forbidden_because
 from ident_service.results.export.round_trip import AGREEMENT, RecordedMotion, disagreement, random_states
 from ident_service.results.parameter_file import (
     ParameterFile,
@@ -41,6 +42,7 @@ class IdentifiedArm:
         feasible_set: that the values are held in; `none` where they are not.
         unconstrained: base parameters before that [SI], to which `sigma` belongs, shape (base,); None where unknown.
         motion: that it was identified from; None where the file does not have it.
+        forbidden: why its values must not be used; empty where nothing says so.
     """
 
     model: ArmModel
@@ -53,6 +55,12 @@ class IdentifiedArm:
     feasible_set: str = "none"
     unconstrained: Array | None = None
     motion: RecordedMotion | None = None
+    forbidden: tuple[str, ...] = ()
+
+    @property
+    def forbidden_note(self) -> str:
+        """Return the mark that every file of values bears that must not be used; else empty."""
+        return f"DO NOT USE: {'; '.join(self.forbidden)}" if self.forbidden else ""
 
     @property
     def deviations_note(self) -> str:
@@ -127,6 +135,7 @@ def identified_arm(config: ArmConfig, parameters: ParameterFile, source: str, wh
         feasible_set=parameters.feasible_set or "none",
         unconstrained=None if (free := table.get("unconstrained_values")) is None else np.array(free, dtype=float),
         motion=None if known is None else _motion(parameters.content, base, model, where),
+        forbidden=forbidden_because(parameters.content),
     )
 
 

@@ -33,4 +33,4 @@ def comments(lost: Sequence[str], said: Sequence[str]) -> tuple[str, ...]:
 
 def plain(text: str) -> str:
     """Return text that ends no comment, in C or in XML, and begins no other line."""
-    return re.sub(r"-{2,}", "-", re.sub(r"[^A-Za-z0-9 _.,:;+*()=^-]", "_", text))
+    return re.sub(r"-{2,}", "-", re.sub(r"[^A-Za-z0-9 _.,:;+*()=^%-]", "_", text))
