@@ -639,7 +639,7 @@ class Engine:
             if live.order.resources and self._motion_socket is not None:
                 child = UnitChild(live.order.words, folder, self._motion_socket)
             else:
-                child = SubprocessJob(live.order.words, folder)
+                child = SubprocessJob(live.order.words, folder, computes=not live.order.resources)
         except (IdentError, OSError) as error:
             self._finish(live, "failed", f"its process could not be started: {error}", None)
             return
