@@ -267,7 +267,7 @@ class PositionUnknown(DriverError):
 
 
 class Stopped(ArmError):
-    """A motion did not come to its end: a stop was requested, or its lease was not renewed."""
+    """A motion, or the search for one, did not come to its end: a stop was requested, or a lease was not renewed."""
 
 
 class ArmFault(ArmError):

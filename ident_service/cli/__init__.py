@@ -105,9 +105,34 @@ def main(argv: Sequence[str] | None = None) -> int:
         SystemExit: with 0 after help or version, with 2 after words that no verb understands.
     """
     words = sys.argv[1:] if argv is None else argv
-    if completion.VARIABLE in os.environ and argv is None:
+    try:
+        return _run(words, completes=argv is None)
+    except (KeyboardInterrupt, Exception) as error:  # imports wrap an interrupt in errors of their own
+        if not _is_interrupt(error):
+            raise
+        # A second Ctrl-C, where the first one stops: the person does not want to wait for what could be saved.
+        print_to_person("ident: interrupted\n")
+        if asks_for_json(words):
+            print_error("Interrupted", "interrupted", FAILED)
+        return FAILED
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    # Not `__context__`: what failed while a verb let an arm go after an interrupt is an error of its own.
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
+
+
+def _run(words: Sequence[str], *, completes: bool) -> int:
+    """Run one verb, as `main`; complete its words instead where a shell asks for that and `completes`."""
+    if completion.VARIABLE in os.environ and completes:
         completion.complete(parser())
     enable_interrupts()
+    if "IDENT_ENDS_WITH_INPUT" in os.environ:  # a daemon's computation
+        from ident_service.model.limited_process import end_with_input
+
+        end_with_input()
     try:
         arguments = parser(words[0] if words else None).parse_args(words)
         arguments.requested_ns = time.monotonic_ns()
@@ -123,12 +148,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         with progress_bar(arguments):
             code, text, document = _answer_of(verb, arguments)
-    except KeyboardInterrupt:
-        # A second Ctrl-C: the person does not want to wait for what could be saved.
-        print_to_person("ident: interrupted\n")
-        if arguments.json:
-            print_error("Interrupted", "interrupted", FAILED)
-        return FAILED
     except IdentError as error:
         code = next(number for kind, number in _EXIT_CODES if isinstance(error, kind))
         notes = list(getattr(error, "__notes__", ()))

@@ -127,7 +127,7 @@ def _design(arguments: argparse.Namespace) -> Answer:
 
     from ident_service.config.load import load_arm
     from ident_service.excitation.search import Budget
-    from ident_service.operations.motion_design import FILES, DesignRequest, design_files
+    from ident_service.operations.motion_design import FILES, SEARCH, DesignRequest, design_files
     from ident_service.operations.motion_preview import preview_document, preview_text
     from ident_service.registry.state_folder import new_run_folder
 
@@ -152,6 +152,8 @@ def _design(arguments: argparse.Namespace) -> Answer:
     with stopping:
         designed, seen = design_files(request, folder, _progress(arguments), stopping.requested)
     unfinished = "" if designed.found.finished or request.resume else _UNFINISHED
+    if stopping.requested():
+        unfinished = f"interrupted; the best motion so far is written, and --resume {folder / SEARCH} searches on"
     if unfinished:
         print_to_person(f"ident: {unfinished}\n")
     teaches = bool(np.isfinite(seen.deviations).any())

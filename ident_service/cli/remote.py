@@ -381,13 +381,21 @@ def follow(
         every: s between turns; the job itself is looked at less often.
 
     Returns:
-        The job as it was last.
+        The job as it was last; it runs still where its end cannot be entered for 10 s, or after Ctrl-C.
     """
+    from ident_service.client.client import UNENTERED
+
     looked, phase, cancelled = time.monotonic(), "", False
+    entered = looked
     while job["state"] in LIVE:
+        unentered = job["state"] == "running" and bool(job["detail"])
+        if not unentered:
+            entered = time.monotonic()
+        elif cancelled or time.monotonic() - entered > UNENTERED:
+            break
         if not cancelled and over():
             cancelled = True
-            if not ours:
+            if not ours or unentered:
                 break
             with suppress(UsageError):  # it has ended meanwhile, as the next look will tell
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
@@ -402,7 +410,7 @@ def follow(
             for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
                 tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
         known = job["progress"] or {}
-        state = f"queued, {job['detail']}" if job["state"] == "queued" and job["detail"] else job["state"]
+        state = ", ".join(filter(None, (job["state"], job["detail"])))
         said = known.get("phase", state)
         step_of(arguments)(said, known.get("fraction"), known.get("remaining"))
         if said != phase:
@@ -428,6 +436,8 @@ def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None
     lines += [f"run {job['run']}"] if job["run"] else []
     if code is None:  # bad input has the code that it has at the machine
         code = USAGE if (job["state"], job["exit_code"]) == ("failed", USAGE) else _CODES.get(job["state"], FAILED)
+        if job["state"] == "running":  # its end is known, and cannot be entered
+            code = job["exit_code"] or FAILED
     return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
 
 

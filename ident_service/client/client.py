@@ -64,6 +64,11 @@ class Job:
         """Tell if the job has not ended."""
         return self.state in _LIVE
 
+    @property
+    def unentered(self) -> bool:
+        """Tell if the job has ended and the daemon cannot enter that yet, on a full disk for example; `detail` says."""
+        return self.state == "running" and bool(self.detail)
+
 
 @dataclass(frozen=True)
 class LiveSample:
@@ -151,6 +156,7 @@ def _send(connection: Connection, stream: BinaryIO, seen: dict[str, Any], tell: 
 _API: Final = "/api/v1"
 _RENEWED: Final = 0.5  # s between renewals of a lease, which lasts four times as long
 _LOOK = 0.3  # s between looks at a job
+UNENTERED: Final = 10.0  # s that an end is waited for which the daemon cannot enter
 _AGAIN, _TRIES = 1.0, 30  # s between tries to take up a stream, and how many
 
 
@@ -322,8 +328,16 @@ class IdentClient(Connection):
         return ArmFault(faults[0]["code"], f"{faults[0]['cause']}; {words}")
 
     def wait(self, job: str) -> Job:
-        """Wait until a job has ended, or its arm is held until a person confirms that it is supported (`held`)."""
+        """Wait until a job has ended, or its arm is held until a person confirms that it is supported (`held`).
+
+        An end that the daemon cannot enter (`unentered`) is waited for 10 s.
+        """
+        entered = time.monotonic()
         while (seen := self.job(job)).live and not seen.held:
+            if not seen.unentered:
+                entered = time.monotonic()
+            elif time.monotonic() - entered > UNENTERED:
+                break
             time.sleep(_LOOK)
         return seen
 
@@ -461,9 +475,9 @@ class RemoteMotion:
         return self._ended
 
     def live(self) -> Iterator[LiveSample]:
-        """Yield samples of a run until it ends, or its arm is held; `uncertainty` has the deviations so far."""
+        """Yield samples of a run until it ends or its arm is held; `uncertainty` has the deviations so far."""
         for kind, _, value in self.client.stream(f"{_API}/jobs/{self.id}/live"):
-            if kind == "job" and value["job"].get("held"):
+            if kind == "job" and (value["job"].get("held") or _job(value["job"]).unentered):
                 return
             if kind == "doubt":
                 self.uncertainty = value

@@ -142,7 +142,8 @@ class ProgressAnswer(BaseModel):
 class JobAnswer(BaseModel):
     """A job; `run` is the id of the run, motion or export that it makes or is about, null where it ended and made none.
 
-    `detail` says why it ended so, and of a queued job what it waits for.
+    `detail` says why it ended so, and of a queued job what it waits for. Of a running job it is empty, unless its
+    process has ended and the registry cannot take that yet, on a full disk for example: then it says how, and why.
 
     `held` says that its motion has stopped, and that the arm, which has no brakes, is held until a person confirms that
     it is supported. Until then the job runs; after a kill of the daemon it is `interrupted`, and the arm held all the

@@ -22,6 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -30,6 +31,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from scipy.optimize import minimize
@@ -38,6 +40,7 @@ from ident_service.errors import SolverError, UsageError
 from ident_service.excitation.optimal_design import LINEAR, Problem, Task
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
+from ident_service.model.limited_process import end_with_parent
 
 _ROUNDS = ((2.0, 1.0, 60), (4.0, 3.0, 60), (8.0, 9.0, 60), (16.0, 27.0, 80), (24.0, 81.0, 80))
 _SHARPER = (24.0, 64.0)  # exponent of the condition number's power means, in the first rounds of the polish and later
@@ -516,10 +519,22 @@ def _worker_pool(
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     pool = ProcessPoolExecutor(
-        budget.workers, mp_context=context, initializer=_begin, initargs=(task, safe, seed, per_period, stop)
+        budget.workers,
+        mp_context=context,
+        initializer=_begin,
+        initargs=(task, safe, seed, per_period, stop, os.getpid()),
     )
+
+    def submit(number: int, candidate: Candidate | None, until: float | None) -> Future[Candidate]:
+        # A process that this starts inherits what is blocked, from its first moment on; ours comes when it is over.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINALS)
+        try:
+            return pool.submit(_work, number, candidate, until)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
     try:
-        yield _WorkerPool(lambda number, candidate, until: pool.submit(_work, number, candidate, until), stop.set)
+        yield _WorkerPool(submit, stop.set)
     finally:
         stop.set()
         pool.shutdown(wait=True, cancel_futures=True)
@@ -560,13 +575,16 @@ class _Worker:
                 return stopped.candidate
 
 
+_TERMINALS: Final = (signal.SIGINT, signal.SIGHUP)  # signals that a terminal sends to all processes of a command
 _worker: _Worker | None = None
 
 
-def _begin(task: Task, safe: Array, seed: int, per_period: int, stop: Event) -> None:
-    """Initialise a worker process: ignore the terminal's interrupt, as the parent sets `stop` instead."""
+def _begin(task: Task, safe: Array, seed: int, per_period: int, stop: Event, parent: int) -> None:
+    """Initialise a worker process: it ends with its parent, and what a terminal asks is for that, which sets `stop`."""
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in _TERMINALS:
+        signal.signal(number, signal.SIG_IGN)
+    end_with_parent(parent)
     _worker = _Worker(task, safe, seed, per_period, stop.is_set)
 
 

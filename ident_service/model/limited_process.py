@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import resource
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ident_service.errors import ModelError
 
@@ -56,6 +59,34 @@ def run_limited_process(module: str, path: Path, deadline: float, *more: str) ->
     if done.returncode == -signal.SIGXCPU:
         raise ModelError("takes too long to read and judge; give a smaller one")
     raise ModelError("breaks what reads it: a name twice, a name that is reserved, or too much memory; mend it")
+
+
+ENDS_WITH_INPUT: Final = "IDENT_ENDS_WITH_INPUT"  # in the environment of a command whose starter it must not outlive
+_PR_SET_PDEATHSIG = 1  # of prctl(2)
+
+
+def end_with_input() -> None:
+    """Kill this process as soon as its standard input ends, as a pipe does with the process at its other end."""
+    os.environ.pop(ENDS_WITH_INPUT, None)  # of this command, and not of what it starts
+
+    def wait() -> None:
+        with suppress(OSError):
+            while os.read(0, 4096):
+                pass
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=wait, name="input", daemon=True).start()
+
+
+def end_with_parent(parent: int) -> None:
+    """Have the kernel kill this process when the thread that started it ends, which a killed process's threads do.
+
+    Args:
+        parent: id of the process that started this one; if that is gone already, this one ends at once.
+    """
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def answer_within(memory: int, seconds: int, document: Callable[[], dict[str, Any]]) -> int:

@@ -13,7 +13,7 @@ import math
 import re
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -101,6 +101,7 @@ def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
 
         document = urdf_document(file, part)
     else:
+        _require_mjcf_axes(file)
         document = _mjcf_document(file, part, own=own)
     if (error := document.get("error")) is not None:
         raise ModelError(f"{file.name}: {error}")
@@ -185,6 +186,38 @@ _UNITS: Final = {
     **dict.fromkeys(("lower", "upper"), "rad (m of a slide)"),
 }
 _LONGEST_SHOWN: Final = 40  # characters of a name or value
+_AXIS_LENGTHS: Final = (1e-6, 1e6)  # that parsers make unit length of; about a shorter axis nothing moves
+
+
+def _is_direction(words: Sequence[str]) -> bool:
+    """Return whether words are an axis: three numbers that have a length."""
+    values = [_as_number(word) for word in words]
+    return len(values) == 3 and _AXIS_LENGTHS[0] <= math.hypot(*values) <= _AXIS_LENGTHS[1]
+
+
+def _no_direction(what: str, said: str) -> str:
+    return f"{what} is {said[:_LONGEST_SHOWN]!r}, which is no direction; give one of length 1, such as 0 0 1"
+
+
+def _require_mjcf_axes(file: TextFile) -> None:
+    """Refuse axes of an MJCF that are no direction, those of its default classes too; its elements were counted.
+
+    Raises:
+        ModelError: each with its line.
+    """
+    mistakes: list[str] = []
+    parser = expat.ParserCreate("utf-8")
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        if tag == "joint" and "axis" in attributes and not _is_direction(attributes["axis"].split()):
+            where = f"{file.name}:{parser.CurrentLineNumber}: joint {attributes.get('name', '')[:_LONGEST_SHOWN]!r}"
+            mistakes.append(f"{where}: {_no_direction('axis', attributes['axis'])}")
+
+    parser.StartElementHandler = begin
+    parser.Parse(file.text.encode("utf-8", "surrogatepass"), True)
+    if mistakes:
+        more = len(mistakes) - _MOST_LISTED
+        raise ModelError("; ".join(mistakes[:_MOST_LISTED]) + (f"; and {more} more" if more > 0 else ""))
 
 
 class _Urdf:
@@ -280,6 +313,8 @@ class _Urdf:
                 should = "three numbers" if count > 1 else f"a number{f' of {_UNITS[key]}' if key in _UNITS else ''}"
                 said = attributes[key][:_LONGEST_SHOWN]
                 self._mistakes.append((line, f"{where}: {tag} {key} is {said!r}; give {should}"))
+            elif tag == "axis" and not _is_direction(words):
+                self._mistakes.append((line, f"{where}: {_no_direction('axis xyz', attributes[key])}"))
 
     def _where(self) -> str:
         return f"joint {self._joint['name'][:_LONGEST_SHOWN]!r}"

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from ident_service.config.load import load_arm
 from ident_service.config.motion_design import Design
 from ident_service.config.motion_limits import motion_limits
-from ident_service.errors import UsageError, plain_mistake
+from ident_service.errors import Stopped, UsageError, plain_mistake
 from ident_service.estimation.equations import equations
 from ident_service.excitation.described_motion import excitation
 from ident_service.excitation.design import Designed, complete_task, design_motion, family
@@ -151,6 +151,7 @@ def design_files(
         cancelled: True ends the search with what it has.
 
     Raises:
+        Stopped: it was cancelled before it had found a motion that teaches anything; nothing is written.
         UsageError, ConfigError: the request or the description is not valid.
         MotionRefused: limits that contradict each other, home in collision, no posture that keeps them.
         RecordingError, ParameterError: a file of the knowledge cannot be used.
@@ -186,6 +187,8 @@ def design_files(
         cancelled=cancelled,
     )
     seen = _previewed(model, designed.excitation, request.knowledge)
+    if cancelled() and not np.isfinite(seen.deviations).any():
+        raise Stopped("interrupted before a first motion was found; nothing is written")
     with atomic_folder(folder) as staging:
         write_atomically(staging / MOTION, designed.excitation.to_json() + "\n")
         write_atomically(staging / SEARCH, found_to_json(designed.found, task) + "\n")

@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 from cli.conftest import COARSE, Ident, left_over, quick_arm, run_main
 
+from ident_service.cli.output import StopOnSignal
+
 QUICK = ("--starts", 1, "--workers", 1)
 
 
@@ -62,6 +64,17 @@ def test_a_design_is_not_written_over(tmp_path: Path, ident: Ident) -> None:
     ended = ident("design", "planar2", "--seconds", 600, "--out", tmp_path)
     assert ended.code == 2
     assert (tmp_path / "motion.json").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_a_search_that_is_interrupted_before_it_found_a_motion_leaves_nothing(
+    tmp_path: Path, ident: Ident, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(StopOnSignal, "requested", lambda _: True)
+    words = ("--search-time", 600, "--workers", 1, "--out", tmp_path / "m")
+    ended = ident("design", quick_arm(tmp_path, *COARSE), *words)
+    assert (ended.code, ended.err) == (1, "ident: interrupted before a first motion was found; nothing is written\n")
+    assert not (tmp_path / "m").exists()
 
 
 @pytest.mark.campaign

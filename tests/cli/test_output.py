@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from ident_service import cli
 from ident_service.cli.output import StopOnSignal, interrupting, print_answer, print_error, print_to_person, tell
 
 TALK = """
@@ -138,6 +139,37 @@ def test_a_polite_kill_is_an_interrupt_that_arms_are_let_go_by(number: signal.Si
         preflight()
     assert let_go == ["torque off"]
     assert signal.getsignal(number) is before
+
+
+class Interrupting:
+    """What an interrupt meets while the class is made whose attribute this is."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("place", ["_require_own_packages", "parser"])
+def test_an_interrupt_while_modules_load_is_an_interrupt(
+    place: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def load(*_: object) -> None:
+        type("Loaded", (), {"attribute": Interrupting()})  # in Python 3.11 a RuntimeError comes out
+
+    monkeypatch.setattr(cli, place, load)
+    assert cli.main(["config", "check", "planar2"]) == 1
+    assert capsys.readouterr().err == "ident: interrupted\n"
+
+
+def test_what_fails_after_an_interrupt_is_not_hidden_by_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def let_go() -> None:
+        try:
+            raise KeyboardInterrupt
+        finally:
+            raise RuntimeError("torque still on")
+
+    monkeypatch.setattr(cli, "_require_own_packages", let_go)
+    with pytest.raises(RuntimeError, match="torque still on"):
+        cli.main(["config", "check", "planar2"])
 
 
 INTERRUPTED = """

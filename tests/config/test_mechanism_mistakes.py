@@ -167,6 +167,7 @@ REFUSED = [
     ),
 ]
 TAKEN = [
+    ('axis xyz="0 0 1"', 'axis xyz="0 0 -250"'),
     ("revolute", "continuous"),
     (LIMIT, '<limit velocity="+1.e0" effort=" 10"/>'),
     (LIMIT, f'{LIMIT}<limit effort="x"/>'),
@@ -195,6 +196,19 @@ def test_what_a_urdfs_parser_refuses_is_reported_with_its_line_and_in_our_words(
     assert not (tmp_path / "o").exists()
     with pytest.raises(ValueError, match="valid URDF"):
         pinocchio.buildModelFromXML((tmp_path / "r.urdf").read_text())
+
+
+@pytest.mark.parametrize("axis", ["0 0 0", "0 -0.0 0e5", "1e-170 0 0", "1e300 0 0"])
+@pytest.mark.parametrize("verb", [("config", "check"), ("new",)])
+def test_an_axis_that_is_no_direction_is_refused(
+    tmp_path: Path, axis: str, verb: tuple[str, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "r.urdf").write_text(URDF.replace('axis xyz="0 0 1"', f'axis xyz="{axis}"'))
+    (tmp_path / "arm.yaml").write_text("format: ident-arm\nversion: 1\nname: r\nkinematics: {urdf: r.urdf}\n")
+    file = tmp_path / ("r.urdf" if verb == ("new",) else "arm.yaml")
+    assert main([*verb, str(file), *(["--out", str(tmp_path / "o")] if verb == ("new",) else [])]) == 2
+    assert f"r.urdf:8: joint 'j': axis xyz is '{axis}', which is no direction; give one" in capfd.readouterr().err
+    assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize(("old", "new"), [("", ""), *TAKEN])

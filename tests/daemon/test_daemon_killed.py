@@ -7,6 +7,7 @@ import random
 import signal
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ from daemon.test_full_disk import held_text, wait_for
 
 from ident_service.cli import main
 from ident_service.client import IdentClient
+from ident_service.daemon.jobs.child_process import alive
 from ident_service.errors import ArmError, MotionRefused
 from ident_service.motion.command_channel import controlling_pid, in_use
 from ident_service.operations.moving_arms import held_arm
 from ident_service.recordings.open import open_recording
 from ident_service.registry.database import Database
+from ident_service.registry.jobs import known_job
 from ident_service.registry.state_folder import control_path
 from ident_service.results.manifest import verified_files
 
@@ -202,6 +205,22 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
         assert process.wait(20) == 0
     assert main(["supported", ARM, "--confirm", ARM, "--state", str(state)]) == 2
     assert "not held: no process has the arm" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_computation_ends_with_its_daemon(state: Path) -> None:
+    with daemon_process(state) as (process, client):
+        job = client.begin("simulate", arm="planar2").id
+        until = time.monotonic() + 60.0
+        with closing(Database(state)) as db:
+            while not (name := known_job(db, job)["process"]):
+                assert time.monotonic() < until
+                time.sleep(0.02)
+        wait_for((state / "jobs" / job / "log").read_text)
+        process.kill()
+        process.wait()
+        time.sleep(1.0)
+        assert not alive(name)
 
 
 @pytest.mark.slow

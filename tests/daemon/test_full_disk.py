@@ -18,9 +18,10 @@ from typing import Any
 import httpx
 import pytest
 from daemon.conftest import Asked, checked_before, patient_text, serving
-from daemon.served import daemon_process
+from daemon.served import daemon_process, listening
 
 from ident_service.cli import main
+from ident_service.client import IdentClient
 from ident_service.errors import ArmError, ArmFault, UsageError
 from ident_service.motion.command_channel import ControlFile, in_use
 from ident_service.operations.moving_arms import held_arm
@@ -48,7 +49,9 @@ def test_the_end_of_a_job_waits_for_room(
     while daemon.get("/healthz").status_code == 200 and time.monotonic() < until:
         time.sleep(0.05)
     assert daemon.get("/healthz").status_code == 503
-    assert daemon.get(f"/api/v1/jobs/{job['id']}").json()["state"] == "running"
+    seen = daemon.get(f"/api/v1/jobs/{job['id']}").json()
+    assert (seen["state"], seen["exit_code"], seen["progress"]) == ("running", 0, None)
+    assert seen["detail"] == "it has ended (done), but that cannot be entered: database or disk is full"
     full[0] = False
     assert daemon.follow(job["id"])["state"] == "done"
     while daemon.get("/healthz").status_code != 200 and time.monotonic() < until:
@@ -66,6 +69,35 @@ def test_the_end_of_a_job_waits_for_room(
     assert [one.getMessage() for one in caplog.records if "entered yet" in one.getMessage()] == [
         "the end of a job cannot be entered yet: database or disk is full"
     ]
+
+
+@pytest.mark.slow
+def test_who_waits_for_a_job_is_told_that_its_end_cannot_be_entered(
+    state: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ended = rows.ended
+
+    def without_room(*arguments: Any) -> bool:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("ident_service.client.client.UNENTERED", 0.1)
+    monkeypatch.setattr("ident_service.daemon.jobs.queue._AGAIN", 0.05)
+    with listening(state) as reached, IdentClient(reached.url, reached.token) as client:
+        monkeypatch.setattr(rows, "ended", without_room)
+        assert main(["base-parameters", "planar2", "--server", client.url]) == 1
+        said = capsys.readouterr()
+        remedy = "it has ended (done), but that cannot be entered: the disk of the daemon's state folder is full; free"
+        assert said.out.count(remedy) == 2  # while it waits, and in its answer
+        (job,) = client.jobs()
+        assert job.unentered
+        assert client.wait(job.id).detail.startswith(remedy)
+        # A fault that has stopped an arm keeps its exit code.
+        (live,) = reached.service.engine.live.entered()
+        live.exit_code = 4
+        assert main(["jobs", "watch", job.id, "--server", client.url]) == 4
+        monkeypatch.setattr(rows, "ended", ended)
+        wait_for(lambda: not client.job(job.id).live)
+        assert not client.job(job.id).unentered
 
 
 MAINTENANCE: tuple[str, dict[str, str]] = ("/api/v1/arms/planar2/maintenance", {"what": "oil"})
@@ -284,6 +316,9 @@ def test_a_disk_that_fills_while_an_arm_without_brakes_moves_is_reported_while_i
         time.sleep(2.5)
         assert log_of(state).count("cannot be entered yet") == 1
         assert client.job(job.id).state == "running"
+        assert client.job(job.id).detail.startswith("it has ended (faulted: ")
+        assert "is full; free disk space there" in client.job(job.id).detail
+        assert client.job(job.id).document["exit_code"] == 4
         reader.close()
         filled[0].unlink()
         wait_for(lambda: not client.job(job.id).live)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -145,6 +148,21 @@ def test_cancelling_ends_the_work_of_other_processes_too() -> None:
     first = next(progress.finished for progress in told if progress.finished > 0)
     # Two under way, and two that were done when the first of them was told.
     assert 0 < found.finished <= first + 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_terminal_that_interrupts_reaches_its_processes_only_through_the_search(number: signal.Signals) -> None:
+    hit = set[int]()
+
+    def interrupt(_: Progress) -> None:
+        for process in Path(f"/proc/self/task/{os.getpid()}/children").read_text().split():
+            if b"spawn_main" in Path(f"/proc/{process}/cmdline").read_bytes():
+                hit.add(int(process))
+                os.kill(int(process), number)  # while it imports, too
+
+    assert starts(1, workers=2, tell=interrupt).finished == 1
+    assert hit
 
 
 @pytest.mark.slow

@@ -218,6 +218,14 @@ def test_urdfs_that_are_no_arm_are_refused(file: TextFile, message: str) -> None
 BODY = '<inertial pos="0 0 0.1" mass="1" diaginertia="0.1 0.1 0.1"/></body>'
 
 
+@pytest.mark.parametrize("axis", ["0 0 0", "nan 0 1", "0 1", "1e400 0 0", ""])
+def test_mjcfs_with_an_axis_that_is_no_direction_are_refused(axis: str) -> None:
+    file = mjcf(f'<body name="a">\n<joint name="j" axis="{axis}"/>' + BODY)
+    line = 1 + file.text[: file.text.index("<joint")].count("\n")
+    with pytest.raises(ModelError, match=rf":{line}: joint 'j': axis is '{axis}', which is no direction; give one of"):
+        read_mjcf(file, GRAVITY)
+
+
 @pytest.mark.parametrize(
     ("file", "message"),
     [

@@ -1,7 +1,8 @@
 """Start a job's process, talk to it over its standard input, and find it again after a crash of the service.
 
 The output goes into files of the job's folder, not through the service, so that nothing of it is lost when the service
-dies. The end of its standard input tells a motion that whoever asked for it is gone (`cli/operator_input.py`).
+dies. The end of its standard input tells a motion that whoever asked for it is gone (`cli/operator_input.py`), and ends
+a computation at once: nobody would enter what it makes.
 
 A motion may be given to a unit of its own instead (`configs/systemd/`): then the process is the service manager's
 child, behind a local socket, and not ours; whatever becomes of our unit, it has the time to stop its arm.
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from ident_service.errors import UsageError
-from ident_service.model.limited_process import own_module
+from ident_service.model.limited_process import ENDS_WITH_INPUT, own_module
 
 ANSWER, LOG, PROCESS = "answer.json", "log", "process"
 RENEW: Final = b"\n"
@@ -53,9 +54,10 @@ class JobProcess(Protocol):
 class SubprocessJob:
     """Implement `JobProcess` with a subprocess of the daemon."""
 
-    def __init__(self, words: tuple[str, ...], folder: Path) -> None:
-        """Start `ident WORDS` with its files in `folder`."""
+    def __init__(self, words: tuple[str, ...], folder: Path, *, computes: bool = False) -> None:
+        """Start `ident WORDS` with its files in `folder`; one that `computes` ends with this process."""
         command, environment = own_module("ident_service", *words)
+        environment |= {ENDS_WITH_INPUT: "1"} if computes else {}
         environment.pop("NOTIFY_SOCKET", None)  # the service manager watches the service, not this process
         with (folder / ANSWER).open("xb") as answer, (folder / LOG).open("xb") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and command

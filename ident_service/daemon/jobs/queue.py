@@ -117,6 +117,8 @@ class LiveJob:
         terminated: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
         concluding: whether its end is being entered.
+        unentered: how it ended and why the registry cannot take that yet; empty where nothing is in the way.
+        exit_code: with which its process has ended, as far as it is known.
     """
 
     job: str
@@ -132,6 +134,8 @@ class LiveJob:
     terminated: bool = False
     killed: bool = False
     concluding: bool = False
+    unentered: str = ""
+    exit_code: int | None = None
 
 
 class LiveJobs:
@@ -282,6 +286,11 @@ class LiveJobs:
         live = self._jobs.get(job)
         return live is not None and bool(live.end_reason)
 
+    def unentered(self, job: str) -> tuple[str, int | None]:
+        """Return how a job ended whose end cannot be entered yet, and why, with its exit code; else an empty text."""
+        live = self._jobs.get(job)
+        return ("", None) if live is None else (live.unentered, live.exit_code)
+
     # --- leases and stops
 
     def lease_holder(self, job: str) -> str | None:
@@ -406,7 +415,6 @@ class Engine:
         self.db, self.state, self.audit = db, state, AuditQueue(db)
         self.live = LiveJobs(lease_factor, now, self.metrics.renewed)
         self._computing, self._motion_socket, self._now = computing, motion_socket, now
-        self._unwritten: set[str] = set()  # jobs whose end waits for room
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name="jobs", daemon=True)
         self._following = threading.Thread(target=self._follow_orphans, name="orphans", daemon=True)
@@ -439,7 +447,7 @@ class Engine:
     def healthy(self) -> bool:
         """Return whether the queue is being looked after, and the registry can be written."""
         alive = self._thread.is_alive() and self.live.healthy
-        return alive and self._now() - self.beat < 30.0 and not self._unwritten
+        return alive and self._now() - self.beat < 30.0 and not any(one.unentered for one in self.live.entered())
 
     def create(
         self,
@@ -631,7 +639,7 @@ class Engine:
             if live.order.resources and self._motion_socket is not None:
                 child = UnitChild(live.order.words, folder, self._motion_socket)
             else:
-                child = SubprocessJob(live.order.words, folder)
+                child = SubprocessJob(live.order.words, folder, computes=not live.order.resources)
         except (IdentError, OSError) as error:
             self._finish(live, "failed", f"its process could not be started: {error}", None)
             return
@@ -657,20 +665,29 @@ class Engine:
         """Enter what an ended job has made, then the job's end."""
         self.live.conclude(live, child)
         ended = outcome(process_output(self.state / JOBS / live.job), child.exit_code, live.end_reason)
+        live.exit_code = ended.exit_code
         while True:
             try:
                 self._finish(live, ended.state, self._enter_outputs(live, ended.detail), ended.exit_code)
             except (sqlite3.Error, OSError) as error:
                 # For example a full disk; until there is room, the service must not count as healthy.
-                if live.job not in self._unwritten:  # once, however long it lasts
+                if not live.unentered:  # once, however long it lasts
                     LOG.error("the end of a job cannot be entered yet: %s", error, extra={"job": live.job})
-                self._unwritten.add(live.job)
+                how = ended.state + (f": {ended.detail}" if ended.detail else "")
+                live.unentered = f"it has ended ({how}), but that cannot be entered: {self._remedy(error)}"
                 if self._closing.wait(_AGAIN):
                     self.live.remove(live)  # the next start determines the job's outcome
                     return
             else:
-                self._unwritten.discard(live.job)
                 return
+
+    def _remedy(self, error: Exception) -> str:
+        short = shortage(self.state / FILE, error)
+        if isinstance(error, DiskFull) or isinstance(short, DiskFull):
+            return "the disk of the daemon's state folder is full; free disk space there, then it is entered by itself"
+        if short is not None:
+            return "another process has locked the registry; it is entered when that has ended"
+        return str(error)
 
     def _enter_outputs(self, live: LiveJob, detail: str) -> str:
         """Enter what a job made; return `detail`, with the error if that failed."""

@@ -243,6 +243,9 @@ def job_answer_document(service: Service, row: Row) -> answers.JobAnswer:
         shown["detail"] = f"waits for {before}"
         if other is not None and held_arm(service.state, str(other["arm"])):
             shown["detail"] += f", which holds {held_until(other['arm'])}"
+    unentered, code = service.engine.live.unentered(row["id"]) if row["state"] == "running" else ("", None)
+    if unentered:
+        shown["detail"], shown["exit_code"], progress = _named(unentered, service, row), code, None
     return answers.JobAnswer(**{**shown, "progress": progress, "held": held})
 
 
