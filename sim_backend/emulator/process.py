@@ -381,9 +381,10 @@ class _Run:
                         break
                 heard, at_once = self._station.receive(max(0, self._next_due(looked) - now) * 1e-9), 0
                 while at_once < _AT_ONCE:
-                    now = clock.now_ns()
-                    if heard is None and now >= self._next_due(looked):
-                        heard = self._station.receive(0.0)  # what came before what is due is handled before it
+                    if heard is None:
+                        # The drives' time is moved to `now` below: what was sent until then comes before.
+                        now = clock.now_ns()
+                        heard = self._station.receive(0.0)
                     if heard is None:
                         break
                     at_once += 1
