@@ -107,7 +107,8 @@ def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, 
 @pytest.mark.parametrize("held", [True, False])
 def test_a_job_whose_arm_is_held_shows_no_progress(state: Path, held: bool) -> None:
     """It ends when a person says so; what ends by itself says when."""
-    engine = SimpleNamespace(progress=lambda _: Progress("exciting", 0.99, 0.0))
+    live = SimpleNamespace(unentered=lambda _: ("", None))
+    engine = SimpleNamespace(progress=lambda _: Progress("exciting", 0.99, 0.0), live=live)
     numbers = {"number": 1, "motion": 1, "created": 1.0, "started": 2.0, "ended": None, "exit_code": None}
     words = {"id": "j", "kind": "run", "arm": ARM, "state": "running", "run": "r", "created_by": "ann", "detail": ""}
     row = {**numbers, **words, "request": {}, "words": []}
