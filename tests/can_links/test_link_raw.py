@@ -50,7 +50,7 @@ def attribute(kind: int, data: bytes) -> bytes:
 
 
 def link_message(state: int) -> bytes:
-    """What the kernel answers of a CAN interface (linux/rtnetlink.h, if_link.h, can/netlink.h), shortened."""
+    """Return the kernel's answer about a CAN interface, shortened (linux/rtnetlink.h, if_link.h, can/netlink.h)."""
     of_can = attribute(1, bytes(32)) + attribute(4, struct.pack("=I", state)) + attribute(6, struct.pack("=I", 100))
     info = attribute(1, b"can\0") + attribute(2, of_can)
     body = struct.pack("=BxHiII", 0, 280, 5, 0x100C1, 0) + attribute(3, b"can0\0") + attribute(0x8000 | 18, info)

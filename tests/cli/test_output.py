@@ -142,7 +142,7 @@ def test_a_polite_kill_is_an_interrupt_that_arms_are_let_go_by(number: signal.Si
 
 
 class Interrupting:
-    """What an interrupt meets while the class is made whose attribute this is."""
+    """Interrupt the making of a class of which this is an attribute, as Ctrl-C during an import may."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         signal.raise_signal(signal.SIGINT)

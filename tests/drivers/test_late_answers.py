@@ -151,7 +151,7 @@ def test_of_a_late_answer_and_one_in_time_the_second_counts(kind: str) -> None:
 
 @KINDS
 def test_a_node_that_stalls_and_answers_the_last_request_alone_is_not_late(kind: str) -> None:
-    """As drives do whose processor was busy: only one answer, once, comes at an unusual time."""
+    """Take one answer at an unusual time for the latest: a drive whose processor was busy gives only that one."""
     with running(kind) as (arm, link):
         link.delay = lambda frame: None
         silent = [arm.exchange(NONE) for _ in range(2)]
