@@ -1,4 +1,4 @@
-"""Find columns of a recording that were read with the wrong sign or for another joint, by fitting each other reading.
+"""Find columns that were read with the wrong sign, factor or time, or for another joint, by fitting each other reading.
 
 Forced into the feasible set, an estimate predicts a part of any torque, so that its error alone does not tell wrong
 columns from a poor model. The reading that is right leaves an error smaller by an order of magnitude than all others.
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import SolverError
-from ident_service.estimation.equations import motions_of, rows_of_motion
+from ident_service.estimation.equations import Rows, motions_of, rows_of_motion
 from ident_service.estimation.feasible.problems import ENOUGH, constrained_least_squares
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import (
@@ -27,6 +27,7 @@ from ident_service.estimation.least_squares import (
 )
 from ident_service.estimation.signal_processing import Motion
 from ident_service.model.arm_model import ArmModel
+from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.chain import Array
 from ident_service.model.information import Information, sparsity, triangle
@@ -41,6 +42,11 @@ EXPLAINED = 10.0  # percent of all torques in motion that the right reading leav
 _LONGEST = 60.0  # s of recordings that are fitted
 _ROWS = 1000  # that are fitted, about
 _TRIED = 6  # readings besides signs of torques that are fitted under the conditions, while none explains: the best
+_NUMBERS = np.concatenate([-np.arange(1.0, 38.0)[::-1], np.arange(1.0, 38.0)])
+_FACTORS = 1.2 ** (_NUMBERS + np.sign(_NUMBERS))  # from 1.44, beyond what gains are off, to a thousand
+_DELAYS = 3e-3 * np.sign(_NUMBERS) * 1.15 ** np.abs(_NUMBERS)  # s; to half a second
+
+_NO_DELAYS = np.empty(0)
 
 _Which = Literal["torque", "position", "both"]
 
@@ -53,16 +59,25 @@ class Reading:
         which: columns that it is about.
         joints: one whose sign is negated, two that are exchanged, or all.
         all_negated: whether it is about all, with the other sign.
+        factor: that the columns of one joint, or of all, are multiplied by.
+        late: time by which the torque of one joint is stamped too late [s].
     """
 
     which: _Which
     joints: tuple[int, ...]
     all_negated: bool = False
+    factor: float = -1.0
+    late: float = 0.0
+
+    @property
+    def exchanges(self) -> bool:
+        """Return whether columns are exchanged; else those of one joint, or all, are read otherwise."""
+        return len(self.joints) == 2 and not self.all_negated
 
     @property
     def negates(self) -> bool:
-        """Return whether signs are negated; else columns are exchanged."""
-        return self.all_negated or len(self.joints) == 1
+        """Return whether signs are negated."""
+        return not self.exchanges and self.factor == -1.0
 
     @property
     def of_torque_signs(self) -> bool:
@@ -70,14 +85,14 @@ class Reading:
         return self.which == "torque" and self.negates
 
     def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
-        """Return positions, velocities or torques, shape (samples, joints), as they are read."""
+        """Return positions, velocities or torques, shape (samples, joints), as they are read but for their time."""
         if self.which not in (what, "both"):
             return columns
         read = columns.copy()
-        if self.negates:
-            read[:, self.joints] *= -1.0
-        else:
+        if self.exchanges:
             read[:, self.joints] = columns[:, self.joints[::-1]]
+        else:
+            read[:, self.joints] *= self.factor
         return read
 
 
@@ -122,6 +137,18 @@ class MisreadColumns:
                     f" negated ({each}): turn its axis in the description, or give both columns the factor -1"
                     " (recording.columns)"
                 )
+            if late := self.reading.late:
+                when = f"{abs(late):.2g} s too {'late' if late > 0.0 else 'early'}"
+                return (
+                    f"the torque of {named[0]} seems to be stamped {when}: {errors} it moved by that ({each}): give it"
+                    " the time of its position where it is recorded"
+                )
+            if not self.reading.negates:
+                return (
+                    f"the torque of {named[0]} seems to have another unit or scale than those of other joints: {errors}"
+                    f" it multiplied by about {self.reading.factor:.2g} ({each}): correct it where it is recorded, or"
+                    " give the column that factor (recording.columns)"
+                )
             return (
                 f"the {self.reading.which} of {named[0]} seems to have the wrong sign: {errors} the other sign"
                 f" ({each}): correct it where it is recorded, or give the column the factor -1 (recording.columns)"
@@ -151,17 +178,25 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     weights /= np.exp(np.mean(np.log(weights)))
     parts = _samples(recordings, estimate.prepared.model)
-    as_read = _equations(estimate, parts, None) if recordings else _equations_of_estimate(estimate)
+    as_read = _equations(estimate, parts, None, _DELAYS) if recordings else _equations_of_estimate(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
     at_positions: dict[tuple[int, ...], list[Reading]] = {}
     for reading in _readings(estimate, np.flatnonzero(own > CONCERNED_FROM)):
         if recordings or reading.of_torque_signs:
             at_positions.setdefault(() if reading.which == "torque" else reading.joints, []).append(reading)
-    found: list[tuple[float, Reading, _Equations]] = []
+    of_each_kind: dict[object, tuple[float, Reading, _Equations]] = {}
     for moved, readings in at_positions.items():
         equations = _equations(estimate, parts, readings[0]) if moved else as_read
         for reading, errors in zip(readings, equations.free_errors(readings, weights), strict=True):
-            found.append((float(_gains(before.joint_relative_percent, errors).sum()), reading, equations))
+            gain = float(_gains(before.joint_relative_percent, errors).sum())
+            kind = (
+                replace(reading, factor=0.0, late=0.0),
+                reading.negates,
+                reading.late == 0.0,
+            )  # one factor, one time
+            if kind not in of_each_kind or gain > of_each_kind[kind][0]:
+                of_each_kind[kind] = gain, reading, equations
+    found = list(of_each_kind.values())
     best, most = None, -np.inf
     # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and of others the best;
     # once one explains the recordings, every other is compared with it.
@@ -191,6 +226,9 @@ def _readings(estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]
     for which in kinds:
         for joint in joints.tolist():
             yield Reading(which, (joint,))
+            if which == "torque":
+                yield from (Reading(which, (joint,), factor=float(factor)) for factor in _FACTORS)
+                yield from (Reading(which, (joint,), factor=1.0, late=float(late)) for late in _DELAYS)
         for one, other in combinations(joints.tolist(), 2):
             if turns[one] == turns[other]:
                 yield Reading(which, (one, other))
@@ -214,9 +252,10 @@ class _Equations:
     Attributes:
         supports: per joint, which base parameters it feels, increasing.
         columns: per joint, orthogonal combinations of its rows, shape (rows, k).
-        torques: the same combinations of all joints' torques, shape (rows, joints).
+        torques: the same combinations of all joints' torques, shape (rows, joints); then of these at each delay.
         rows: equations that went into each joint's, shape (joints,).
         base: number of base parameters.
+        delays: by which torques may be late [s], shape (delays,).
     """
 
     supports: tuple[NDArray[np.intp], ...]
@@ -224,9 +263,14 @@ class _Equations:
     torques: tuple[Array, ...]
     rows: NDArray[np.int64]
     base: int
+    delays: Array
 
     def _torques(self, joint: int, reading: Reading | None) -> Array:
-        torques = self.torques[joint]
+        joints = len(self.torques)
+        if reading is not None and reading.late and joint in reading.joints:
+            delayed = 1 + int(np.argmin(np.abs(self.delays - reading.late)))
+            return self.torques[joint][:, delayed * joints + joint]
+        torques = self.torques[joint][:, :joints]
         return (torques if reading is None else reading.read(torques, "torque"))[:, joint]
 
     def information(self, reading: Reading | None) -> Information:
@@ -265,19 +309,24 @@ def _equations_of_estimate(estimate: Estimate) -> _Equations:
         torques.append(np.zeros((len(factor), moving.joints)))
         torques[-1][:, joint] = factor[:, -1]
     columns = tuple(factor[:, :-1] for factor in moving.factors)
-    return _Equations(moving.supports, columns, tuple(torques), moving.rows, moving.base)
+    return _Equations(moving.supports, columns, tuple(torques), moving.rows, moving.base, _NO_DELAYS)
 
 
-def _equations(estimate: Estimate, parts: Sequence[tuple[Recording, Motion]], reading: Reading | None) -> _Equations:
-    """Return the equations of some samples of recordings with one reading of the positions."""
+def _equations(
+    estimate: Estimate, parts: Sequence[_Part], reading: Reading | None, delays: Array = _NO_DELAYS
+) -> _Equations:
+    """Return the equations of some samples of recordings with one reading of the positions, at some delays."""
     model, base = estimate.prepared.model, estimate.base
     supports = sparsity(model.chain, model.layout, base.base)
     rows = [
-        rows_of_motion(motion if reading is None else _rearranged(motion, reading, model), recording, model, base)
-        for recording, motion in parts
+        rows_of_motion(
+            part.some if reading is None else _rearranged(part.some, reading, model), part.recording, model, base
+        )
+        for part in parts
     ]
-    torque, keep = (np.concatenate([getattr(one, name) for one in rows]) for name in ("torque", "keep"))
+    keep = np.concatenate([one.keep for one in rows])
     keep = keep if keep.any() else np.ones_like(keep)
+    torque = np.concatenate([_at_delays(one, part, model, base, delays) for one, part in zip(rows, parts, strict=True)])
     columns, torques = [], []
     for joint, support in enumerate(supports):
         H = np.concatenate([one.H_b[joint, support].T for one in rows])
@@ -285,7 +334,18 @@ def _equations(estimate: Estimate, parts: Sequence[tuple[Recording, Motion]], re
         factor = triangle(np.column_stack([H, torque])[keep[:, joint]])
         columns.append(factor[:, : len(support)])
         torques.append(estimate.prepared.torque_scales[joint] * factor[:, len(support) :])
-    return _Equations(supports, tuple(columns), tuple(torques), keep.sum(axis=0).astype(np.int64), base.size)
+    counts = keep.sum(axis=0).astype(np.int64)
+    return _Equations(supports, tuple(columns), tuple(torques), counts, base.size, delays)
+
+
+def _at_delays(rows: Rows, part: _Part, model: ArmModel, base: BaseParameters, delays: Array) -> Array:
+    """Return torques as recorded, then as stamped late by each delay, shape (samples, joints (1 + delays))."""
+    torques = [rows.torque]
+    for late in delays:
+        moved = [np.interp(part.some.time + late, part.all.time, torque) for torque in part.all.torque.T]
+        motion = replace(part.some, torque=np.array(moved).T)
+        torques.append(rows_of_motion(motion, part.recording, model, base).torque)
+    return np.hstack(torques)
 
 
 def _rearranged(motion: Motion, reading: Reading, model: ArmModel) -> Motion:
@@ -298,13 +358,22 @@ def _rearranged(motion: Motion, reading: Reading, model: ArmModel) -> Motion:
         # Where drives share joints, nothing is known of the pre-sliding of a motion that they did not make.
         direction = reading.read(direction, "position") if uncoupled else np.sign(moved["velocity"] @ coupling.T)
     keep = motion.keep
-    if not reading.negates:
+    if reading.exchanges:
         keep = keep.copy()
         keep[:, reading.joints] = motion.keep[:, reading.joints[::-1]]
     return replace(motion, **moved, keep=keep, direction=direction)
 
 
-def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[tuple[Recording, Motion]]:
+@dataclass(frozen=True)
+class _Part:
+    """Smoothed samples of a stretch of a recording, and some of them, which are fitted."""
+
+    recording: Recording
+    all: Motion
+    some: Motion
+
+
+def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[_Part]:
     """Return about `_ROWS` smoothed samples of at most a minute of the recordings."""
     options = model.config.identification
     # What else filters the equations is left out: readings are compared among themselves.
@@ -314,7 +383,7 @@ def _samples(recordings: Sequence[Recording], model: ArmModel) -> list[tuple[Rec
     model = model.with_options(smoothing=smoothing)
     parts = list(_first_minute(recordings, model))
     step = max(sum(len(motion.time) for _, motion in parts) // _ROWS, 1)
-    return [(one, motion[slice(None, None, step)]) for one, motion in parts]
+    return [_Part(one, motion, motion[slice(None, None, step)]) for one, motion in parts]
 
 
 def _first_minute(recordings: Sequence[Recording], model: ArmModel) -> Iterator[tuple[Recording, Motion]]:

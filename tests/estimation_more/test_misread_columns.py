@@ -1,4 +1,4 @@
-"""Columns with a wrong sign or of another joint are named; what is only poor data is not taken for them."""
+"""Columns with a wrong sign, scale or time, or of another joint, are named; what is only poor data is not."""
 
 from __future__ import annotations
 
@@ -73,6 +73,31 @@ def test_the_wrong_columns_are_named(which: str, joints: tuple[int, ...]) -> Non
     assert all(names[joint] in reason for joint in joints)
     assert ("exchanged" if len(joints) == 2 else "other direction" if which == "both" else "wrong sign") in reason
     assert "recording.columns" in reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.1, 0.5, 1.6])
+def test_a_torque_of_another_scale_than_the_others_is_named(factor: float) -> None:
+    recording = misread(Reading("torque", (1,), factor=factor))
+    estimate = identified(recording)
+    found = misread_columns(estimate, [recording])
+    assert found is not None
+    assert found.reading.joints == (1,)
+    assert found.reading.factor == pytest.approx(1.0 / factor, rel=0.1)
+    (reason,) = reasons_against(estimate, [recording])
+    assert "the torque of elbow seems to have another unit or scale" in reason
+    assert f"multiplied by about {found.reading.factor:.2g} " in reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("samples", "words"), [(5, "0.049 s too late"), (-10, "0.099 s too early")])
+def test_the_torque_of_one_joint_at_another_time_is_named(samples: int, words: str) -> None:
+    _, right = elbowed()
+    torque = right.torque.copy()
+    torque[:, 1] = np.roll(torque[:, 1], samples)
+    recording = replace(right, torque=torque)
+    (reason,) = reasons_against(identified(recording), [recording])
+    assert f"the torque of elbow seems to be stamped {words}" in reason
 
 
 def test_it_is_found_where_both_sides_of_the_equations_are_filtered() -> None:
