@@ -332,7 +332,14 @@ def equation_rows(recording: Recording, model: ArmModel, base: BaseParameters, *
 def rows_of_motion(motion: Motion, recording: Recording, model: ArmModel, base: BaseParameters) -> Rows:
     """Return the equations of smoothed samples of a recording, such as some of them with other positions."""
     rows = _rows(motion, _regressor(motion, model, base), motion.torque, model)
-    return _of_links(rows, recording, model, base, _torque_factors(model))
+    return with_recorded_torque(rows, motion.torque, recording, model, base)
+
+
+def with_recorded_torque(
+    rows: Rows, torque: Array, recording: Recording, model: ArmModel, base: BaseParameters
+) -> Rows:
+    """Return equations with other torques, shape (samples, joints), as recorded."""
+    return _of_links(replace(rows, torque=torque), recording, model, base, _torque_factors(model))
 
 
 def _of_links(rows: Rows, recording: Recording, model: ArmModel, base: BaseParameters, mixes: Array | None) -> Rows:

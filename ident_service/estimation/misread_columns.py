@@ -1,4 +1,4 @@
-"""Find columns that were read with the wrong sign, factor or time, or for another joint, by fitting each other reading.
+"""Find columns read with the wrong sign, scale, zero or time, or for another joint, by fitting each other reading.
 
 Forced into the feasible set, an estimate predicts a part of any torque, so that its error alone does not tell wrong
 columns from a poor model. The reading that is right leaves an error smaller by an order of magnitude than all others.
@@ -6,7 +6,7 @@ columns from a poor model. The reading that is right leaves an error smaller by 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ident_service.errors import SolverError
-from ident_service.estimation.equations import Rows, motions_of, rows_of_motion
+from ident_service.estimation.equations import Rows, motions_of, rows_of_motion, with_recorded_torque
 from ident_service.estimation.feasible.problems import ENOUGH, constrained_least_squares
 from ident_service.estimation.identify import Estimate
 from ident_service.estimation.least_squares import (
@@ -42,9 +42,14 @@ EXPLAINED = 10.0  # percent of all torques in motion that the right reading leav
 _LONGEST = 60.0  # s of recordings that are fitted
 _ROWS = 1000  # that are fitted, about
 _TRIED = 6  # readings besides signs of torques that are fitted under the conditions, while none explains: the best
-_NUMBERS = np.concatenate([-np.arange(1.0, 38.0)[::-1], np.arange(1.0, 38.0)])
-_FACTORS = 1.2 ** (_NUMBERS + np.sign(_NUMBERS))  # from 1.44, beyond what gains are off, to a thousand
-_DELAYS = 3e-3 * np.sign(_NUMBERS) * 1.15 ** np.abs(_NUMBERS)  # s; to half a second
+_THINNED = 4  # of these rows, one in so many is fitted to choose among positions
+_BOTH_WAYS = np.concatenate([-np.arange(37.0, 0.0, -1.0), np.arange(1.0, 38.0)])
+_FACTORS = 1.2 ** (_BOTH_WAYS + np.sign(_BOTH_WAYS))  # of a torque: from 1.44, beyond what gains are off, to a thousand
+_DELAYS = 3e-3 * np.sign(_BOTH_WAYS) * 1.15 ** np.abs(_BOTH_WAYS)  # s; to half a second
+_GEARS = 1.5 ** np.array([n for n in range(-13, 14) if n])  # of a position: to two hundred
+_ZEROS = np.radians([n for n in range(-150, 181, 30) if n])  # that a position may be off by
+_FINER = 3  # times that the best of these are made finer, by halves
+_CONCERNED, _WHOLE_BETTER = 4.0, 1.3  # percent of all torques to try these, and factor by which it must shrink
 
 _NO_DELAYS = np.empty(0)
 
@@ -59,8 +64,9 @@ class Reading:
         which: columns that it is about.
         joints: one whose sign is negated, two that are exchanged, or all.
         all_negated: whether it is about all, with the other sign.
-        factor: that the columns of one joint, or of all, are multiplied by.
+        factor: that the columns of one joint, or of all, are multiplied by; torques are divided where both are read.
         late: time by which the torque of one joint is stamped too late [s].
+        zero: that is added to the position of one joint [rad].
     """
 
     which: _Which
@@ -68,6 +74,7 @@ class Reading:
     all_negated: bool = False
     factor: float = -1.0
     late: float = 0.0
+    zero: float = 0.0
 
     @property
     def exchanges(self) -> bool:
@@ -80,19 +87,24 @@ class Reading:
         return not self.exchanges and self.factor == -1.0
 
     @property
+    def of_measured_position(self) -> bool:
+        """Return whether it is about the scale or the zero of a position."""
+        return self.which != "torque" and not (self.negates or self.exchanges)
+
+    @property
     def of_torque_signs(self) -> bool:
         """Return whether it is about signs of torques alone, which needs no other regressor."""
         return self.which == "torque" and self.negates
 
     def read(self, columns: Array, what: Literal["torque", "position"]) -> Array:
-        """Return positions, velocities or torques, shape (samples, joints), as they are read but for their time."""
+        """Return positions, velocities or torques, shape (samples, joints), as they are read but for time and zero."""
         if self.which not in (what, "both"):
             return columns
         read = columns.copy()
         if self.exchanges:
             read[:, self.joints] = columns[:, self.joints[::-1]]
         else:
-            read[:, self.joints] *= self.factor
+            read[:, self.joints] *= 1.0 / self.factor if what == "torque" and self.which == "both" else self.factor
         return read
 
 
@@ -131,23 +143,36 @@ class MisreadColumns:
                 " -1 (recording.columns), or correct gravity in the description"
             )
         if len(named) == 1:
-            if self.reading.which == "both":
-                return (
-                    f"{named[0]} seems to count in the other direction than described: {errors} position and torque"
-                    f" negated ({each}): turn its axis in the description, or give both columns the factor -1"
-                    " (recording.columns)"
-                )
             if late := self.reading.late:
                 when = f"{abs(late):.2g} s too {'late' if late > 0.0 else 'early'}"
                 return (
                     f"the torque of {named[0]} seems to be stamped {when}: {errors} it moved by that ({each}): give it"
                     " the time of its position where it is recorded"
                 )
-            if not self.reading.negates:
+            if zero := self.reading.zero:
+                off = f"{-zero:.2g} rad ({np.degrees(-zero):.0f} degrees)"
                 return (
-                    f"the torque of {named[0]} seems to have another unit or scale than those of other joints: {errors}"
-                    f" it multiplied by about {self.reading.factor:.2g} ({each}): correct it where it is recorded, or"
-                    " give the column that factor (recording.columns)"
+                    f"the zero of {named[0]} seems to be off by about {off}: {errors} its position less by that"
+                    f" ({each}): correct its zero where it is recorded, or in the description"
+                )
+            if not self.reading.negates:
+                factor = self.reading.factor
+                if self.reading.which == "both":
+                    return (
+                        f"position and torque of {named[0]} seem to be those of its motor: {errors} the position"
+                        f" multiplied and the torque divided by about {factor:.2g} ({each}): describe its gear"
+                        " (transmission), or give both columns these factors (recording.columns)"
+                    )
+                return (
+                    f"the {self.reading.which} of {named[0]} seems to have another unit or scale than those of other"
+                    f" joints: {errors} it multiplied by about {factor:.2g} ({each}): correct it where it is recorded,"
+                    " or give the column that factor (recording.columns)"
+                )
+            if self.reading.which == "both":
+                return (
+                    f"{named[0]} seems to count in the other direction than described: {errors} position and torque"
+                    f" negated ({each}): turn its axis in the description, or give both columns the factor -1"
+                    " (recording.columns)"
                 )
             return (
                 f"the {self.reading.which} of {named[0]} seems to have the wrong sign: {errors} the other sign"
@@ -180,33 +205,23 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     parts = _samples(recordings, estimate.prepared.model)
     as_read = _equations(estimate, parts, None, _DELAYS) if recordings else _equations_of_estimate(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
-    at_positions: dict[tuple[int, ...], list[Reading]] = {}
-    for reading in _readings(estimate, np.flatnonzero(own > CONCERNED_FROM)):
-        if recordings or reading.of_torque_signs:
-            at_positions.setdefault(() if reading.which == "torque" else reading.joints, []).append(reading)
-    of_each_kind: dict[object, tuple[float, Reading, _Equations]] = {}
-    for moved, readings in at_positions.items():
-        equations = _equations(estimate, parts, readings[0]) if moved else as_read
-        for reading, errors in zip(readings, equations.free_errors(readings, weights), strict=True):
-            gain = float(_gains(before.joint_relative_percent, errors).sum())
-            kind = (
-                replace(reading, factor=0.0, late=0.0),
-                reading.negates,
-                reading.late == 0.0,
-            )  # one factor, one time
-            if kind not in of_each_kind or gain > of_each_kind[kind][0]:
-                of_each_kind[kind] = gain, reading, equations
-    found = list(of_each_kind.values())
+    joints = np.flatnonzero(own > CONCERNED_FROM)
+    readings = [one for one in _of_torques(estimate, joints) if recordings or one.of_torque_signs]
+    found = _best_of_each_kind(readings, as_read.free_errors(readings, weights), before)
+    if recordings:
+        thin = [replace(part, some=part.some[slice(None, None, _THINNED)]) for part in parts]
+        found += _of_positions(estimate, thin, joints, weights, before)
     best, most = None, -np.inf
     # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and of others the best;
     # once one explains the recordings, every other is compared with it.
     signs = [one for one in found if one[1].of_torque_signs]
     others = sorted((one for one in found if not one[1].of_torque_signs), key=lambda one: -one[0])
-    for number, (without_conditions, reading, equations) in enumerate((*signs, *others)):
+    for number, (without_conditions, reading) in enumerate((*signs, *others)):
         if without_conditions < max(most, np.log(BETTER)):  # conditions only add to the error
             continue
         if best is None and number >= len(signs) + _TRIED:
             break
+        equations = as_read if reading.which == "torque" else _equations(estimate, parts, reading)
         try:
             after = _constrained_error(estimate, equations.information(reading), weights)
         except SolverError:  # it explains nothing, and must not end what has been identified
@@ -214,24 +229,76 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
         gains = _gains(before.joint_relative_percent, after.joint_relative_percent)
         gained = float(gains.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
         enough = gains.sum() >= np.log(BETTER) and gains.min() >= -np.log(NONE_WORSE)
+        if reading.of_measured_position:
+            enough = enough and after.relative_percent * _WHOLE_BETTER < before.relative_percent
         if enough and after.relative_percent < EXPLAINED and (best is None or gained > most):
             best, most = MisreadColumns(reading, before, after), gained
     return best
 
 
-def _readings(estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]:
-    kinds: tuple[_Which, ...] = ("torque", "position", "both")
+_Found = list[tuple[float, Reading]]  # gain without conditions, and the reading
+
+
+def _of_torques(estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]:
+    yield Reading("torque", tuple(range(estimate.model.chain.joints)), all_negated=True)
+    yield from _signs_and_exchanges("torque", estimate, joints)
+    for joint in joints.tolist():
+        yield from (Reading("torque", (joint,), factor=float(factor)) for factor in _FACTORS)
+        yield from (Reading("torque", (joint,), factor=1.0, late=float(late)) for late in _DELAYS)
+
+
+def _signs_and_exchanges(which: _Which, estimate: Estimate, joints: NDArray[np.intp]) -> Iterator[Reading]:
     turns = estimate.model.chain.revolute
-    yield Reading("torque", tuple(range(len(turns))), all_negated=True)
-    for which in kinds:
-        for joint in joints.tolist():
-            yield Reading(which, (joint,))
-            if which == "torque":
-                yield from (Reading(which, (joint,), factor=float(factor)) for factor in _FACTORS)
-                yield from (Reading(which, (joint,), factor=1.0, late=float(late)) for late in _DELAYS)
-        for one, other in combinations(joints.tolist(), 2):
-            if turns[one] == turns[other]:
-                yield Reading(which, (one, other))
+    yield from (Reading(which, (joint,)) for joint in joints.tolist())
+    for one, other in combinations(joints.tolist(), 2):
+        if turns[one] == turns[other]:
+            yield Reading(which, (one, other))
+
+
+def _of_positions(
+    estimate: Estimate, parts: Sequence[_Part], joints: NDArray[np.intp], weights: Array, before: TorqueError
+) -> _Found:
+    """Return the best readings of positions, of zeros and scales one for each joint."""
+
+    def tried(readings: Sequence[Reading]) -> _Found:
+        errors = [_equations(estimate, parts, one).free_errors([one], weights)[0] for one in readings]
+        return _best_of_each_kind(readings, errors, before)
+
+    kinds: tuple[_Which, ...] = ("position", "both")
+    found = tried([one for which in kinds for one in _signs_and_exchanges(which, estimate, joints)])
+    if before.relative_percent < _CONCERNED:
+        return found
+    for joint in range(estimate.model.chain.joints):  # those before it feel it, too
+        for which in kinds:
+            found += _finest(tried, [Reading(which, (joint,), factor=float(factor)) for factor in _GEARS])
+        if estimate.model.chain.revolute[joint]:
+            found += _finest(tried, [Reading("position", (joint,), factor=1.0, zero=float(zero)) for zero in _ZEROS])
+    return found
+
+
+def _finest(tried: Callable[[Sequence[Reading]], _Found], readings: Sequence[Reading]) -> _Found:
+    """Return the best of factors or zeros, made finer where it may explain anything."""
+    (best,) = tried(readings)
+    factor, zero = readings[1].factor / readings[0].factor, readings[1].zero - readings[0].zero
+    for _ in range(_FINER if best[0] > np.log(BETTER) else 0):
+        factor, zero = factor**0.5, 0.5 * zero
+        near = [(best[1].factor * factor**way, best[1].zero + zero * way) for way in (-1.0, 1.0)]
+        finer = tried([replace(best[1], factor=one, zero=other) for one, other in near])
+        best = max(best, *finer, key=lambda one: one[0])
+    return [best]
+
+
+def _best_of_each_kind(readings: Sequence[Reading], errors: Iterable[Array], before: TorqueError) -> _Found:
+    """Return readings with their gains, and of one joint's factors, zeros or times only the best."""
+    found: dict[Reading, tuple[float, Reading]] = {}
+    for reading, after in zip(readings, errors, strict=True):
+        gain = float(_gains(before.joint_relative_percent, after).sum())
+        alike = reading
+        if not (reading.negates or reading.exchanges):
+            alike = replace(reading, factor=0.0, late=float(reading.late != 0.0), zero=float(reading.zero != 0.0))
+        if alike not in found or gain > found[alike][0]:
+            found[alike] = gain, reading
+    return list(found.values())
 
 
 def _constrained_error(estimate: Estimate, information: Information, weights: Array) -> TorqueError:
@@ -343,8 +410,7 @@ def _at_delays(rows: Rows, part: _Part, model: ArmModel, base: BaseParameters, d
     torques = [rows.torque]
     for late in delays:
         moved = [np.interp(part.some.time + late, part.all.time, torque) for torque in part.all.torque.T]
-        motion = replace(part.some, torque=np.array(moved).T)
-        torques.append(rows_of_motion(motion, part.recording, model, base).torque)
+        torques.append(with_recorded_torque(rows, np.array(moved).T, part.recording, model, base).torque)
     return np.hstack(torques)
 
 
@@ -352,11 +418,13 @@ def _rearranged(motion: Motion, reading: Reading, model: ArmModel) -> Motion:
     """Return smoothed samples as they are with another reading of the positions: each column is smoothed alone."""
     names = ("position", "velocity", "acceleration")
     moved = {name: reading.read(getattr(motion, name), "position") for name in names}
+    moved["position"][:, reading.joints] += reading.zero
     coupling, direction = model.chain.coupling, motion.direction
     if direction is not None:
         uncoupled = np.array_equal(coupling != 0.0, np.eye(len(coupling), dtype=bool))
         # Where drives share joints, nothing is known of the pre-sliding of a motion that they did not make.
-        direction = reading.read(direction, "position") if uncoupled else np.sign(moved["velocity"] @ coupling.T)
+        turned = replace(reading, factor=float(np.sign(reading.factor)))
+        direction = turned.read(direction, "position") if uncoupled else np.sign(moved["velocity"] @ coupling.T)
     keep = motion.keep
     if reading.exchanges:
         keep = keep.copy()
