@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axis_status import AxisStatus
-from drivers.can.answer_order import AnswerOrder
+from drivers.can.answer_order import AnswerOrder, settle_uncertain
 from drivers.can.bus_state import (
     HOST,
     LEFT_NORMAL,
@@ -281,15 +281,8 @@ class BusCodec:
     def end_cycle(self) -> None:
         """Close the cycle at its deadline: answers from now on are late."""
         self._open = False
-        for drive in self.drives if self._missing else ():
-            if not drive.order.uncertain:
-                continue
-            if drive.order.settle():
-                drive.answered, drive.age = True, 0
-                self._missing -= 1
-            else:
-                drive.late += 1
-                self._tell(EventCode.LATE, drive.node, f"its position is {drive.age} cycles old")
+        if self._missing:
+            self._missing -= settle_uncertain(self.drives, self._tell)
 
     @property
     def complete(self) -> bool:
