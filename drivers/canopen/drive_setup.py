@@ -19,7 +19,7 @@ import numpy as np
 from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, parse_entry, where
-from drivers.canopen.cia402 import POWER_OFF, state_of
+from drivers.canopen.cia402 import COMMUNICATION_ERROR, ERROR_PASSIVE, POWER_OFF, state_of
 from drivers.canopen.motor_units import count_limits, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
@@ -374,6 +374,21 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
         firmware = "not told"
     words = ", ".join(f"{name} {value:08X}h" for name, value in found.items())
     return f"node {objects.node}: {words}, firmware {firmware}"
+
+
+def is_error_passive(objects: Objects) -> bool:
+    """Return whether a drive's CAN controller is error-passive by its error register and history (1001h, 1003h).
+
+    Its emergency message may have been sent before anybody listened.
+
+    Raises:
+        DriverError: it does not answer.
+    """
+    try:
+        bad = objects.read(od.ERROR_REGISTER) & COMMUNICATION_ERROR
+        return bool(bad) and objects.read(od.LAST_ERROR) & 0xFFFF == ERROR_PASSIVE
+    except SdoRefused:
+        return False  # without a history, or one that is empty
 
 
 def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:

@@ -49,6 +49,7 @@ from drivers.canopen.drive_setup import (
     configure,
     disable_supervision,
     identify,
+    is_error_passive,
     motor_limits,
     quick_stop_option,
     watchdogs_of,
@@ -203,8 +204,6 @@ _CODES = BUS_EVENTS | {
     EventCode.DEAF: AxisEventCode.TORQUE_IGNORED,
     EventCode.TORQUE_LIMITED: AxisEventCode.TORQUE_LIMITED,
 }
-# Emergencies of a drive that is in trouble with the bus itself (CiA 301, table 26).
-_ERROR_PASSIVE = "8120h"
 
 
 def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
@@ -220,8 +219,6 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
     found = []
     for event in events:
         code = _CODES.get(event.code)
-        if event.code is EventCode.EMERGENCY and event.words.startswith(_ERROR_PASSIVE):
-            code = AxisEventCode.BUS_DEGRADED
         if code is not None:
             words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
             found.append(AxisEvent(code, joint_of.get(event.node), words))
@@ -600,6 +597,7 @@ class CanopenArm(Arm):
             self._begun = number + 1
             mode = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
             buses.modes[number] = mode
+            buses.drives[number].error_passive |= is_error_passive(objects)
             identity += ", its targets act when they come, not at SYNC" if mode.at_once else ""
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]

@@ -32,6 +32,8 @@ from drivers.can.bus_state import (
 from drivers.can.can_frame import Frame
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import (
+    COMMUNICATION_ERROR,
+    ERROR_PASSIVE,
     FOLLOWS,
     INTERNAL_LIMIT,
     WARNING,
@@ -98,6 +100,7 @@ class Drive:
         heartbeat_ns: when that was [ns of the link's clock].
         boots: boot-up messages.
         emergency: the latest, None before the first and after a reset.
+        error_passive: whether it has said so of its CAN controller, and not since that it is over.
         uploads: last value of each entry that it was asked for by one frame, by `index << 8 | sub-index`.
     """
 
@@ -118,6 +121,7 @@ class Drive:
     heartbeat_ns: int = 0
     boots: int = 0
     emergency: Emergency | None = None
+    error_passive: bool = False
     uploads: dict[int, bytes] = field(default_factory=dict)
 
     @property
@@ -312,6 +316,9 @@ class BusCodec:
         self._foreign.clear()
         if self.controller in LEFT_NORMAL:
             self._tell_controller()
+        for drive in self.drives:
+            if drive.error_passive:
+                self._tell(EventCode.DRIVE_PASSIVE, drive.node, f"{emergency_words(ERROR_PASSIVE)}, and not over yet")
 
     def receive(self, frame: Frame) -> None:
         """Take one frame, whatever it is; never raises."""
@@ -398,7 +405,13 @@ class BusCodec:
                 return
         # A torn emergency is one nevertheless.
         code, register, vendor = data[0] | data[1] << 8, data[2] if len(data) > 2 else 0, bytes(data[3:8])
-        if code == 0:
+        if code == ERROR_PASSIVE:
+            drive.error_passive = True
+            drive.emergency = Emergency(code, register, vendor)
+            self._tell(EventCode.DRIVE_PASSIVE, drive.node, emergency_words(code, register, vendor))
+        elif code == 0:
+            # Another error may be over: of those that remain the register tells.
+            drive.error_passive = drive.error_passive and bool(register & COMMUNICATION_ERROR)
             drive.emergency = None
             self._tell(EventCode.EMERGENCY_RESET, drive.node, "error reset")
         elif self._is_notice(drive.node, code, data):
@@ -423,6 +436,7 @@ class BusCodec:
         drive.nmt, drive.heartbeat_ns = state, frame.stamp_ns or self._now_ns
         if state == NmtState.BOOT_UP:
             drive.boots += 1
+            drive.error_passive = False
             drive.status = None  # the drive has lost its configuration; its last status is no longer true
             self._tell(EventCode.BOOT_UP, drive.node, "has booted")
         elif before != state and before is not None:
