@@ -215,6 +215,7 @@ class BarrettArm(Arm):
         self._stale: set[int] = set()
         self._status: tuple[int, ...] = ()
         self._checks: tuple[SetupCheck, ...] = ()
+        self._unconfirmed: tuple[str, ...] = ()
 
     def look(self) -> Arm:
         """Return an arm that asks pucks for positions and states, and sets nothing.
@@ -414,18 +415,33 @@ class BarrettArm(Arm):
         self.stop(StopKind.TORQUE_OFF)
         if self._bus is not None:
             if not self._looks:
-                for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
-                    if self._is_idle(self._bus) or (cycle >= _FAREWELL and not self._untold):
-                        break
-                    with suppress(Exception):
-                        self._lower(self._bus)
-                        self._bus.cycle(None, asks_safety=True)
+                self._wait_until_idle(self._bus)
             self._bus.close()
         elif self._port is not None:
             with suppress(Exception):
                 self._port.link.close()
         self._bus = self._found = self._port = None
         self._session.close()
+
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Return the pucks that did not say, when the arm was closed last, that they are idle; see `Arm`."""
+        return self._unconfirmed
+
+    def _wait_until_idle(self, bus: PuckBus) -> None:
+        """Send IDLE until all pucks say so, or have had their time; never raises."""
+        for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
+            if self._is_idle(bus) or (cycle >= _FAREWELL and not self._untold):
+                break
+            self._lower(bus)
+            with suppress(Exception):
+                if self._found is not None and cycle % _LOWER_EVERY == 0:
+                    bus.link.send(get(Group.ARM, self._found.motors.number("MODE"), group=True))
+            with suppress(Exception):
+                bus.cycle(None, asks_safety=True)
+        pucks, safety = bus.codec.pucks, bus.codec.safety
+        left = [name for name, puck in zip(self._names, pucks, strict=True) if puck.mode == Mode.TORQUE]
+        left += [f"safety puck {safety.node}"] if safety.mode == SafetyMode.ACTIVE else []
+        self._unconfirmed = tuple(f"{name} has not said that it is idle" for name in left)
 
     _port: setup.PropertyPort | None = None
 

@@ -43,7 +43,15 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.capabilities import required
-from drivers.canopen.cia402 import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, DriveState, NmtCommand, joint_status
+from drivers.canopen.cia402 import (
+    DISABLE_VOLTAGE,
+    ENABLE,
+    POWER_OFF,
+    QUICK_STOP,
+    DriveState,
+    NmtCommand,
+    joint_status,
+)
 from drivers.canopen.drive_setup import (
     DriveConfiguration,
     configure,
@@ -58,9 +66,9 @@ from drivers.canopen.homing import ZeroingArm
 from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import bus_profiles
-from drivers.canopen.sdo import Objects
+from drivers.canopen.sdo import Objects, SdoRefused
 from drivers.canopen.stored_zero import zeros_of
-from drivers.canopen.sync_cycle import Buses, EnableSequence, Resetting, hold
+from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, hold
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
@@ -83,11 +91,14 @@ class StopCommand:
     def __init__(self) -> None:
         self.braking = False
         self._untold: list[int] = []
+        self._deaf: set[int] = set()  # drives that have not obeyed
+        self._again_ns: int | None = None  # when drives that have not obeyed are told again; None before a stop
 
     def give(self, buses: Buses, kind: StopKind) -> None:
         """Send the stop to every drive; for 75 ms again to those whose link has not taken it."""
         self.braking = kind is StopKind.QUICK_STOP
         self._untold = list(range(len(buses.drives)))
+        self._again_ns = buses.clock.now_ns() + round(REPEAT * 1e9)
         for _ in range(_TRIES):
             self.repeat(buses)
             if not self._untold:
@@ -96,11 +107,15 @@ class StopCommand:
                 buses.clock.sleep_until_ns(buses.clock.now_ns() + round(_AGAIN * 1e9))
 
     def repeat(self, buses: Buses) -> None:
-        """Send the stop once more to the drives whose link has not taken it."""
+        """Send the stop once more to the drives whose link has not taken it, or that have not obeyed for `REPEAT`."""
+        if self._again_ns is not None and (now_ns := buses.clock.now_ns()) >= self._again_ns:
+            self._again_ns = now_ns + round(REPEAT * 1e9)
+            on = {number for number, drive in enumerate(buses.drives) if drive.state is DriveState.OPERATION_ENABLED}
+            self._untold, self._deaf = sorted(on.union(self._untold)), on
         word, drives, self._untold = QUICK_STOP if self.braking else DISABLE_VOLTAGE, self._untold, []
         for number in drives:
             try:
-                buses.control_stop(number, word)
+                buses.control_stop(number, word, deaf=number in self._deaf)
             except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
                 self._untold.append(number)
 
@@ -126,10 +141,10 @@ class StopCommand:
             self.repeat(buses)
             with suppress(Exception):  # of one cycle: the next one may be possible
                 buses.cycle(None if zero is None else self.counts(zero))
-            brakes = self.braking and any(drive.state in _ENDING for drive in buses.drives)
-            if cycle >= _FAREWELL and not brakes and not self._untold:
+            on = any(drive.state in _ENDING for drive in buses.drives)
+            if cycle >= _FAREWELL and not on and not self._untold:
                 break
-            if brakes and cycle % _FAREWELL == 0:
+            if on and cycle % _FAREWELL == 0:
                 self._untold = list(range(len(buses.drives)))  # what was sent may have been lost
         self._untold = []
 
@@ -341,6 +356,7 @@ class CanopenArm(Arm):
         self._reports = Reports(self._driver, first, self._look_every)
         self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns, compares=not self._positions)
         self._identities: tuple[str, ...] = ()
+        self._unconfirmed: list[str] = []
 
     def look(self) -> Arm:
         """Return an arm that reads the drives' objects by SDO and sends nothing else."""
@@ -548,19 +564,33 @@ class CanopenArm(Arm):
         self._streaming = False
         self._session.close()
 
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Return the drives that did not confirm, when the arm was closed last, that they are off; see `Arm`."""
+        return tuple(self._unconfirmed)
+
     def _leave(self, buses: Buses) -> None:
         """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""
         zero = self._counts if self._streaming else None
         self._stop.wait_until_off(buses, zero, self._period_ns)
+        buses.enabled = False  # or answers to its questions would be taken for those to these
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
-                objects = buses.objects(number)
-                # Between two conversations, so that the others do not miss their torque frames.
-                buses.cycle(zero)
-                for _ in disable_supervision(objects, self._zeros, number, buses.restarted(number)):
-                    buses.cycle(zero)
-                there[drive.bus] = objects
+                buses.cycle(zero)  # what was asked before is answered in it
+            said = ""
+            try:
+                objects = buses.objects_in_cycles(number, zero)
+                state = disable_supervision(objects, self._zeros, number, buses.restarted(number))
+                if state not in (*POWER_OFF, DriveState.QUICK_STOP):
+                    said = f"is in the state {state}"
+            except Exception as error:  # noqa: BLE001 - whatever a drive or its bus died of, the others must be left
+                said = str(error)
+                if not isinstance(error, SdoRefused):
+                    self._unconfirmed.append(f"{self._names[number]}: {said}")
+                    continue
+            there[drive.bus] = buses.objects(number)
+            if said:
+                self._unconfirmed.append(f"{self._names[number]}: {said}")
         for number in range(len(buses.drives)):
             with suppress(Exception):
                 buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)

@@ -101,6 +101,7 @@ class Drive:
         boots: boot-up messages.
         emergency: the latest, None before the first and after a reset.
         error_passive: whether it has said so of its CAN controller, and not since that it is over.
+        reply: last answer to an SDO request, of any kind; None until one came since whoever asks has cleared it.
         uploads: last value of each entry that it was asked for by one frame, by `index << 8 | sub-index`.
     """
 
@@ -122,6 +123,7 @@ class Drive:
     boots: int = 0
     emergency: Emergency | None = None
     error_passive: bool = False
+    reply: Frame | None = None
     uploads: dict[int, bytes] = field(default_factory=dict)
 
     @property
@@ -371,7 +373,7 @@ class BusCodec:
 
     def _on_upload(self, drive: Drive, frame: Frame) -> None:
         """Keep the answer to a question of one frame (`sdo.upload_request`); others are neither used nor strange."""
-        data = frame.data
+        data, drive.reply = frame.data, frame
         _, index, sub = _MULTIPLEXER.unpack_from(data.ljust(_MULTIPLEXER.size, b"\0"))
         if len(data) != 8 or data[0] & 0xE3 != _UPLOADED or index << 8 | sub not in self.asked:
             self.counters.ignored += 1

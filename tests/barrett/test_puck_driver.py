@@ -662,3 +662,34 @@ def test_mistakes_in_a_description_of_pucks_are_found(tmp_path: Any, change: Cha
     path.write_text(json.dumps(tree), encoding="utf-8")
     with pytest.raises(ConfigError, match=words):
         load_arm(path)
+
+
+@pytest.mark.parametrize("kind", list(StopKind))
+@pytest.mark.parametrize("moment", ["before the stop", "after it"])
+def test_a_puck_that_vanishes_while_the_arm_is_closed_is_named_and_the_others_are_idle(
+    moment: str, kind: StopKind
+) -> None:
+    bench = Bench(wam(heartbeat=2.0, watchdog_reason="the safety puck does not help here"))
+    bench.arm.open()
+    bench.arm.enable()
+    bench.cycles(5, NONE)
+    vanish = DriveFault("node_silent", 2)
+    if moment == "before the stop":
+        bench.behind.inject(vanish)
+    bench.arm.stop(kind)
+    if moment == "after it":
+        bench.behind.inject(vanish)
+    bench.arm.close()
+    assert bench.arm.unconfirmed() == ("j2 and j3: puck 3 has not said that it is idle",)
+    assert bench.safety.mode is SafetyMode.IDLE
+    others = [puck.motor.power for puck in bench.pucks if puck.number != 3]
+    assert others == [Power.BRAKE] * 6
+
+
+def test_pucks_that_say_that_they_are_idle_are_not_named(bench: Bench) -> None:
+    with bench.arm as arm:
+        arm.enable()
+        bench.cycles(5, NONE)
+        begun = arm.clock.now_ns()
+    assert bench.arm.unconfirmed() == ()
+    assert bench.behind.clock.now_ns() - begun <= 5_000_000  # asked for, so that nobody waits for it
