@@ -137,12 +137,15 @@ class Watchdog:
         kind: the signal it watches: `rpdo_timer` and the like.
         seconds: how long that may stay away before the drive acts [s]; None where unknown.
         of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
+        report_delay: how much later its reaction may show while its signal is withheld [s]; None where that is
+            `ArmDescription.report_delay`.
     """
 
     drive: str
     kind: str
     seconds: float | None
     of_torque: bool = True
+    report_delay: float | None = None
 
 
 @dataclass(frozen=True)

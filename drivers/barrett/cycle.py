@@ -432,7 +432,7 @@ class PuckBus:
         self.complete = codec.complete
         if not self.complete:
             self.lost += sum(not puck.answered for puck in codec.pucks)
-        self._ask(asks_safety)
+        self._ask(asks_safety or silent)  # its watchdog is tried; MODE it does not watch
         return stamp_ns
 
     def answers_late(self) -> bool:

@@ -315,8 +315,11 @@ class BarrettArm(Arm):
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
         """Return the safety puck's watch over every puck, see `Arm`."""
-        seconds = self._driver.heartbeat
-        return tuple(Watchdog(name, "bus_silence", seconds, of_torque=False) for name in self._names)
+        seconds, period = self._driver.heartbeat, self._period_ns * 1e-9
+        # Meanwhile the safety puck is asked in every cycle whether it has acted.
+        return tuple(
+            Watchdog(name, "bus_silence", seconds, of_torque=False, report_delay=period) for name in self._names
+        )
 
     def withhold(self, kind: str) -> None:
         """Send neither torques nor requests for positions, which the safety puck watches; see `Arm`."""

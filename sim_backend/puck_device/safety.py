@@ -251,6 +251,7 @@ class EmulatedSafetyPuck:
             self._faults.append(cause)
         if self.mode is SafetyMode.ACTIVE:
             self.lowered_by_host = False
+            self._asked_ns = now_ns  # whoever is at the pendant sees it first
             self._enter(SafetyMode.IDLE, now_ns)
 
     def _watch_torques(self, data: bytes, now_ns: int) -> None:

@@ -21,10 +21,14 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError, PositionUnknown
 from ident_service.model.arm_model import arm_model
+from ident_service.model.expected_friction import expected_friction
 from ident_service.motion.ticket import Verdict
+from ident_service.motion.trajectory import hold
 from ident_service.operations.recovery import recover
 from ident_service.preflight.passive_checks import identities_check, record_idle
 from ident_service.preflight.preflight import preflight
+from ident_service.preflight.session import Session
+from ident_service.preflight.watchdog import watchdog_check
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 from sim_backend.emulator.motor import Power
@@ -693,3 +697,20 @@ def test_pucks_that_say_that_they_are_idle_are_not_named(bench: Bench) -> None:
         begun = arm.clock.now_ns()
     assert bench.arm.unconfirmed() == ()
     assert bench.behind.clock.now_ns() - begun <= 5_000_000  # asked for, so that nobody waits for it
+
+
+@pytest.mark.parametrize(("acts", "verdict"), [(0.09, Verdict.PASSED), (0.19, Verdict.FAILED)])
+def test_a_safety_puck_that_acts_later_than_described_gives_no_ticket(acts: float, verdict: Verdict) -> None:
+    """The WAM falls: 0.1 s and eleven cycles are the most, though 0.19 s are within twice 0.1 s."""
+    config = wam(emulation={"heartbeat": acts})
+    bench, model, limits = Bench(config), arm_model(config), motion_limits(config)
+    with bench.arm as arm:
+        arm.enable()
+        home = bench.cycles(5, NONE).position
+        friction = expected_friction(model, limits, config.design.friction_guess)
+        session = Session(arm, model, limits, arm.describe(), home, friction)
+        session.follow(hold(home), 0.02)
+        check = watchdog_check(arm, model, session, hold(home).at)
+    assert check.verdict is verdict, check.reason
+    assert [one.most for one in check.measures] == pytest.approx([0.1 + 11 / RATE] * 7)
+    assert [one.value for one in check.measures] == pytest.approx([acts] * 7, abs=3 / RATE)
