@@ -28,7 +28,7 @@ from ident_service.errors import DriverError
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Counts = NDArray[np.int64]
-NOT_OFF: Final = "not known to be off and released:"  # begins what is told of `Arm.unconfirmed`
+AT_CLOSING: Final = "when the arm was closed:"  # begins what is told of `Arm.unconfirmed`
 _Numbers = TypeVar("_Numbers", bound=NDArray[Any])
 
 
@@ -266,7 +266,8 @@ class Arm(ABC):
     def unconfirmed(self) -> tuple[str, ...]:
         """Return which drives did not confirm that they are off when the arm was closed last, and why, in words.
 
-        One of these may have power, or will miss its host. Empty where all did, and for drivers that cannot tell.
+        One of these may have power, or will miss its host. Also which have restarted while the arm was open, as it may
+        have shown as silence only. Empty where nothing is to be told, and for drivers that cannot tell.
         """
         return ()
 
@@ -354,4 +355,4 @@ class Arm(ABC):
         """Close the arm, whatever happened; an error that ends it says which drives have not confirmed that."""
         self.close()
         if error is not None and (left := self.unconfirmed()):
-            error.add_note(f"{NOT_OFF} {'; '.join(left)}")
+            error.add_note(f"{AT_CLOSING} {'; '.join(left)}")

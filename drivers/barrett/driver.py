@@ -34,7 +34,7 @@ from drivers.arm import (
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
-from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
+from drivers.barrett.protocol import POSITION_BITS, Group, Mode, Properties, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
@@ -438,13 +438,25 @@ class BarrettArm(Arm):
             self._lower(bus)
             with suppress(Exception):
                 if self._found is not None and cycle % _LOWER_EVERY == 0:
-                    bus.link.send(get(Group.ARM, self._found.motors.number("MODE"), group=True))
+                    self._ask_whether_idle(bus, self._found.motors)
             with suppress(Exception):
                 bus.cycle(None, asks_safety=True)
         pucks, safety = bus.codec.pucks, bus.codec.safety
         left = [name for name, puck in zip(self._names, pucks, strict=True) if puck.mode == Mode.TORQUE]
         left += [f"safety puck {safety.node}"] if safety.mode == SafetyMode.ACTIVE else []
-        self._unconfirmed = tuple(f"{name} has not said that it is idle" for name in left)
+        restarted = [name for name, puck in zip(self._names, pucks, strict=True) if puck.stat == Status.RESET]
+        self._unconfirmed = (
+            *(f"{name} has not said that it is idle" for name in left if name not in restarted),
+            *(f"{name} has restarted" for name in restarted),
+        )
+
+    @staticmethod
+    def _ask_whether_idle(bus: PuckBus, motors: Properties) -> None:
+        """Ask all pucks for MODE, and those that have not said IDLE for STAT: one that has restarted knows no MODE."""
+        bus.link.send(get(Group.ARM, motors.number("MODE"), group=True))
+        for puck in bus.codec.pucks:
+            if puck.mode == Mode.TORQUE:
+                bus.link.send(get(puck.node, motors.number("STAT")))
 
     _port: setup.PropertyPort | None = None
 

@@ -349,7 +349,7 @@ class CanopenArm(Arm):
         self._counts = [0] * len(self._limits)
         self._acting = read_only(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
-        self._told: list[tuple[int | None, Emergency | None]] = []
+        self._told: list[tuple[int | None, int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
         self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
         first = {k: joints[0] for k, joints in self._joints_of.items()}
@@ -357,6 +357,7 @@ class CanopenArm(Arm):
         self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns, compares=not self._positions)
         self._identities: tuple[str, ...] = ()
         self._unconfirmed: list[str] = []
+        self._boots = [0] * len(self._driver.drives)  # of each drive, when its configuration began
 
     def look(self) -> Arm:
         """Return an arm that reads the drives' objects by SDO and sends nothing else."""
@@ -440,8 +441,8 @@ class CanopenArm(Arm):
         Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
 
         Raises:
-            DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, or does not
-                follow in time; only what held the arm still does.
+            DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, has restarted
+                since the arm was opened, or does not follow in time; only what held the arm still does.
         """
         buses = self._open()
         held = hold(buses.drives)
@@ -449,6 +450,7 @@ class CanopenArm(Arm):
         self._streaming, self._stop = True, StopCommand()
         try:
             require_set_up(self.setup_checks())
+            self._require_no_restart(buses)
             reports = self._driver.report_delay, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
             buses.forget_modes()
@@ -591,6 +593,7 @@ class CanopenArm(Arm):
             there[drive.bus] = buses.objects(number)
             if said:
                 self._unconfirmed.append(f"{self._names[number]}: {said}")
+        self._unconfirmed += self._restarted(buses)
         for number in range(len(buses.drives)):
             with suppress(Exception):
                 buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
@@ -620,6 +623,7 @@ class CanopenArm(Arm):
         motors = motor_limits(self._config, self._coordinates)
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
+            self._boots[number] = buses.drives[number].boots
             identity = identify(objects, drive.identity)
             can = required(objects, self._driver, number)
             identity += f"; {can.summary}"  # a preflight ticket is for what was found of the drive
@@ -637,9 +641,16 @@ class CanopenArm(Arm):
             yield identity
 
     def _require_no_restart(self, buses: Buses) -> None:
-        """Raise PositionUnknown where a drive has restarted since it was configured, and so has lost its zero."""
-        if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
-            raise PositionUnknown(self._zeros.lost(restarted))
+        """Raise DriverError where a drive has restarted since it was configured (PositionUnknown: it had a zero)."""
+        if self._zeros is not None and (lost := [drive.node for drive in buses.drives if drive.boots]):
+            raise PositionUnknown(self._zeros.lost(lost))
+        if restarted := self._restarted(buses):
+            raise DriverError(f"{'; '.join(restarted)}: what it was configured with is lost; open the arm again")
+
+    def _restarted(self, buses: Buses) -> list[str]:
+        """Return the drives that have sent a boot-up message since they were configured, in words."""
+        drives = zip(self._names, buses.drives, self._boots, strict=True)
+        return [f"{name} has restarted" for name, drive, boots in drives if drive.boots > boots]
 
     def _cycle_until_states(self, buses: Buses, steps: EnableSequence | Resetting) -> None:
         """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
@@ -687,10 +698,12 @@ class CanopenArm(Arm):
 
     def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
         """Return the status of each joint; computed again only when a drive has reported something new."""
-        told = [(drive.status, drive.emergency) for drive in drives]
+        told = [(drive.status, drive.let_go, drive.emergency) for drive in drives]
         if told != self._told:
             self._told = told
             self._status = tuple(int(joint_status(drives[k].axis_status for k in needed)) for needed in self._drives_of)
+            for drive in drives:
+                drive.let_go = None
         return self._status
 
 

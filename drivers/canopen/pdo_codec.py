@@ -93,6 +93,8 @@ class Drive:
         duplicates: positions that came second in a cycle.
         late: positions that came outside of the cycle that they are of.
         status: the last status word (6041h), None before the first.
+        let_go: a status word by which an enabled drive was not enabled any more, since whoever acts upon it has cleared
+            it; a later one that says otherwise does not take it back.
         torque: the last one that it measured [per mille of rated torque] (6077h).
         torques: how often that was told.
         status_age: cycles since it.
@@ -115,6 +117,7 @@ class Drive:
     duplicates: int = 0
     late: int = 0
     status: int | None = None
+    let_go: int | None = None
     torque: int = 0
     torques: int = 0
     status_age: int = 0
@@ -135,7 +138,8 @@ class Drive:
     def axis_status(self) -> AxisStatus:
         """Return the status in flags common to all fieldbuses; none before the first status word."""
         error = 0 if self.emergency is None else self.emergency.code
-        return AxisStatus(0) if self.status is None else axis_status(self.status, error)
+        status = self.status if self.let_go is None else self.let_go
+        return AxisStatus(0) if status is None else axis_status(status, error)
 
 
 @dataclass(slots=True)
@@ -319,6 +323,7 @@ class BusCodec:
         if self.controller in LEFT_NORMAL:
             self._tell_controller()
         for drive in self.drives:
+            drive.let_go = None
             if drive.error_passive:
                 self._tell(EventCode.DRIVE_PASSIVE, drive.node, f"{emergency_words(ERROR_PASSIVE)}, and not over yet")
 
@@ -388,6 +393,8 @@ class BusCodec:
             return
         state, was = state_of(status), None if before is None else state_of(before)
         if state is not was:
+            if was is DriveState.OPERATION_ENABLED:
+                drive.let_go = status
             bad = state in (DriveState.FAULT, DriveState.FAULT_REACTION)
             words = f"{state} (status word {status:04X}h)" + ("" if was is None else f", was {was}")
             self._tell(EventCode.DRIVE_FAULT if bad else EventCode.DRIVE_STATE, drive.node, words)

@@ -335,9 +335,7 @@ def _report_text(report: dict[str, Any]) -> str:
     early += f"not finished early: {report['not_finished']}\n" if "not_finished" in report else ""
     early += _target_text(report["until"]) if "until" in report else ""
     early += (
-        f"WARNING: not known to be off and released: {'; '.join(report['unconfirmed'])}\n"
-        if "unconfirmed" in report
-        else ""
+        f"WARNING: when the arm was closed: {'; '.join(report['unconfirmed'])}\n" if "unconfirmed" in report else ""
     )
     ended = f"{early}{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
     if lateness is None or compute is None:

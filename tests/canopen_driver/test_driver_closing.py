@@ -249,7 +249,7 @@ def test_an_error_that_ends_an_open_arm_says_which_drives_were_not_left() -> Non
     with pytest.raises(DriverError, match="given torques") as ended, bench.as_it_is():
         bench.arm.exchange_position(PUSH)
     (note,) = ended.value.__notes__
-    assert note.startswith("not known to be off and released: turn: drive 1: node 1: reading 6041h:00")
+    assert note.startswith("when the arm was closed: turn: drive 1: node 1: reading 6041h:00")
 
 
 def test_what_was_told_of_one_session_is_not_told_of_the_next() -> None:
