@@ -51,6 +51,7 @@ from drivers.canopen.cia402 import (
     DriveState,
     NmtCommand,
     joint_status,
+    state_of,
 )
 from drivers.canopen.drive_setup import (
     DriveConfiguration,
@@ -65,7 +66,7 @@ from drivers.canopen.drive_setup import (
 from drivers.canopen.homing import ZeroingArm
 from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
-from drivers.canopen.pdo_mapping import bus_profiles
+from drivers.canopen.pdo_mapping import Write, bus_profiles
 from drivers.canopen.sdo import Objects, SdoRefused
 from drivers.canopen.stored_zero import zeros_of
 from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, hold
@@ -379,7 +380,7 @@ class CanopenArm(Arm):
         return self._session.logged()
 
     def open(self) -> None:
-        """Lock and open every bus, and configure every drive; nothing is energised.
+        """Lock and open every bus, and configure every drive; nothing is energised, and what was is quick-stopped.
 
         Raises:
             DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
@@ -400,6 +401,7 @@ class CanopenArm(Arm):
                 raise
             self._buses = buses
             buses.call()
+            self._brake_enabled(buses)
             self._find_zero(buses)
             self._identities = tuple(self._configured(buses))
             buses.begin()
@@ -611,6 +613,26 @@ class CanopenArm(Arm):
         there = self._positions and self._buses is not None
         self._counts = [drive.position for drive in self._buses.drives] if there else [0] * len(self._limits)  # type: ignore[union-attr]
         self._acting = read_only(np.zeros(len(self._limits)))
+
+    def _brake_enabled(self, buses: Buses) -> None:
+        """Quick-stop drives that a host has left enabled: none is to be configured while its last torque acts.
+
+        Raises:
+            DriverError: one goes on all the same.
+        """
+        every, enabled = [buses.objects(number) for number in range(len(buses.drives))], DriveState.OPERATION_ENABLED
+        last_ns: int | None = None
+        while on := [k for k, objects in enumerate(every) if state_of(objects.read(od.STATUS_WORD)) is enabled]:
+            now_ns = self.clock.now_ns()
+            if last_ns is None:
+                self._stops, self._stop.braking = self._stops + 1, True  # closing does not cut it short
+                last_ns = now_ns + round(_BRAKING * 1e9)
+            elif now_ns > last_ns:
+                names = ", ".join(self._names[k] for k in on)
+                raise DriverError(f"{names}: left enabled by another host, and goes on although told to stop")
+            for k in on:
+                every[k].write(Write(od.CONTROL_WORD, QUICK_STOP))
+            self.clock.sleep_until_ns(now_ns + round(REPEAT * 1e9))
 
     def _find_zero(self, buses: Buses) -> None:
         """Find the zero that the drives confirm, before they are configured, which may make them forget it."""

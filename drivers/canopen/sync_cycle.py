@@ -152,7 +152,8 @@ class Buses:
         self.control(number, word)
         codec, link = self._at[number]
         drive = self.drives[number]
-        if self.enabled and (deaf or drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL)):
+        gone = self.enabled and (drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL))
+        if deaf or gone:
             link.send(codec.control_download(drive.node, word))
 
     def ask(self, number: int, entry: Entry) -> None:

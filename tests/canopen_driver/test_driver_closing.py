@@ -33,7 +33,7 @@ class Bench:
     """An enabled arm, the emulated drives behind it, and the wires between."""
 
     def __init__(self, **driver: Any) -> None:
-        config = weightless_config(**driver)
+        self.config = config = weightless_config(**driver)
         self.behind = LockStepArm(config)
         self.taps = tapped(self.behind, config)
         self.arm = CanopenArm(config, lambda _: self.taps)
@@ -261,3 +261,38 @@ def test_what_was_told_of_one_session_is_not_told_of_the_next() -> None:
     sound = Bench()
     sound.arm.close()
     assert sound.arm.unconfirmed() == ()
+
+
+def left_enabled(**driver: Any) -> Bench:
+    """Drives that pushed when their host died, and whose watchdogs did not mind."""
+    bench = Bench(**driver)
+    bench.behind.inject(DriveFault("watchdog_ignored"))
+    bench.tap.close()
+    bench.behind.settle(bench.behind.clock.now_ns() + 10**9)
+    assert all(drive.motor.torque for drive in (bench.drive(0), bench.drive(1)))
+    return bench
+
+
+@pytest.mark.parametrize(("option", "then"), [(2, "SWITCH_ON_DISABLED"), (6, "QUICK_STOP_ACTIVE")])
+def test_drives_that_a_dead_host_has_left_enabled_are_braked_before_they_are_configured(option: int, then: str) -> None:
+    bench = left_enabled(reactions={"quick_stop": option})
+    taps = tapped(bench.behind, bench.config)
+    with CanopenArm(bench.config, lambda _: taps) as arm:
+        words = [frame for frame in taps[0].sent if 0x600 < frame.identifier < 0x680]
+        stops = [frame.data for frame in words if frame.data[0] == 0x2B][:2]
+        assert stops == [bytes([0x2B, 0x40, 0x60, 0, 0x02, 0, 0, 0])] * 2
+        assert [bench.drive(number).power.state.name for number in (0, 1)] == [then] * 2
+        for _ in range(5):
+            arm.exchange(None)
+        arm.enable()
+        np.testing.assert_allclose(arm.exchange(PUSH).torque, PUSH, atol=1e-3)
+    assert arm.unconfirmed() == ()
+
+
+def test_a_drive_that_goes_on_is_named_and_nothing_is_opened() -> None:
+    bench = left_enabled()
+    bench.taps = tapped(bench.behind, bench.config)
+    bench.drive(1)._firmware.arrived = lambda keys: None  # type: ignore[method-assign]
+    with pytest.raises(DriverError, match="slide: drive 2: left enabled by another host, and goes on although told"):
+        CanopenArm(bench.config, lambda _: bench.taps).open()
+    assert bench.drive(0).power.state is PowerState.SWITCH_ON_DISABLED
