@@ -433,7 +433,7 @@ class BarrettArm(Arm):
     def _wait_until_idle(self, bus: PuckBus) -> None:
         """Send IDLE until all pucks say so, or have had their time; never raises."""
         for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
-            if self._is_idle(bus) or (cycle >= _FAREWELL and not self._untold):
+            if self._is_idle(bus) or (cycle >= _FAREWELL and not self._untold and not self._disobeys(bus)):
                 break
             self._lower(bus)
             with suppress(Exception):
@@ -449,6 +449,13 @@ class BarrettArm(Arm):
             *(f"{name} has not said that it is idle" for name in left if name not in restarted),
             *(f"{name} has restarted" for name in restarted),
         )
+
+    @staticmethod
+    def _disobeys(bus: PuckBus) -> bool:
+        """Return whether a puck that answers says that it is not idle; of one that does not nothing will be heard."""
+        pucks, safety = bus.codec.pucks, bus.codec.safety
+        heard = safety.mode == SafetyMode.ACTIVE and safety.status_age <= _LOWER_EVERY
+        return heard or any(puck.mode == Mode.TORQUE and puck.answered for puck in pucks)
 
     @staticmethod
     def _ask_whether_idle(bus: PuckBus, motors: Properties) -> None:

@@ -671,7 +671,7 @@ class CanopenArm(Arm):
 
     def _restarted(self, buses: Buses) -> list[str]:
         """Return the drives that have sent a boot-up message since they were configured, in words."""
-        drives = zip(self._names, buses.drives, self._boots, strict=True)
+        drives = list(zip(self._names, buses.drives, self._boots, strict=True))[: self._begun]
         return [f"{name} has restarted" for name, drive, boots in drives if drive.boots > boots]
 
     def _cycle_until_states(self, buses: Buses, steps: EnableSequence | Resetting) -> None:

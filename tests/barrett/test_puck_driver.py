@@ -714,3 +714,25 @@ def test_a_safety_puck_that_acts_later_than_described_gives_no_ticket(acts: floa
     assert check.verdict is verdict, check.reason
     assert [one.most for one in check.measures] == pytest.approx([0.1 + 11 / RATE] * 7)
     assert [one.value for one in check.measures] == pytest.approx([acts] * 7, abs=3 / RATE)
+
+
+def test_pucks_that_do_not_hear_idle_are_told_for_as_long_as_they_answer() -> None:
+    bench = Bench(wam(heartbeat=2.0, watchdog_reason="the safety puck does not help here"))
+    bench.arm.open()
+    bench.arm.enable()
+    bench.cycles(5, NONE)
+    until_ns, link = bench.behind.clock.now_ns() + 300_000_000, bench.taps[-1]._link
+    send = link.send
+
+    def loses(frame: Frame) -> None:
+        request = request_of(frame.data)
+        lowers = request is not None and request.number == 8 and request.value is not None
+        if not (lowers and bench.behind.clock.now_ns() < until_ns):
+            send(frame)
+
+    link.send = loses  # type: ignore[method-assign]
+    bench.arm.stop(StopKind.TORQUE_OFF)
+    bench.arm.close()
+    assert bench.arm.unconfirmed() == ()
+    assert bench.safety.mode is SafetyMode.IDLE
+    assert all(puck.motor.power is Power.BRAKE for puck in bench.pucks)
