@@ -581,18 +581,15 @@ class CanopenArm(Arm):
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
                 buses.cycle(zero)  # what was asked before is answered in it
-            said = ""
+            objects, said = buses.objects_in_cycles(number, zero), ""
             try:
-                objects = buses.objects_in_cycles(number, zero)
                 state = disable_supervision(objects, self._zeros, number, buses.restarted(number))
-                if state not in (*POWER_OFF, DriveState.QUICK_STOP):
-                    said = f"is in the state {state}"
+                said = "" if state in (*POWER_OFF, DriveState.QUICK_STOP) else f"is in the state {state}"
+                there[drive.bus] = buses.objects(number)
             except Exception as error:  # noqa: BLE001 - whatever a drive or its bus died of, the others must be left
-                said = str(error)
-                if not isinstance(error, SdoRefused):
-                    self._unconfirmed.append(f"{self._names[number]}: {said}")
-                    continue
-            there[drive.bus] = buses.objects(number)
+                said = str(error) or repr(error)
+                if isinstance(error, SdoRefused):
+                    there[drive.bus] = buses.objects(number)
             if said:
                 self._unconfirmed.append(f"{self._names[number]}: {said}")
         self._unconfirmed += self._restarted(buses)
@@ -631,7 +628,8 @@ class CanopenArm(Arm):
                 names = ", ".join(self._names[k] for k in on)
                 raise DriverError(f"{names}: left enabled by another host, and goes on although told to stop")
             for k in on:
-                every[k].write(Write(od.CONTROL_WORD, QUICK_STOP))
+                with suppress(DriverError):  # the others must be told; what it says next time counts
+                    every[k].write(Write(od.CONTROL_WORD, QUICK_STOP))
             self.clock.sleep_until_ns(now_ns + round(REPEAT * 1e9))
 
     def _find_zero(self, buses: Buses) -> None:

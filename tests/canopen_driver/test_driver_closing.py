@@ -296,3 +296,12 @@ def test_a_drive_that_goes_on_is_named_and_nothing_is_opened() -> None:
     with pytest.raises(DriverError, match="slide: drive 2: left enabled by another host, and goes on although told"):
         CanopenArm(bench.config, lambda _: bench.taps).open()
     assert bench.drive(0).power.state is PowerState.SWITCH_ON_DISABLED
+
+
+def test_one_that_does_not_confirm_its_stop_does_not_keep_the_other_from_its_own() -> None:
+    bench = left_enabled()
+    bench.taps = tapped(bench.behind, bench.config)
+    bench.tap.loses = requests(1, of=0x6040)
+    with pytest.raises(DriverError, match="turn: drive 1: left enabled by another host, and goes on although told"):
+        CanopenArm(bench.config, lambda _: bench.taps).open()
+    assert bench.drive(1).power.state is PowerState.SWITCH_ON_DISABLED
