@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from ident_service.errors import DriverError
 Vector = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Counts = NDArray[np.int64]
+AT_CLOSING: Final = "when the arm was closed:"  # begins what is told of `Arm.unconfirmed`
 _Numbers = TypeVar("_Numbers", bound=NDArray[Any])
 
 
@@ -136,12 +137,15 @@ class Watchdog:
         kind: the signal it watches: `rpdo_timer` and the like.
         seconds: how long that may stay away before the drive acts [s]; None where unknown.
         of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
+        report_delay: how much later its reaction may show while its signal is withheld [s]; None where that is
+            `ArmDescription.report_delay`.
     """
 
     drive: str
     kind: str
     seconds: float | None
     of_torque: bool = True
+    report_delay: float | None = None
 
 
 @dataclass(frozen=True)
@@ -259,6 +263,14 @@ class Arm(ABC):
         """Return what each drive has reported last, in the order of `watchdogs`."""
         return ()
 
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Return which drives did not confirm that they are off when the arm was closed last, and why, in words.
+
+        One of these may have power, or will miss its host. Also which have restarted while the arm was open, as it may
+        have shown as silence only. Empty where nothing is to be told, and for drivers that cannot tell.
+        """
+        return ()
+
     @abstractmethod
     def open(self) -> None:
         """Open the arm exclusively and check that it answers; raises DriverError where that fails."""
@@ -339,6 +351,8 @@ class Arm(ABC):
         self.open()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Close the arm, whatever happened."""
+    def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
+        """Close the arm, whatever happened; an error that ends it says which drives have not confirmed that."""
         self.close()
+        if error is not None and (left := self.unconfirmed()):
+            error.add_note(f"{AT_CLOSING} {'; '.join(left)}")

@@ -45,7 +45,7 @@ from drivers.barrett.protocol import (
     torque_frame,
 )
 from drivers.barrett.setup import TIMEOUT
-from drivers.can.answer_order import AnswerOrder
+from drivers.can.answer_order import AnswerOrder, settle_uncertain
 from drivers.can.bus_load import ROUND_RATES, Budget, BusLoad, Line, line_of, mean_bits, shares, worst
 from drivers.can.bus_state import HOST as BUS
 from drivers.can.bus_state import (
@@ -83,6 +83,7 @@ class MotorPuck:
         encoder: of the last answer, the joint encoder's position [counts], likewise; None where it has told none.
         answered: in this cycle.
         age: cycles since the request that `position` is of, 0 where that is the latest one.
+        late: positions that came outside of the cycle that they are of, or second in one.
         order: which request an answer is of.
         mode: MODE; None while unknown.
         stat: STAT; None while unknown.
@@ -94,6 +95,7 @@ class MotorPuck:
     encoder: int | None = None
     answered: bool = False
     age: int = 0
+    late: int = 0
     order: AnswerOrder = field(default_factory=AnswerOrder)
     mode: int | None = None
     stat: int | None = None
@@ -119,7 +121,6 @@ class PuckCodec:
         pucks: the motor pucks, in the arm's order.
         safety: the safety puck.
         controller: state of the host's CAN controller.
-        late: positions that came outside a cycle, or second in one.
         unexplained: cycles since an arm was seen to leave ACTIVE while the pendant has not said why; None for no such.
     """
 
@@ -134,7 +135,6 @@ class PuckCodec:
         """
         self.pucks = tuple(MotorPuck(puck.node, order=AnswerOrder(period)) for puck in driver.pucks)
         self.safety = SafetyPuck(driver.safety_node)
-        self.late = 0
         self.unexplained: int | None = None
         self._waits_for: set[int] = set()
         self.controller = ControllerState.ACTIVE
@@ -151,6 +151,11 @@ class PuckCodec:
         self._open, self._missing, self._now_ns = False, len(self.pucks), 0
         self._events: list[Event] = []
         self._told: set[int] = set()
+
+    @property
+    def late(self) -> int:
+        """Return how many positions were late or second, of all pucks together."""
+        return sum(puck.late for puck in self.pucks)
 
     @property
     def complete(self) -> bool:
@@ -205,15 +210,8 @@ class PuckCodec:
     def end_cycle(self) -> None:
         """Close the cycle at its deadline: answers from now on are late."""
         self._open = False
-        for puck in self.pucks if self._missing else ():
-            if not puck.order.uncertain:
-                continue
-            if puck.order.settle():
-                puck.answered, puck.age = True, 0
-                self._missing -= 1
-            else:
-                self.late += 1
-                self._tell(EventCode.LATE, puck.node, f"its position is {puck.age} cycles old")
+        if self._missing:
+            self._missing -= settle_uncertain(self.pucks, self._tell)
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call, oldest first, and forget them."""
@@ -247,11 +245,11 @@ class PuckCodec:
         if puck is None:
             self._tell_once(answer.node, EventCode.STRANGER, "a position of a puck that is not ours")
         elif not self._open:
-            self.late += 1
+            puck.late += 1
             puck.order.take_late()
             self._tell(EventCode.LATE, puck.node, "its position came after its cycle")
         elif (age := puck.order.take(stamp_ns - self._now_ns if stamp_ns else None)) is None:
-            self.late += 1
+            puck.late += 1
             self._tell(EventCode.DUPLICATE, puck.node, "a second position in one cycle")
         else:
             puck.position, puck.encoder, puck.age = answer.counts, answer.encoder, age
@@ -434,7 +432,7 @@ class PuckBus:
         self.complete = codec.complete
         if not self.complete:
             self.lost += sum(not puck.answered for puck in codec.pucks)
-        self._ask(asks_safety)
+        self._ask(asks_safety or silent)  # its watchdog is tried; MODE it does not watch
         return stamp_ns
 
     def answers_late(self) -> bool:

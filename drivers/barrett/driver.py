@@ -34,7 +34,7 @@ from drivers.arm import (
 from drivers.axis_status import AxisEvent, AxisEventCode, AxisStatus
 from drivers.barrett import setup
 from drivers.barrett.cycle import MotorPuck, PuckBus, PuckCodec, axis_status, budget
-from drivers.barrett.protocol import POSITION_BITS, Group, Mode, SafetyMode, Status, get, put
+from drivers.barrett.protocol import POSITION_BITS, Group, Mode, Properties, SafetyMode, Status, get, put
 from drivers.can.bus_load import Budget
 from drivers.can.bus_state import BUS_EVENTS, HOST, Event, EventCode, controller_checks
 from drivers.can.can_link import Link, open_links
@@ -215,6 +215,7 @@ class BarrettArm(Arm):
         self._stale: set[int] = set()
         self._status: tuple[int, ...] = ()
         self._checks: tuple[SetupCheck, ...] = ()
+        self._unconfirmed: tuple[str, ...] = ()
 
     def look(self) -> Arm:
         """Return an arm that asks pucks for positions and states, and sets nothing.
@@ -314,8 +315,11 @@ class BarrettArm(Arm):
 
     def watchdogs(self) -> tuple[Watchdog, ...]:
         """Return the safety puck's watch over every puck, see `Arm`."""
-        seconds = self._driver.heartbeat
-        return tuple(Watchdog(name, "bus_silence", seconds, of_torque=False) for name in self._names)
+        seconds, period = self._driver.heartbeat, self._period_ns * 1e-9
+        # Meanwhile the safety puck is asked in every cycle whether it has acted.
+        return tuple(
+            Watchdog(name, "bus_silence", seconds, of_torque=False, report_delay=period) for name in self._names
+        )
 
     def withhold(self, kind: str) -> None:
         """Send neither torques nor requests for positions, which the safety puck watches; see `Arm`."""
@@ -414,18 +418,52 @@ class BarrettArm(Arm):
         self.stop(StopKind.TORQUE_OFF)
         if self._bus is not None:
             if not self._looks:
-                for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
-                    if self._is_idle(self._bus) or (cycle >= _FAREWELL and not self._untold):
-                        break
-                    with suppress(Exception):
-                        self._lower(self._bus)
-                        self._bus.cycle(None, asks_safety=True)
+                self._wait_until_idle(self._bus)
             self._bus.close()
         elif self._port is not None:
             with suppress(Exception):
                 self._port.link.close()
         self._bus = self._found = self._port = None
         self._session.close()
+
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Return the pucks that did not say, when the arm was closed last, that they are idle; see `Arm`."""
+        return self._unconfirmed
+
+    def _wait_until_idle(self, bus: PuckBus) -> None:
+        """Send IDLE until all pucks say so, or have had their time; never raises."""
+        for cycle in range(max(_FAREWELL, round(_CLOSING * 1e9 / self._period_ns))):
+            if self._is_idle(bus) or (cycle >= _FAREWELL and not self._untold and not self._disobeys(bus)):
+                break
+            self._lower(bus)
+            with suppress(Exception):
+                if self._found is not None and cycle % _LOWER_EVERY == 0:
+                    self._ask_whether_idle(bus, self._found.motors)
+            with suppress(Exception):
+                bus.cycle(None, asks_safety=True)
+        pucks, safety = bus.codec.pucks, bus.codec.safety
+        left = [name for name, puck in zip(self._names, pucks, strict=True) if puck.mode == Mode.TORQUE]
+        left += [f"safety puck {safety.node}"] if safety.mode == SafetyMode.ACTIVE else []
+        restarted = [name for name, puck in zip(self._names, pucks, strict=True) if puck.stat == Status.RESET]
+        self._unconfirmed = (
+            *(f"{name} has not said that it is idle" for name in left if name not in restarted),
+            *(f"{name} has restarted" for name in restarted),
+        )
+
+    @staticmethod
+    def _disobeys(bus: PuckBus) -> bool:
+        """Return whether a puck that answers says that it is not idle; of one that does not nothing will be heard."""
+        pucks, safety = bus.codec.pucks, bus.codec.safety
+        heard = safety.mode == SafetyMode.ACTIVE and safety.status_age <= _LOWER_EVERY
+        return heard or any(puck.mode == Mode.TORQUE and puck.answered for puck in pucks)
+
+    @staticmethod
+    def _ask_whether_idle(bus: PuckBus, motors: Properties) -> None:
+        """Ask all pucks for MODE, and those that have not said IDLE for STAT: one that has restarted knows no MODE."""
+        bus.link.send(get(Group.ARM, motors.number("MODE"), group=True))
+        for puck in bus.codec.pucks:
+            if puck.mode == Mode.TORQUE:
+                bus.link.send(get(puck.node, motors.number("STAT")))
 
     _port: setup.PropertyPort | None = None
 

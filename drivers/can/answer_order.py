@@ -12,7 +12,10 @@ shows when a request is left out, which both drivers do when they are opened, an
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable, Iterable
+from typing import Final, Protocol
+
+from drivers.can.bus_state import EventCode
 
 MARGIN: Final = 0.125  # of a period, later than ever so far, that is still usual; at 1 kHz, the time of one more frame
 _BELIEVED: Final = 2  # answers in a row at unusual times that are taken for this cycle's
@@ -78,3 +81,44 @@ class AnswerOrder:
         if delay_ns is None or self._earliest_ns is None:
             return True
         return self._earliest_ns <= delay_ns <= self._latest_ns + self._margin_ns
+
+
+class AnsweringNode(Protocol):
+    """A node that answers each request once, as both kinds of drives do.
+
+    Attributes:
+        node: its number.
+        answered: whether it has answered in this cycle.
+        age: cycles since the request that its last answer is of.
+        late: answers that did not count for the cycle in which they came.
+        order: which request an answer is of.
+    """
+
+    node: int
+    answered: bool
+    age: int
+    late: int
+    order: AnswerOrder
+
+
+def settle_uncertain(nodes: Iterable[AnsweringNode], tell: Callable[[EventCode, int, str], None]) -> int:
+    """Decide, at the end of a cycle, for which nodes an uncertain answer counts as the latest request's.
+
+    Args:
+        nodes: of one bus.
+        tell: is told of the others, whose answers are late.
+
+    Returns:
+        How many nodes have answered by this.
+    """
+    settled = 0
+    for one in nodes:
+        if not one.order.uncertain:
+            continue
+        if one.order.settle():
+            one.answered, one.age = True, 0
+            settled += 1
+        else:
+            one.late += 1
+            tell(EventCode.LATE, one.node, f"its position is {one.age} cycles old")
+    return settled

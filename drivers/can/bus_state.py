@@ -195,6 +195,7 @@ class EventCode(StrEnum):
     STRANGER = "stranger"  # a frame of no node that should be on this bus
     SECOND_HOST = "second_host"  # another node sends what only this host may
     ERROR_PASSIVE = "error_passive"  # the host's controller
+    DRIVE_PASSIVE = "drive_passive"  # a drive's controller is error-passive
     BUS_OFF = "bus_off"  # the host's controller
     CONTROLLER = "controller"  # any other change of its state
     BUS_ERROR = "bus_error"
@@ -215,6 +216,7 @@ BUS_EVENTS = {
     EventCode.DRIVE_WARNING: AxisEventCode.DRIVE_WARNING,
     EventCode.SECOND_HOST: AxisEventCode.SECOND_HOST,
     EventCode.ERROR_PASSIVE: AxisEventCode.BUS_DEGRADED,
+    EventCode.DRIVE_PASSIVE: AxisEventCode.BUS_DEGRADED,
     EventCode.BUS_OFF: AxisEventCode.BUS_OFF,
     **dict.fromkeys(MILD, AxisEventCode.STRANGE_FRAME),
 }

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum, IntEnum
+from typing import Final
 
 from drivers.axis_status import AxisStatus
 
@@ -148,8 +149,10 @@ _AXIS_STATUS: dict[DriveState, AxisStatus] = {
     DriveState.FAULT_REACTION: AxisStatus.FAULT,
     DriveState.FAULT: AxisStatus.FAULT,
 }
+ERROR_PASSIVE: Final = 0x8120  # a drive whose CAN controller hears and sends badly
 _WATCHDOGS = (0x8130, 0x8250, 0x8700)  # the host fell silent: no heartbeat or question, no torque frame, no SYNC
 
+COMMUNICATION_ERROR: Final = 0x10  # of 1001h
 # Bits of object 1001h, from the lowest.
 ERROR_REGISTER = ("generic", "current", "voltage", "temperature", "communication", "profile", "reserved", "vendor")
 

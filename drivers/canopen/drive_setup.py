@@ -10,7 +10,7 @@ out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -19,7 +19,7 @@ import numpy as np
 from drivers.arm import Watchdog
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.capabilities import DRIVE_PROFILE, TORQUE_UNITS, Capabilities, parse_entry, where
-from drivers.canopen.cia402 import POWER_OFF, state_of
+from drivers.canopen.cia402 import COMMUNICATION_ERROR, ERROR_PASSIVE, POWER_OFF, DriveState, state_of
 from drivers.canopen.motor_units import count_limits, torque_limit_counts
 from drivers.canopen.object_dictionary import Entry, Kind, OperationMode
 from drivers.canopen.pdo_mapping import BusProfile, Pdo, Write
@@ -376,6 +376,21 @@ def identify(objects: Objects, wanted: DriveIdentity) -> str:
     return f"node {objects.node}: {words}, firmware {firmware}"
 
 
+def is_error_passive(objects: Objects) -> bool:
+    """Return whether a drive's CAN controller is error-passive by its error register and history (1001h, 1003h).
+
+    Its emergency message may have been sent before anybody listened.
+
+    Raises:
+        DriverError: it does not answer.
+    """
+    try:
+        bad = objects.read(od.ERROR_REGISTER) & COMMUNICATION_ERROR
+        return bool(bad) and objects.read(od.LAST_ERROR) & 0xFFFF == ERROR_PASSIVE
+    except SdoRefused:
+        return False  # without a history, or one that is empty
+
+
 def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     """Configure a pre-operational drive for the profile and its own protection; what it has already is not written.
 
@@ -461,11 +476,11 @@ def _mode_entry(text: str) -> Entry:
 
 def disable_supervision(
     objects: Objects, zeros: Zeros | None, number: int, restarted: Callable[[], bool]
-) -> Iterator[None]:
-    """Disable in steps the supervision of the host in a drive that is off; a drive that is on keeps it.
+) -> DriveState:
+    """Disable the supervision of the host in a drive that is off; a drive that is on keeps it.
 
-    It comes in steps of a few frames each, for cycles between them. A zero that the drive has confirmed it
-    confirms afterwards too, and nothing else: one that restarted in the session has lost its zero.
+    A zero that the drive has confirmed it confirms afterwards too, and nothing else: one that restarted in the session
+    has lost its zero. A part that it refuses does not keep it from the others.
 
     Args:
         objects: of the drive.
@@ -473,21 +488,29 @@ def disable_supervision(
         number: of the drive.
         restarted: whether it has sent a boot-up message in the session.
 
+    Returns:
+        The state in which the drive is.
+
     Raises:
-        DriverError: it does not answer, or refuses.
+        DriverError: it does not answer.
+        SdoRefused: it refuses a part; all others are done.
     """
     # Asked for: a status report may be held back by its inhibit time.
-    if state_of(objects.read(od.STATUS_WORD)) not in POWER_OFF:
-        return
-    counts = None
-    if zeros is not None:
-        counts = zeros.held(objects, number)
-        yield
+    state = state_of(objects.read(od.STATUS_WORD))
+    if state not in POWER_OFF:
+        return state
+    counts = zeros.held(objects, number) if zeros is not None else None
+    kept: SdoRefused | None = None
     for entry in (od.ABORT_CONNECTION, od.HEARTBEAT_CONSUMER, od.GUARD_TIME):  # or 8130h would follow every session
-        optional(objects.write, Write(entry, 0))
+        try:
+            optional(objects.write, Write(entry, 0))
+        except SdoRefused as refused:
+            kept = kept or refused
     if zeros is not None and counts is not None:
-        yield
         zeros.restore_mark(objects, number, counts, restarted)
+    if kept is not None:
+        raise kept
+    return state
 
 
 def _encoder(objects: Objects, drive: CanopenDrive) -> None:

@@ -43,12 +43,22 @@ from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import budget
 from drivers.canopen.bus_monitor import MonitoringArm
 from drivers.canopen.capabilities import required
-from drivers.canopen.cia402 import DISABLE_VOLTAGE, ENABLE, QUICK_STOP, DriveState, NmtCommand, joint_status
+from drivers.canopen.cia402 import (
+    DISABLE_VOLTAGE,
+    ENABLE,
+    POWER_OFF,
+    QUICK_STOP,
+    DriveState,
+    NmtCommand,
+    joint_status,
+    state_of,
+)
 from drivers.canopen.drive_setup import (
     DriveConfiguration,
     configure,
     disable_supervision,
     identify,
+    is_error_passive,
     motor_limits,
     quick_stop_option,
     watchdogs_of,
@@ -56,10 +66,10 @@ from drivers.canopen.drive_setup import (
 from drivers.canopen.homing import ZeroingArm
 from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
-from drivers.canopen.pdo_mapping import bus_profiles
-from drivers.canopen.sdo import Objects
+from drivers.canopen.pdo_mapping import Write, bus_profiles
+from drivers.canopen.sdo import Objects, SdoRefused
 from drivers.canopen.stored_zero import zeros_of
-from drivers.canopen.sync_cycle import Buses, EnableSequence, Resetting, hold
+from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, hold
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
@@ -82,11 +92,14 @@ class StopCommand:
     def __init__(self) -> None:
         self.braking = False
         self._untold: list[int] = []
+        self._deaf: set[int] = set()  # drives that have not obeyed
+        self._again_ns: int | None = None  # when drives that have not obeyed are told again; None before a stop
 
     def give(self, buses: Buses, kind: StopKind) -> None:
         """Send the stop to every drive; for 75 ms again to those whose link has not taken it."""
         self.braking = kind is StopKind.QUICK_STOP
         self._untold = list(range(len(buses.drives)))
+        self._again_ns = buses.clock.now_ns() + round(REPEAT * 1e9)
         for _ in range(_TRIES):
             self.repeat(buses)
             if not self._untold:
@@ -95,11 +108,15 @@ class StopCommand:
                 buses.clock.sleep_until_ns(buses.clock.now_ns() + round(_AGAIN * 1e9))
 
     def repeat(self, buses: Buses) -> None:
-        """Send the stop once more to the drives whose link has not taken it."""
+        """Send the stop once more to the drives whose link has not taken it, or that have not obeyed for `REPEAT`."""
+        if self._again_ns is not None and (now_ns := buses.clock.now_ns()) >= self._again_ns:
+            self._again_ns = now_ns + round(REPEAT * 1e9)
+            on = {number for number, drive in enumerate(buses.drives) if drive.state is DriveState.OPERATION_ENABLED}
+            self._untold, self._deaf = sorted(on.union(self._untold)), on
         word, drives, self._untold = QUICK_STOP if self.braking else DISABLE_VOLTAGE, self._untold, []
         for number in drives:
             try:
-                buses.control_stop(number, word)
+                buses.control_stop(number, word, deaf=number in self._deaf)
             except Exception:  # noqa: BLE001 - whatever the link died of, the other drives must be told
                 self._untold.append(number)
 
@@ -125,10 +142,10 @@ class StopCommand:
             self.repeat(buses)
             with suppress(Exception):  # of one cycle: the next one may be possible
                 buses.cycle(None if zero is None else self.counts(zero))
-            brakes = self.braking and any(drive.state in _ENDING for drive in buses.drives)
-            if cycle >= _FAREWELL and not brakes and not self._untold:
+            on = any(drive.state in _ENDING for drive in buses.drives)
+            if cycle >= _FAREWELL and not on and not self._untold:
                 break
-            if brakes and cycle % _FAREWELL == 0:
+            if on and cycle % _FAREWELL == 0:
                 self._untold = list(range(len(buses.drives)))  # what was sent may have been lost
         self._untold = []
 
@@ -203,8 +220,6 @@ _CODES = BUS_EVENTS | {
     EventCode.DEAF: AxisEventCode.TORQUE_IGNORED,
     EventCode.TORQUE_LIMITED: AxisEventCode.TORQUE_LIMITED,
 }
-# Emergencies of a drive that is in trouble with the bus itself (CiA 301, table 26).
-_ERROR_PASSIVE = "8120h"
 
 
 def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int, int]) -> list[AxisEvent]:
@@ -220,8 +235,6 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
     found = []
     for event in events:
         code = _CODES.get(event.code)
-        if event.code is EventCode.EMERGENCY and event.words.startswith(_ERROR_PASSIVE):
-            code = AxisEventCode.BUS_DEGRADED
         if code is not None:
             words = f"{bus}: {event.words}" if event.node == HOST else f"node {event.node}: {event.words}"
             found.append(AxisEvent(code, joint_of.get(event.node), words))
@@ -337,13 +350,15 @@ class CanopenArm(Arm):
         self._counts = [0] * len(self._limits)
         self._acting = read_only(np.zeros(len(self._limits)))
         self._unwrapped: list[int] | None = None
-        self._told: list[tuple[int | None, Emergency | None]] = []
+        self._told: list[tuple[int | None, int | None, Emergency | None]] = []
         self._status: tuple[int, ...] = ()
         self._cycle = self._begun = 0  # drives whose configuration has begun, the first ones
         first = {k: joints[0] for k, joints in self._joints_of.items()}
         self._reports = Reports(self._driver, first, self._look_every)
         self._measured = MeasuredTorque(self._coordinates, 1e9 / self._period_ns, compares=not self._positions)
         self._identities: tuple[str, ...] = ()
+        self._unconfirmed: list[str] = []
+        self._boots = [0] * len(self._driver.drives)  # of each drive, when its configuration began
 
     def look(self) -> Arm:
         """Return an arm that reads the drives' objects by SDO and sends nothing else."""
@@ -365,7 +380,7 @@ class CanopenArm(Arm):
         return self._session.logged()
 
     def open(self) -> None:
-        """Lock and open every bus, and configure every drive; nothing is energised.
+        """Lock and open every bus, and configure every drive; nothing is energised, and what was is quick-stopped.
 
         Raises:
             DriverError: a bus is in use, also by another host on it, or cannot be had; a drive does not answer, is
@@ -386,6 +401,7 @@ class CanopenArm(Arm):
                 raise
             self._buses = buses
             buses.call()
+            self._brake_enabled(buses)
             self._find_zero(buses)
             self._identities = tuple(self._configured(buses))
             buses.begin()
@@ -427,8 +443,8 @@ class CanopenArm(Arm):
         Drives that hold the arm in quick stop (605Ah of 5 to 8) go on holding it until all others are ready, too.
 
         Raises:
-            DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, or does not
-                follow in time; only what held the arm still does.
+            DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, has restarted
+                since the arm was opened, or does not follow in time; only what held the arm still does.
         """
         buses = self._open()
         held = hold(buses.drives)
@@ -436,6 +452,7 @@ class CanopenArm(Arm):
         self._streaming, self._stop = True, StopCommand()
         try:
             require_set_up(self.setup_checks())
+            self._require_no_restart(buses)
             reports = self._driver.report_delay, self._driver.status.period
             now_ns, option = self.clock.now_ns(), self._quick_stop
             buses.forget_modes()
@@ -551,19 +568,31 @@ class CanopenArm(Arm):
         self._streaming = False
         self._session.close()
 
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Return the drives that did not confirm, when the arm was closed last, that they are off; see `Arm`."""
+        return tuple(self._unconfirmed)
+
     def _leave(self, buses: Buses) -> None:
         """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""
         zero = self._counts if self._streaming else None
         self._stop.wait_until_off(buses, zero, self._period_ns)
+        buses.enabled = False  # or answers to its questions would be taken for those to these
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
-                objects = buses.objects(number)
-                # Between two conversations, so that the others do not miss their torque frames.
-                buses.cycle(zero)
-                for _ in disable_supervision(objects, self._zeros, number, buses.restarted(number)):
-                    buses.cycle(zero)
-                there[drive.bus] = objects
+                buses.cycle(zero)  # what was asked before is answered in it
+            objects, said = buses.objects_in_cycles(number, zero), ""
+            try:
+                state = disable_supervision(objects, self._zeros, number, buses.restarted(number))
+                said = "" if state in (*POWER_OFF, DriveState.QUICK_STOP) else f"is in the state {state}"
+                there[drive.bus] = buses.objects(number)
+            except Exception as error:  # noqa: BLE001 - whatever a drive or its bus died of, the others must be left
+                said = str(error) or repr(error)
+                if isinstance(error, SdoRefused):
+                    there[drive.bus] = buses.objects(number)
+            if said:
+                self._unconfirmed.append(f"{self._names[number]}: {said}")
+        self._unconfirmed += self._restarted(buses)
         for number in range(len(buses.drives)):
             with suppress(Exception):
                 buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
@@ -582,6 +611,27 @@ class CanopenArm(Arm):
         self._counts = [drive.position for drive in self._buses.drives] if there else [0] * len(self._limits)  # type: ignore[union-attr]
         self._acting = read_only(np.zeros(len(self._limits)))
 
+    def _brake_enabled(self, buses: Buses) -> None:
+        """Quick-stop drives that a host has left enabled: none is to be configured while its last torque acts.
+
+        Raises:
+            DriverError: one goes on all the same.
+        """
+        every, enabled = [buses.objects(number) for number in range(len(buses.drives))], DriveState.OPERATION_ENABLED
+        last_ns: int | None = None
+        while on := [k for k, objects in enumerate(every) if state_of(objects.read(od.STATUS_WORD)) is enabled]:
+            now_ns = self.clock.now_ns()
+            if last_ns is None:
+                self._stops, self._stop.braking = self._stops + 1, True  # closing does not cut it short
+                last_ns = now_ns + round(_BRAKING * 1e9)
+            elif now_ns > last_ns:
+                names = ", ".join(self._names[k] for k in on)
+                raise DriverError(f"{names}: left enabled by another host, and goes on although told to stop")
+            for k in on:
+                with suppress(DriverError):  # the others must be told; what it says next time counts
+                    every[k].write(Write(od.CONTROL_WORD, QUICK_STOP))
+            self.clock.sleep_until_ns(now_ns + round(REPEAT * 1e9))
+
     def _find_zero(self, buses: Buses) -> None:
         """Find the zero that the drives confirm, before they are configured, which may make them forget it."""
         if self._zeros is not None:
@@ -593,6 +643,7 @@ class CanopenArm(Arm):
         motors = motor_limits(self._config, self._coordinates)
         for number, drive in enumerate(self._driver.drives):
             objects = buses.objects(number)
+            self._boots[number] = buses.drives[number].boots
             identity = identify(objects, drive.identity)
             can = required(objects, self._driver, number)
             identity += f"; {can.summary}"  # a preflight ticket is for what was found of the drive
@@ -600,6 +651,7 @@ class CanopenArm(Arm):
             self._begun = number + 1
             mode = configure(objects, DriveConfiguration(drive, buses.profile(number), *own))
             buses.modes[number] = mode
+            buses.drives[number].error_passive |= is_error_passive(objects)
             identity += ", its targets act when they come, not at SYNC" if mode.at_once else ""
             if self._zeros is not None:
                 counts = self._coordinates.zero[number]
@@ -609,9 +661,16 @@ class CanopenArm(Arm):
             yield identity
 
     def _require_no_restart(self, buses: Buses) -> None:
-        """Raise PositionUnknown where a drive has restarted since it was configured, and so has lost its zero."""
-        if self._zeros is not None and (restarted := [drive.node for drive in buses.drives if drive.boots]):
-            raise PositionUnknown(self._zeros.lost(restarted))
+        """Raise DriverError where a drive has restarted since it was configured (PositionUnknown: it had a zero)."""
+        if self._zeros is not None and (lost := [drive.node for drive in buses.drives if drive.boots]):
+            raise PositionUnknown(self._zeros.lost(lost))
+        if restarted := self._restarted(buses):
+            raise DriverError(f"{'; '.join(restarted)}: what it was configured with is lost; open the arm again")
+
+    def _restarted(self, buses: Buses) -> list[str]:
+        """Return the drives that have sent a boot-up message since they were configured, in words."""
+        drives = list(zip(self._names, buses.drives, self._boots, strict=True))[: self._begun]
+        return [f"{name} has restarted" for name, drive, boots in drives if drive.boots > boots]
 
     def _cycle_until_states(self, buses: Buses, steps: EnableSequence | Resetting) -> None:
         """Cycle with zero torque until the drives have gone through the given states; a stop meanwhile wins."""
@@ -659,10 +718,12 @@ class CanopenArm(Arm):
 
     def _statuses(self, drives: Sequence[Drive]) -> tuple[int, ...]:
         """Return the status of each joint; computed again only when a drive has reported something new."""
-        told = [(drive.status, drive.emergency) for drive in drives]
+        told = [(drive.status, drive.let_go, drive.emergency) for drive in drives]
         if told != self._told:
             self._told = told
             self._status = tuple(int(joint_status(drives[k].axis_status for k in needed)) for needed in self._drives_of)
+            for drive in drives:
+                drive.let_go = None
         return self._status
 
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.axis_status import AxisStatus
-from drivers.can.answer_order import AnswerOrder
+from drivers.can.answer_order import AnswerOrder, settle_uncertain
 from drivers.can.bus_state import (
     HOST,
     LEFT_NORMAL,
@@ -32,6 +32,8 @@ from drivers.can.bus_state import (
 from drivers.can.can_frame import Frame
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.cia402 import (
+    COMMUNICATION_ERROR,
+    ERROR_PASSIVE,
     FOLLOWS,
     INTERNAL_LIMIT,
     WARNING,
@@ -91,6 +93,8 @@ class Drive:
         duplicates: positions that came second in a cycle.
         late: positions that came outside of the cycle that they are of.
         status: the last status word (6041h), None before the first.
+        let_go: a status word by which an enabled drive was not enabled any more, since whoever acts upon it has cleared
+            it; a later one that says otherwise does not take it back.
         torque: the last one that it measured [per mille of rated torque] (6077h).
         torques: how often that was told.
         status_age: cycles since it.
@@ -98,6 +102,8 @@ class Drive:
         heartbeat_ns: when that was [ns of the link's clock].
         boots: boot-up messages.
         emergency: the latest, None before the first and after a reset.
+        error_passive: whether it has said so of its CAN controller, and not since that it is over.
+        reply: last answer to an SDO request, of any kind; None until one came since whoever asks has cleared it.
         uploads: last value of each entry that it was asked for by one frame, by `index << 8 | sub-index`.
     """
 
@@ -111,6 +117,7 @@ class Drive:
     duplicates: int = 0
     late: int = 0
     status: int | None = None
+    let_go: int | None = None
     torque: int = 0
     torques: int = 0
     status_age: int = 0
@@ -118,6 +125,8 @@ class Drive:
     heartbeat_ns: int = 0
     boots: int = 0
     emergency: Emergency | None = None
+    error_passive: bool = False
+    reply: Frame | None = None
     uploads: dict[int, bytes] = field(default_factory=dict)
 
     @property
@@ -129,7 +138,8 @@ class Drive:
     def axis_status(self) -> AxisStatus:
         """Return the status in flags common to all fieldbuses; none before the first status word."""
         error = 0 if self.emergency is None else self.emergency.code
-        return AxisStatus(0) if self.status is None else axis_status(self.status, error)
+        status = self.status if self.let_go is None else self.let_go
+        return AxisStatus(0) if status is None else axis_status(status, error)
 
 
 @dataclass(slots=True)
@@ -281,15 +291,8 @@ class BusCodec:
     def end_cycle(self) -> None:
         """Close the cycle at its deadline: answers from now on are late."""
         self._open = False
-        for drive in self.drives if self._missing else ():
-            if not drive.order.uncertain:
-                continue
-            if drive.order.settle():
-                drive.answered, drive.age = True, 0
-                self._missing -= 1
-            else:
-                drive.late += 1
-                self._tell(EventCode.LATE, drive.node, f"its position is {drive.age} cycles old")
+        if self._missing:
+            self._missing -= settle_uncertain(self.drives, self._tell)
 
     @property
     def complete(self) -> bool:
@@ -319,6 +322,10 @@ class BusCodec:
         self._foreign.clear()
         if self.controller in LEFT_NORMAL:
             self._tell_controller()
+        for drive in self.drives:
+            drive.let_go = None
+            if drive.error_passive:
+                self._tell(EventCode.DRIVE_PASSIVE, drive.node, f"{emergency_words(ERROR_PASSIVE)}, and not over yet")
 
     def receive(self, frame: Frame) -> None:
         """Take one frame, whatever it is; never raises."""
@@ -371,7 +378,7 @@ class BusCodec:
 
     def _on_upload(self, drive: Drive, frame: Frame) -> None:
         """Keep the answer to a question of one frame (`sdo.upload_request`); others are neither used nor strange."""
-        data = frame.data
+        data, drive.reply = frame.data, frame
         _, index, sub = _MULTIPLEXER.unpack_from(data.ljust(_MULTIPLEXER.size, b"\0"))
         if len(data) != 8 or data[0] & 0xE3 != _UPLOADED or index << 8 | sub not in self.asked:
             self.counters.ignored += 1
@@ -386,6 +393,8 @@ class BusCodec:
             return
         state, was = state_of(status), None if before is None else state_of(before)
         if state is not was:
+            if was is DriveState.OPERATION_ENABLED:
+                drive.let_go = status
             bad = state in (DriveState.FAULT, DriveState.FAULT_REACTION)
             words = f"{state} (status word {status:04X}h)" + ("" if was is None else f", was {was}")
             self._tell(EventCode.DRIVE_FAULT if bad else EventCode.DRIVE_STATE, drive.node, words)
@@ -405,7 +414,13 @@ class BusCodec:
                 return
         # A torn emergency is one nevertheless.
         code, register, vendor = data[0] | data[1] << 8, data[2] if len(data) > 2 else 0, bytes(data[3:8])
-        if code == 0:
+        if code == ERROR_PASSIVE:
+            drive.error_passive = True
+            drive.emergency = Emergency(code, register, vendor)
+            self._tell(EventCode.DRIVE_PASSIVE, drive.node, emergency_words(code, register, vendor))
+        elif code == 0:
+            # Another error may be over: of those that remain the register tells.
+            drive.error_passive = drive.error_passive and bool(register & COMMUNICATION_ERROR)
             drive.emergency = None
             self._tell(EventCode.EMERGENCY_RESET, drive.node, "error reset")
         elif self._is_notice(drive.node, code, data):
@@ -430,6 +445,7 @@ class BusCodec:
         drive.nmt, drive.heartbeat_ns = state, frame.stamp_ns or self._now_ns
         if state == NmtState.BOOT_UP:
             drive.boots += 1
+            drive.error_passive = False
             drive.status = None  # the drive has lost its configuration; its last status is no longer true
             self._tell(EventCode.BOOT_UP, drive.node, "has booted")
         elif before != state and before is not None:

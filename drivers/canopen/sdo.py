@@ -14,7 +14,7 @@ import logging
 import struct
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo import SdoAbortedError, SdoClient, SdoCommunicationError
@@ -60,6 +60,20 @@ def optional(do: Callable[[Any], T], what: Any) -> T | None:
         return None
 
 
+class ReplyLink(Protocol):
+    """Define what a conversation with one node needs of a link; see `Link`."""
+
+    @property
+    def clock(self) -> Clock:
+        """Return the clock of deadlines."""
+
+    def send(self, frame: Frame) -> None:
+        """Queue one frame for transmission."""
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """Return the next received frame, None when there is none until the deadline [ns of the clock]."""
+
+
 class Objects:
     """Access the object dictionary of one node, while nothing streams.
 
@@ -71,7 +85,7 @@ class Objects:
     dry = False
     patience = TIMEOUT
 
-    def __init__(self, link: Link, node: int, others: Callable[[Frame], None] = lambda frame: None) -> None:
+    def __init__(self, link: ReplyLink, node: int, others: Callable[[Frame], None] = lambda frame: None) -> None:
         """Use the given link, which stays the caller's.
 
         Args:

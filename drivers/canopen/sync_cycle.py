@@ -141,12 +141,19 @@ class Buses:
         word |= mode.enabling if word == ENABLE else 0
         link.send(codec.control_word(self.drives[number].node, word, mode.sent))
 
-    def control_stop(self, number: int, word: int) -> None:
-        """Send a control word that stops; by SDO too where a drive may have left `operational`, deaf to RPDOs."""
+    def control_stop(self, number: int, word: int, *, deaf: bool = False) -> None:
+        """Send a control word that stops; by SDO too where a drive may have left `operational`, deaf to RPDOs.
+
+        Args:
+            number: of the drive.
+            word: that stops it.
+            deaf: whether it has not obeyed such a word before.
+        """
         self.control(number, word)
         codec, link = self._at[number]
         drive = self.drives[number]
-        if self.enabled and (drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL)):
+        gone = self.enabled and (drive.age >= _SILENT or drive.nmt not in (None, NmtState.OPERATIONAL))
+        if deaf or gone:
             link.send(codec.control_download(drive.node, word))
 
     def ask(self, number: int, entry: Entry) -> None:
@@ -180,10 +187,29 @@ class Buses:
         for drive, mode in zip(self.drives, self.modes, strict=True):
             drive.uploads.pop(mode.display.key, None)
 
+    def link(self, number: int) -> Link:
+        """Return the link to the bus that a drive is on."""
+        return self._at[number][1]
+
+    def hear(self, number: int, deadline_ns: int) -> None:
+        """Wait for one frame on the bus of a drive, and decode it; raises DriverError on a dead bus."""
+        codec, link = self._at[number]
+        if (frame := link.receive(deadline_ns)) is not None:
+            codec.receive(frame)
+
     def objects(self, number: int) -> Objects:
         """Return the object dictionary of one drive, usable as long as nothing streams."""
         codec, link = self._at[number]
         return Objects(link, self.drives[number].node, codec.receive)
+
+    def objects_in_cycles(self, number: int, counts: Sequence[int] | None) -> Objects:
+        """Return the object dictionary of one drive, usable while the others are to miss nothing of their host.
+
+        Args:
+            number: of the drive.
+            counts: sent in the cycles that go on, see `cycle`.
+        """
+        return Objects(_RepliesInCycles(self, number, counts), self.drives[number].node)
 
     def profile(self, number: int) -> BusProfile:
         """Return the profile of the bus that a drive is on."""
@@ -363,6 +389,31 @@ class Buses:
         if now_ns >= guard.due_ns:
             guard.due_ns = now_ns + guard.period_ns
             self._at[number][1].send(Frame(HEARTBEAT + guard.node, b"", remote=True))
+
+
+class _RepliesInCycles:
+    """Wait for one drive's answers to SDO requests by cycles; one that has vanished takes nothing from the others."""
+
+    def __init__(self, buses: Buses, number: int, counts: Sequence[int] | None) -> None:
+        """Use open buses; arguments as for `Buses.objects_in_cycles`."""
+        self._buses, self._number, self._counts = buses, number, counts
+        self.clock = buses.clock
+
+    def send(self, frame: Frame) -> None:
+        """Send a request; raises DriverError on a dead bus."""
+        self._buses.drives[self._number].reply = None
+        self._buses.link(self._number).send(frame)
+
+    def receive(self, deadline_ns: int) -> Frame | None:
+        """Return the answer, None when there is none until the deadline; raises DriverError on a dead bus."""
+        drive = self._buses.drives[self._number]
+        while drive.reply is None and self.clock.now_ns() < deadline_ns:
+            try:
+                self._buses.cycle(self._counts)
+            except DriverError:  # of the other bus, maybe, which must not keep this one from it
+                self._buses.hear(self._number, deadline_ns)
+        found, drive.reply = drive.reply, None
+        return found
 
 
 def _on_the_wire(profile: BusProfile) -> float:

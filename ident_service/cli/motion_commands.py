@@ -334,6 +334,9 @@ def _report_text(report: dict[str, Any]) -> str:
     early = f"finished early, after {report['motion_seconds']:.1f} s of the motion\n" if "finished" in report else ""
     early += f"not finished early: {report['not_finished']}\n" if "not_finished" in report else ""
     early += _target_text(report["until"]) if "until" in report else ""
+    early += (
+        f"WARNING: when the arm was closed: {'; '.join(report['unconfirmed'])}\n" if "unconfirmed" in report else ""
+    )
     ended = f"{early}{report['state']} after {report['cycles']} cycles; warnings: {warnings}\n{report['real_time']}"
     if lateness is None or compute is None:
         return f"{ended}: nothing was timed\n{frames}"

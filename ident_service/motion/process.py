@@ -204,6 +204,7 @@ def _moved(request: dict[str, Any], controls: ControlFile, latch: ActiveFaults) 
         # In virtual time cycles wait for each other, and nothing is late.
         "lateness": None if arm.clock.lock_step else {**sink.lateness.document(), "late_or_lost": report.late},
         "compute": None if arm.clock.lock_step else sink.compute.document(),
+        **({"unconfirmed": list(arm.unconfirmed())} if arm.unconfirmed() else {}),
         **({"frames_logged": arm.logged()} if request["log_frames"] else {}),
     }
 

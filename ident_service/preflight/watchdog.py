@@ -112,7 +112,7 @@ def watchdog_check(
     """
     period = session.period
     dogs = watchdogs_of(arm, model)
-    reported = arm.describe().report_delay
+    delay = arm.describe().report_delay
     where = "at rest" if moving is None else "in motion"
     watchdog_expired: dict[int, tuple[float, AxisStatus]] = {}
     strange: list[str] = []
@@ -121,7 +121,7 @@ def watchdog_check(
     try:
         for kind in sorted({dog.kind for dog in dogs}, key=_ORDER.index):
             watched = [number for number, dog in enumerate(dogs) if dog.kind == kind]
-            most = max(_most(dogs[number], period, reported) for number in watched)
+            most = max(_most(dogs[number], period, delay) for number in watched)
             of_torque = dogs[watched[0]].of_torque
             if not of_torque:
                 arm.withhold(kind)
@@ -170,9 +170,9 @@ def watchdog_check(
     for number, dog in enumerate(dogs):
         seconds, word = watchdog_expired.get(number, (None, AxisStatus(0)))
         what = f"{where}, {_WORDS[dog.kind]} withheld: {_reaction(word) if seconds is not None else 'goes on'} after"
-        most = _most(dog, period, reported)
+        most = _most(dog, period, delay)
         if falls:  # however long its description says, nobody holds the arm meanwhile
-            most = min(most, LONGEST_SILENCE + _CYCLES * period + reported)
+            most = min(most, LONGEST_SILENCE + _unseen(dog, period, delay))
         found.append(measure(what, seconds, "s", joint=dog.drive, most=most))
         # A host that is gone may be a fault to a drive; any other fault is no watchdog.
         fault = bool(word & AxisStatus.FAULT and not word & AxisStatus.WATCHDOG)
@@ -188,9 +188,14 @@ def watchdog_check(
     return failed(CODE, "; ".join(strange), REMEDY, found) if strange else check_from_measures(CODE, found, REMEDY)
 
 
-def _most(dog: Watchdog, period: float, reported: float) -> float:
+def _most(dog: Watchdog, period: float, delay: float) -> float:
     """Return how long a drive may take until it has reported that it stopped [s]."""
-    return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _CYCLES * period + reported
+    return LONGEST_SILENCE if dog.seconds is None else _LATER * dog.seconds + _unseen(dog, period, delay)
+
+
+def _unseen(dog: Watchdog, period: float, delay: float) -> float:
+    """Return for how long nobody may see that a drive has stopped [s]; `delay` is that of any report of the arm [s]."""
+    return _CYCLES * period + (delay if dog.report_delay is None else dog.report_delay)
 
 
 def _joints_of(drives: Collection[int], model: ArmModel) -> Flags:

@@ -230,6 +230,7 @@ class EmulatedSafetyPuck:
         if name == "MODE":
             if value <= self.mode and value in (SafetyMode.IDLE, SafetyMode.ESTOP):  # the host may only lower
                 self.lowered_by_host = True
+                self._torques_ns = now_ns - _STREAMS  # nobody asks any more for the arm to be activated
                 self._enter(SafetyMode(value), now_ns)
             return
         if name == "ZERO" and value != self._values["ZERO"]:
@@ -251,6 +252,7 @@ class EmulatedSafetyPuck:
             self._faults.append(cause)
         if self.mode is SafetyMode.ACTIVE:
             self.lowered_by_host = False
+            self._asked_ns = now_ns  # whoever is at the pendant sees it first
             self._enter(SafetyMode.IDLE, now_ns)
 
     def _watch_torques(self, data: bytes, now_ns: int) -> None:

@@ -21,10 +21,14 @@ from ident_service.config.load import load_arm
 from ident_service.config.motion_limits import motion_limits
 from ident_service.errors import DriverError, PositionUnknown
 from ident_service.model.arm_model import arm_model
+from ident_service.model.expected_friction import expected_friction
 from ident_service.motion.ticket import Verdict
+from ident_service.motion.trajectory import hold
 from ident_service.operations.recovery import recover
 from ident_service.preflight.passive_checks import identities_check, record_idle
 from ident_service.preflight.preflight import preflight
+from ident_service.preflight.session import Session
+from ident_service.preflight.watchdog import watchdog_check
 from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm, LockStepLink
 from sim_backend.emulator.motor import Power
@@ -662,3 +666,73 @@ def test_mistakes_in_a_description_of_pucks_are_found(tmp_path: Any, change: Cha
     path.write_text(json.dumps(tree), encoding="utf-8")
     with pytest.raises(ConfigError, match=words):
         load_arm(path)
+
+
+@pytest.mark.parametrize("kind", list(StopKind))
+@pytest.mark.parametrize("moment", ["before the stop", "after it"])
+def test_a_puck_that_vanishes_while_the_arm_is_closed_is_named_and_the_others_are_idle(
+    moment: str, kind: StopKind
+) -> None:
+    bench = Bench(wam(heartbeat=2.0, watchdog_reason="the safety puck does not help here"))
+    bench.arm.open()
+    bench.arm.enable()
+    bench.cycles(5, NONE)
+    vanish = DriveFault("node_silent", 2)
+    if moment == "before the stop":
+        bench.behind.inject(vanish)
+    bench.arm.stop(kind)
+    if moment == "after it":
+        bench.behind.inject(vanish)
+    bench.arm.close()
+    assert bench.arm.unconfirmed() == ("j2 and j3: puck 3 has not said that it is idle",)
+    assert bench.safety.mode is SafetyMode.IDLE
+    others = [puck.motor.power for puck in bench.pucks if puck.number != 3]
+    assert others == [Power.BRAKE] * 6
+
+
+def test_pucks_that_say_that_they_are_idle_are_not_named(bench: Bench) -> None:
+    with bench.arm as arm:
+        arm.enable()
+        bench.cycles(5, NONE)
+        begun = arm.clock.now_ns()
+    assert bench.arm.unconfirmed() == ()
+    assert bench.behind.clock.now_ns() - begun <= 5_000_000  # asked for, so that nobody waits for it
+
+
+@pytest.mark.parametrize(("acts", "verdict"), [(0.09, Verdict.PASSED), (0.19, Verdict.FAILED)])
+def test_a_safety_puck_that_acts_later_than_described_gives_no_ticket(acts: float, verdict: Verdict) -> None:
+    """The WAM falls: 0.1 s and eleven cycles are the most, though 0.19 s are within twice 0.1 s."""
+    config = wam(emulation={"heartbeat": acts})
+    bench, model, limits = Bench(config), arm_model(config), motion_limits(config)
+    with bench.arm as arm:
+        arm.enable()
+        home = bench.cycles(5, NONE).position
+        friction = expected_friction(model, limits, config.design.friction_guess)
+        session = Session(arm, model, limits, arm.describe(), home, friction)
+        session.follow(hold(home), 0.02)
+        check = watchdog_check(arm, model, session, hold(home).at)
+    assert check.verdict is verdict, check.reason
+    assert [one.most for one in check.measures] == pytest.approx([0.1 + 11 / RATE] * 7)
+    assert [one.value for one in check.measures] == pytest.approx([acts] * 7, abs=3 / RATE)
+
+
+def test_pucks_that_do_not_hear_idle_are_told_for_as_long_as_they_answer() -> None:
+    bench = Bench(wam(heartbeat=2.0, watchdog_reason="the safety puck does not help here"))
+    bench.arm.open()
+    bench.arm.enable()
+    bench.cycles(5, NONE)
+    until_ns, link = bench.behind.clock.now_ns() + 300_000_000, bench.taps[-1]._link
+    send = link.send
+
+    def loses(frame: Frame) -> None:
+        request = request_of(frame.data)
+        lowers = request is not None and request.number == 8 and request.value is not None
+        if not (lowers and bench.behind.clock.now_ns() < until_ns):
+            send(frame)
+
+    link.send = loses  # type: ignore[method-assign]
+    bench.arm.stop(StopKind.TORQUE_OFF)
+    bench.arm.close()
+    assert bench.arm.unconfirmed() == ()
+    assert bench.safety.mode is SafetyMode.IDLE
+    assert all(puck.motor.power is Power.BRAKE for puck in bench.pucks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 from helpers.emulated_arms import EDS, Tapped, tapped, weightless_config
 
 from drivers.arm import StopKind
+from drivers.can.can_frame import Frame
 from drivers.canopen import object_dictionary as od
 from drivers.canopen.bus_load import budget
 from drivers.canopen.driver import CanopenArm
@@ -128,6 +130,79 @@ def test_drives_of_several_kinds_are_each_proven_by_their_own(first: str, second
     for one, kind in zip(check.measures, (first, second), strict=True):
         assert one.value == pytest.approx(TIMES[kind], abs=0.02)
     bench.arm.close()
+
+
+def download(node: int, index: int, sub: int, size: int, value: int) -> Frame:
+    """A write of somebody else into a drive: its watchdog is another than what was read back when it was opened."""
+    head = {1: 0x2F, 2: 0x2B, 4: 0x23}[size]
+    return Frame(0x600 + node, struct.pack("<BHB", head, index, sub) + value.to_bytes(4, "little"))
+
+
+def slowed(kind: str, node: int, milliseconds: int) -> Frame:
+    """What makes the watchdog of a drive act after so long."""
+    return {
+        "rpdo_timer": download(node, 0x1400, 5, 2, milliseconds),
+        "heartbeat": download(node, 0x1016, 1, 4, 127 << 16 | milliseconds),
+        "node_guarding": download(node, 0x100C, 0, 2, round(milliseconds / 3)),
+        "sync_loss": download(node, 0x2F70, 0, 1, round(milliseconds / 2)),
+        "vendor": download(node, 0x2F75, 0, 2, milliseconds),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_watchdog_that_acts_later_than_described_gives_no_ticket(kind: str) -> None:
+    """Thrice the time, and a little: twice it and ten cycles are within what a report may take."""
+    bench = Bench(arm_of(kind, kind))
+    bench.taps[0].disturb([slowed(kind, 2, round(3000 * TIMES[kind]) + 30)])
+    for _ in range(20):
+        bench.arm.exchange(ZERO)
+    check = bench.check()
+    assert check.verdict is Verdict.FAILED
+    turn, slide = check.measures
+    assert turn.within_limits
+    assert not slide.within_limits
+    assert slide.most == pytest.approx(2.0 * TIMES[kind] + 10 * PERIOD + 0.005)
+    assert "slide: drive 2" in check.reason
+    bench.arm.close()
+
+
+LONGEST = 0.1  # s, for what can fall
+SLOW: dict[str, dict[str, Any]] = {
+    "rpdo_timer": {"torque_deadline": LONGEST},
+    "heartbeat": {"heartbeats": BEATS | {"host_timeout": LONGEST}},
+    "node_guarding": {"guarding": {"period": 0.033, "factor": 3}},
+    "sync_loss": {},
+    "vendor": {},
+}
+
+
+def heavy(kind: str, reason: str = "") -> ArmConfig:
+    """An arm whose first joint gravity moves, and whose drives act as late as such an arm's may."""
+    config = arm_of(kind, kind, watchdog_reason=reason, **SLOW[kind]).model_dump(mode="json", by_alias=True)
+    config["gravity"] = (0.0, -9.81, 0.0)
+    config["driver"]["emulation"]["truth"] = {"m1": 0.5, "lx1": 0.1, "Lxx1": 0.1, "Lyy1": 0.1, "Lzz1": 1.0, "m2": 1.0}
+    for drive in config["driver"]["drives"]:
+        if kind in ("sync_loss", "vendor"):
+            drive["watchdog_time"] = LONGEST
+            drive["watchdog_entry"]["value"] = round(1e3 * LONGEST / (2.0 if kind == "sync_loss" else 1.0))
+    return ArmConfig.model_validate(config)
+
+
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("reason", ["", "it hangs from a spring"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_can_fall_is_given_no_ticket_where_a_watchdog_acts_after_more_than_a_tenth_of_a_second(
+    kind: str, reason: str, late: bool
+) -> None:
+    """0.18 s are within twice the described time, which is enough for an arm that cannot fall."""
+    bench = Bench(heavy(kind, reason))
+    bench.taps[0].disturb([slowed(kind, node, 180) for node in (1, 2)] if late else [])
+    check = bench.check()
+    bench.arm.close()
+    assert [one.value for one in check.measures] == pytest.approx([0.18 if late else LONGEST] * 2, abs=0.03)
+    allowed = 2.0 * LONGEST if reason else LONGEST
+    assert [one.most for one in check.measures] == pytest.approx([allowed + 10 * PERIOD + 0.005] * 2, abs=0.003)
+    assert check.verdict is (Verdict.FAILED if late and not reason else Verdict.PASSED), check.reason
 
 
 def test_one_of_a_differential_that_ignores_its_watchdog_does_not_hide_behind_the_other() -> None:

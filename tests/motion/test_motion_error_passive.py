@@ -5,26 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from campaign_canopen import bench_canopen_config
 from campaign_pucks import bench_puck_config
 from helpers.emulated_arms import Tapped
 from motion_bench import Story
 
-from drivers.arm import Arm
+from drivers.arm import Arm, StopKind
 from drivers.axis_status import AxisEventCode
 from drivers.barrett.driver import BarrettArm
 from drivers.can.bus_state import ACTIVE, CONTROLLER, PASSIVE_TX
 from drivers.can.can_frame import Frame
 from drivers.canopen.driver import CanopenArm
 from ident_service.config.arm import ArmConfig
-from ident_service.errors import DriverError
+from ident_service.errors import ArmFault, DriverError
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
 from ident_service.motion.faults import ActiveFaults
 from ident_service.motion.run import run
 from ident_service.motion.ticket import Verdict
 from ident_service.preflight.preflight import preflight
+from sim_backend.canopen_device.drive import CanopenDrive
 from sim_backend.emulator.lock_step import LockStepArm
 
 SAID = "the host's CAN controller on bench is error-passive, expected error-active"
@@ -116,3 +118,54 @@ def test_one_that_becomes_so_while_drives_are_enabled_shows_in_the_first_cycle(
         arm.enable()
         found = [(event.code, event.words) for event in arm.exchange(None).events]
     assert found == [(AxisEventCode.BUS_DEGRADED, "bench: the host's CAN controller is passive")]
+
+
+def drive_says(code: int, register: int) -> Frame:
+    """An emergency message of the second drive."""
+    return Frame(0x082, bytes((code & 0xFF, code >> 8, register, 0, 0, 0, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("over", "tells"),
+    [
+        (None, True),
+        (drive_says(0x0000, 0x11), True),  # another error is over
+        (drive_says(0x4310, 0x19), True),  # another one came
+        (drive_says(0x0000, 0x00), False),
+        (drive_says(0x0000, 0x08), False),  # a temperature is still too high
+    ],
+)
+def test_a_drive_that_is_error_passive_is_told_anew_of_an_enabled_arm_until_it_is_over(
+    over: Frame | None, tells: bool
+) -> None:
+    config = bench_canopen_config()
+    taps = [Tapped(LockStepArm(config).link(0))]
+    with CanopenArm(config, lambda _: taps) as arm:
+        taps[0].disturb([drive_says(0x8120, 0x11), *([] if over is None else [over])], drives_hear=False)
+        assert AxisEventCode.BUS_DEGRADED in [event.code for event in arm.exchange(None).events]
+        for _ in range(2):  # whoever enables it again is told again
+            arm.enable()
+            events = [event for _ in range(5) for event in arm.exchange(np.zeros(2)).events]
+            found = [(event.code, event.axis, event.words) for event in events]
+            words = "node 2: 8120h CAN controller in error passive, and not over yet"
+            assert found == ([(AxisEventCode.BUS_DEGRADED, 1, words)] if tells else [])
+            arm.stop(StopKind.TORQUE_OFF)
+
+
+@pytest.mark.parametrize("when", ["before it was opened", "while it was idle"])
+def test_a_run_over_a_drive_that_is_error_passive_stops_under_control(when: str) -> None:
+    described, story = bench_canopen_config(), Story()
+    model, behind = arm_model(described), LockStepArm(described)
+    taps = [Tapped(behind.link(0))]
+    if when == "before it was opened":
+        face = behind.emulator.faces[1]
+        assert isinstance(face, CanopenDrive)
+        face.emergency.occurs(0x8120)
+    with CanopenArm(described, lambda _: taps) as arm:
+        if when == "while it was idle":
+            taps[0].disturb([drive_says(0x8120, 0x11)], drives_hear=False)
+            arm.exchange(None)
+        with pytest.raises(ArmFault, match="8120h CAN controller in error passive") as ended:
+            run(arm, model, excitation(model, "identification"), story, hold_seconds=0.1)
+    assert ended.value.code == "bus_degraded"
+    assert story.states[-2:] == ["stopping", "stopped"]
