@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from functools import partial
+from itertools import chain, combinations
 from typing import Literal
 
 import numpy as np
@@ -87,9 +88,9 @@ class Reading:
         return not self.exchanges and self.factor == -1.0
 
     @property
-    def of_measured_position(self) -> bool:
-        """Return whether it is about the scale or the zero of a position."""
-        return self.which != "torque" and not (self.negates or self.exchanges)
+    def is_measured(self) -> bool:
+        """Return whether it is about a scale, a zero or a time, which may have any value."""
+        return not (self.negates or self.exchanges)
 
     @property
     def of_torque_signs(self) -> bool:
@@ -209,18 +210,21 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     readings = [one for one in _of_torques(estimate, joints) if recordings or one.of_torque_signs]
     found = _best_of_each_kind(readings, as_read.free_errors(readings, weights), before)
     if recordings:
-        thin = [replace(part, some=part.some[slice(None, None, _THINNED)]) for part in parts]
-        found += _of_positions(estimate, thin, joints, weights, before)
-    best, most = None, -np.inf
-    # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and of others the best;
+        found += _of_positions(estimate, parts, joints, weights, before)
+    # Without conditions a fit hardly tells signs of torques, so that all of these are tried, and the best of others;
     # once one explains the recordings, every other is compared with it.
+    found.sort(key=lambda one: -one[0])
     signs = [one for one in found if one[1].of_torque_signs]
-    others = sorted((one for one in found if not one[1].of_torque_signs), key=lambda one: -one[0])
-    for number, (without_conditions, reading) in enumerate((*signs, *others)):
+    exact = [one for one in found if not (one[1].of_torque_signs or one[1].is_measured)]
+    measured = [one for one in found if one[1].is_measured]
+    best, most = None, -np.inf
+    for number, (without_conditions, reading) in chain(
+        enumerate(signs, -len(signs)), enumerate(exact), enumerate(measured)
+    ):
         if without_conditions < max(most, np.log(BETTER)):  # conditions only add to the error
             continue
-        if best is None and number >= len(signs) + _TRIED:
-            break
+        if best is None and number >= _TRIED:
+            continue
         equations = as_read if reading.which == "torque" else _equations(estimate, parts, reading)
         try:
             after = _constrained_error(estimate, equations.information(reading), weights)
@@ -229,7 +233,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
         gains = _gains(before.joint_relative_percent, after.joint_relative_percent)
         gained = float(gains.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
         enough = gains.sum() >= np.log(BETTER) and gains.min() >= -np.log(NONE_WORSE)
-        if reading.of_measured_position:
+        if reading.is_measured and reading.which != "torque":
             enough = enough and after.relative_percent * _WHOLE_BETTER < before.relative_percent
         if enough and after.relative_percent < EXPLAINED and (best is None or gained > most):
             best, most = MisreadColumns(reading, before, after), gained
@@ -260,7 +264,7 @@ def _of_positions(
 ) -> _Found:
     """Return the best readings of positions, of zeros and scales one for each joint."""
 
-    def tried(readings: Sequence[Reading]) -> _Found:
+    def tried(readings: Sequence[Reading], parts: Sequence[_Part] = parts) -> _Found:
         errors = [_equations(estimate, parts, one).free_errors([one], weights)[0] for one in readings]
         return _best_of_each_kind(readings, errors, before)
 
@@ -268,11 +272,17 @@ def _of_positions(
     found = tried([one for which in kinds for one in _signs_and_exchanges(which, estimate, joints)])
     if before.relative_percent < _CONCERNED:
         return found
+    thin = [replace(part, some=part.some[slice(None, None, _THINNED)]) for part in parts]
     for joint in range(estimate.model.chain.joints):  # those before it feel it, too
         for which in kinds:
-            found += _finest(tried, [Reading(which, (joint,), factor=float(factor)) for factor in _GEARS])
+            found += _finest(
+                partial(tried, parts=thin), [Reading(which, (joint,), factor=float(factor)) for factor in _GEARS]
+            )
         if estimate.model.chain.revolute[joint]:
-            found += _finest(tried, [Reading("position", (joint,), factor=1.0, zero=float(zero)) for zero in _ZEROS])
+            found += _finest(
+                partial(tried, parts=thin),
+                [Reading("position", (joint,), factor=1.0, zero=float(zero)) for zero in _ZEROS],
+            )
     return found
 
 
@@ -294,7 +304,7 @@ def _best_of_each_kind(readings: Sequence[Reading], errors: Iterable[Array], bef
     for reading, after in zip(readings, errors, strict=True):
         gain = float(_gains(before.joint_relative_percent, after).sum())
         alike = reading
-        if not (reading.negates or reading.exchanges):
+        if reading.is_measured:
             alike = replace(reading, factor=0.0, late=float(reading.late != 0.0), zero=float(reading.zero != 0.0))
         if alike not in found or gain > found[alike][0]:
             found[alike] = gain, reading

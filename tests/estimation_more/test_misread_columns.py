@@ -100,6 +100,21 @@ def test_the_torque_of_one_joint_at_another_time_is_named(samples: int, words: s
     assert f"the torque of elbow seems to be stamped {words}" in reason
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["position", "both"])
+def test_the_scale_of_a_position_and_the_columns_of_a_motor_are_named(which: Any) -> None:
+    recording = misread(Reading(which, (1,), factor=20.0))
+    estimate = identified(recording)
+    found = misread_columns(estimate, [recording])
+    assert found is not None
+    assert found.reading == Reading(which, (1,), factor=pytest.approx(0.05, rel=0.1))
+    (reason,) = reasons_against(estimate, [recording])
+    seen = (
+        "the position of elbow seems to have another unit" if which == "position" else "seem to be those of its motor"
+    )
+    assert seen in reason
+
+
 def test_it_is_found_where_both_sides_of_the_equations_are_filtered() -> None:
     model = elbowed()[0]
     options = model.config.identification

@@ -167,8 +167,8 @@ def late(position: np.ndarray, torque: np.ndarray) -> None:
         (late, r"the torque of elbow_joint seems to be stamped 0\.4 s too late"),
     ],
 )
-def test_a_torque_of_another_scale_or_time_than_the_others(change: Change, words: str) -> None:
-    """Doubled, its error of 13 % was within what is usable."""
+def test_a_column_of_another_scale_zero_or_time_than_the_others(change: Change, words: str) -> None:
+    """Doubled, its error of 13 % was within what is usable, and a quarter of a turn off that of 6 %."""
     (case,) = (case for case in CASES if case.arm == "ur10")
     model = case_model(case)
     recording = open_recording(DATA / case.folder / case.fitted, model.chain.names, fmt=model.config.recording)
@@ -345,7 +345,7 @@ WRONG: dict[str, tuple[Change, dict[str, Any], str]] = {
     "hundredth": (hundredth, {}, "no torque is ever more than 0.22 % of its joint's limit"),
     "tenfold": (tenfold, {}, "wrong sign at lwr_2_joint"),
     "backwards": (backwards, {}, "wrong sign"),
-    "geared": (geared, {}, "wrong sign at lwr_2_joint"),
+    "geared": (geared, {}, r"position of lwr_1_joint seems .* by about 1\.8"),
     "turned zero": (turned_zero, {}, "lwr_1_joint"),
     "velocities": (velocities, {}, "the torque, or the position, may have the wrong sign"),
     "coarse": (coarse, {}, "lwr_0_joint moves 0.05 rad between two samples"),
