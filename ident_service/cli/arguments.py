@@ -307,6 +307,7 @@ def _describe(parser: Parser, word: str, text: str, more: str, examples: Sequenc
 def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answer]) -> None:
     """Add the options that a verb shares with others, and what is to be run."""
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    parser.add_argument("--with-text", action="store_true", help=argparse.SUPPRESS)  # of a daemon
     if word in LOCAL_ONLY:
         parser.absent["--server"] = LOCAL_ONLY[word]
     else:

@@ -8,10 +8,10 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ident_service.cli.answer_texts import told
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import Parser, VerbList, count, hours
 from ident_service.cli.output import DONE, VERDICT_NO, Answer, state_folder, writable_state_folder
@@ -130,7 +130,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as db:
         name = _known(db, arguments)
         row = add_schedule(db, name, when, terminal_user(arguments), time.time(), arguments.motion)
-    return DONE, schedule_line(row), _shown(row)
+    return told(arguments, _shown(row))
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
@@ -138,7 +138,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = schedules(db, arguments.arm)
-    return DONE, schedules_text(rows), {"schedules": [_shown(row) for row in rows]}
+    return told(arguments, {"schedules": [_shown(row) for row in rows]})
 
 
 def _remove(arguments: argparse.Namespace) -> Answer:
@@ -146,7 +146,7 @@ def _remove(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         remove_schedule(db, arguments.number, terminal_user(arguments))
-    return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
+    return told(arguments, {"id": arguments.number, "removed": True})
 
 
 def _enabled(arguments: argparse.Namespace) -> Answer:
@@ -154,7 +154,7 @@ def _enabled(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=arguments.enabled)
-    return DONE, schedule_line(row), _shown(row)
+    return told(arguments, _shown(row))
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
@@ -164,10 +164,7 @@ def _maintenance(arguments: argparse.Namespace) -> Answer:
         name = _known(db, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
         due = _with_accepted(state_folder(arguments), pending(db, name))
-    text = f"{name}: recorded: {row['what']}\n" + "".join(due_line(one) for one in due)
-    if not due:
-        text += f"nothing is due after it; see `ident schedules add {name} --maintenance`\n"
-    return DONE, text, {**row, "due": due}
+    return told(arguments, {**row, "due": due})
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
@@ -175,7 +172,7 @@ def _due(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = _with_accepted(state_folder(arguments), pending(db, arguments.arm))
-    return DONE, dues_text(rows), {"due": rows}
+    return told(arguments, {"due": rows})
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -183,7 +180,7 @@ def _dismiss(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         dismiss(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
-    return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
+    return told(arguments, {"id": arguments.number, "dismissed": True})
 
 
 def _alarms(arguments: argparse.Namespace) -> Answer:
@@ -191,7 +188,7 @@ def _alarms(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         rows = alarms(db, arguments.arm)
-    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": [dict(row) for row in rows]}
+    return told(arguments, {"alarms": [dict(row) for row in rows]}, VERDICT_NO if rows else DONE)
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
@@ -199,7 +196,7 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as db:
         row = acknowledge_alarm(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
-    return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", dict(row)
+    return told(arguments, dict(row))
 
 
 def _shown(row: Row) -> dict[str, Any]:
@@ -207,43 +204,8 @@ def _shown(row: Row) -> dict[str, Any]:
     return {key: value for key, value in row.items() if key not in hidden} | {"enabled": bool(row["enabled"])}
 
 
-def schedule_line(row: Row) -> str:
-    """Format one schedule as a line for a person."""
-    when = f"cron {row['cron']} (UTC)" if row["cron"] else str(row["trigger"])
-    coming = f", next {_day(row['next'])}" if row["cron"] and row["enabled"] else ""
-    return f"{row['id']:>4}  {row['arm']:<16} {when}{coming}{'' if row['enabled'] else ', disabled'}\n"
-
-
-def schedules_text(rows: Sequence[Row]) -> str:
-    """Format schedules as lines for a person."""
-    return "".join(map(schedule_line, rows)) or "nothing is scheduled\n"
-
-
-def due_line(row: Row) -> str:
-    """Format one re-identification that is due as a line for a person; it needs an `accepted` set to compare with."""
-    line = f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}"
-    if row["accepted"]:
-        return f"{line}; `ident reidentify {row['arm']}`\n"
-    return f"{line}; nothing of it has been accepted to compare with: run, identify and accept it first\n"
-
-
-def dues_text(rows: Sequence[Row]) -> str:
-    """Format re-identifications that are due as lines for a person."""
-    return "".join(map(due_line, rows)) or "nothing is due\n"
-
-
 def _with_accepted(state: Path, rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return due re-identifications, each with whether its arm has an accepted set."""
     from ident_service.operations.acceptance import acceptances
 
     return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in rows]
-
-
-def alarm_lines(rows: Sequence[Row]) -> str:
-    """Format drift alarms as lines for a person."""
-    lines = [f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows]
-    return "".join(lines) or "no open alarms\n"
-
-
-def _day(at: float) -> str:
-    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ident_service.cli.answer_texts import asked_text, stop_text
 from ident_service.cli.archive_commands import add_by, write_audit_entry
 from ident_service.cli.arguments import Parser, VerbList, seconds, share, speed
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
@@ -667,24 +668,13 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
         for name in known_arms(state):  # a file was made where there was none
             give_to_owner(state, control_path(state, name))
         write_audit_entry(arguments, "stop", "all arms", reached=reached)
-        text = f"stop requested of {', '.join(reached)}" if reached else "no arm is moving"
-        text += "; motions requested before now will not begin\n"
-        return DONE, text, {"arms": reached, "asked": "stop"}
+        return DONE, stop_text(None, reached), {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
     give_to_owner(state, path)
-    write_audit_entry(arguments, "stop", name, reached=[] if pid is None else [name])
-    text = f"{name}: stop requested of process {pid}" if pid is not None else f"{name} is not moving"
-    text += "" if pid is not None else "; motions requested before now will not begin"
-    return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
-
-
-_ASKED = {
-    "pause": "pause requested of",
-    "resume": "resumption requested of",
-    "finish": "early end requested of",
-    "supported": "support confirmed to",
-}
+    reached = [] if pid is None else [name]
+    write_audit_entry(arguments, "stop", name, reached=reached)
+    return DONE, stop_text(name, reached), {"arm": name, "asked": "stop", "pid": pid}
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
@@ -702,8 +692,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
             return _release_drives(arguments)
     pid = ask_process(path, arguments.asks)
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
-    document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
-    return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document
+    return DONE, asked_text(name, arguments.asks), {"arm": name, "asked": arguments.asks, "pid": pid}
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from ident_service.cli.answer_texts import reidentified_text
 from ident_service.cli.archive_commands import add_by, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.maintenance_commands import registry
@@ -308,10 +309,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
         "what": verdict.words,
         "comparison": document,
     }
-    lines = f"{text}{verdict.words}\n"
-    if verdict.state == "changed":
-        lines += "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
-    return EXIT_CODES[verdict.state], lines, answer
+    return EXIT_CODES[verdict.state], reidentified_text(text, verdict.state, verdict.words), answer
 
 
 def _step(arguments: argparse.Namespace, *words: str) -> Answer:

@@ -281,4 +281,4 @@ def _given_options(options: Mapping[str, object]) -> list[str]:
 
 
 def _common_options(state: Path) -> tuple[str, ...]:
-    return ("--json", "--state", str(state))
+    return ("--json", "--with-text", "--state", str(state))
