@@ -183,9 +183,10 @@ def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
             known = progress.remaining == progress.remaining
             step(f"{progress.phase}: {progress.finished}{found}", None, progress.remaining if known else None)
             return
-        best = "none yet" if progress.best is None else f"{progress.best:.4f}"
+        best = "" if progress.best is None else f", best {progress.best:.4f}"
         left = f", about {progress.remaining:.0f} s left" if progress.remaining == progress.remaining else ""
-        words = f"{progress.phase}: {progress.finished} starts, best {best}, {progress.elapsed:.0f} s{left}"
+        act = "searching" if progress.phase == "starts" else "improving the best"
+        words = f"{act}: {progress.finished} starts complete{best}, {progress.elapsed:.0f} s{left}"
         if progress.elapsed - last[0] >= 10.0:
             last[0] = progress.elapsed
             tell(arguments, words)
