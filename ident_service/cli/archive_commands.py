@@ -54,11 +54,13 @@ def terminal_user(arguments: argparse.Namespace) -> str:
 
 @contextmanager
 def registry(arguments: argparse.Namespace) -> Iterator[tuple[Database, Path]]:
-    """Open the registry of the state folder that a verb works on, and return the folder with it."""
+    """Open the registry of the state folder that a verb works on, shipped arms entered; yield it and the folder."""
+    from ident_service.registry.arms import know_shipped
     from ident_service.registry.database import Database
 
     state = writable_state_folder(arguments)
     with Database(state) as db:
+        know_shipped(db)
         yield db, state
 
 
@@ -193,11 +195,10 @@ def _add_lists(verbs: VerbList) -> None:
 
 
 def _arms(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.arms import arm_names, know_shipped
+    from ident_service.registry.arms import arm_names
     from ident_service.registry.state_folder import known_arms
 
     with registry(arguments) as (db, state):
-        know_shipped(db)
         rows = [{key: row[key] for key in ("name", "source", "description")} for row in arm_names(db)]
     named = {row["name"] for row in rows}
     rows += [{"name": name, "source": "file", "description": ""} for name in known_arms(state) if name not in named]

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer_texts import told
-from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import Parser, VerbList, count, hours
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, state_folder, writable_state_folder
+from ident_service.cli.output import DONE, VERDICT_NO, Answer
 
 if TYPE_CHECKING:
     from ident_service.registry.database import Database, Row
@@ -93,16 +93,6 @@ def add(verbs: VerbList) -> None:
     _add_number_and_note(sub)
 
 
-def registry(arguments: argparse.Namespace) -> Database:
-    """Open the registry of the state folder, with the shipped arms entered."""
-    from ident_service.registry.arms import know_shipped
-    from ident_service.registry.database import Database
-
-    db = Database(writable_state_folder(arguments))
-    know_shipped(db)
-    return db
-
-
 def _arm(sub: Parser) -> None:
     sub.add_argument("arm", metavar="NAME", help="name of a shipped arm, or of one uploaded to a daemon")
 
@@ -117,18 +107,18 @@ def _add_number_and_note(sub: Parser) -> None:
     add_by(sub)
 
 
-def _known(db: Database, arguments: argparse.Namespace) -> str:
+def _known(db: Database, state: Path, arguments: argparse.Namespace) -> str:
     from ident_service.registry.arms import known_arm
 
-    return known_arm(db, state_folder(arguments), arguments.arm).name
+    return known_arm(db, state, arguments.arm).name
 
 
 def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import DueRule, add_schedule
 
     when = DueRule(arguments.cron, arguments.hours, arguments.maintenance)
-    with registry(arguments) as db:
-        name = _known(db, arguments)
+    with registry(arguments) as (db, state):
+        name = _known(db, state, arguments)
         row = add_schedule(db, name, when, terminal_user(arguments), time.time(), arguments.motion)
     return told(arguments, _shown(row))
 
@@ -136,7 +126,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
 def _list(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import schedules
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         rows = schedules(db, arguments.arm)
     return told(arguments, {"schedules": [_shown(row) for row in rows]})
 
@@ -144,7 +134,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 def _remove(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import remove_schedule
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         remove_schedule(db, arguments.number, terminal_user(arguments))
     return told(arguments, {"id": arguments.number, "removed": True})
 
@@ -152,7 +142,7 @@ def _remove(arguments: argparse.Namespace) -> Answer:
 def _enabled(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import enable_schedule
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=arguments.enabled)
     return told(arguments, _shown(row))
 
@@ -160,25 +150,25 @@ def _enabled(arguments: argparse.Namespace) -> Answer:
 def _maintenance(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import add_event, pending
 
-    with registry(arguments) as db:
-        name = _known(db, arguments)
+    with registry(arguments) as (db, state):
+        name = _known(db, state, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
-        due = _with_accepted(state_folder(arguments), pending(db, name))
+        due = _with_accepted(state, pending(db, name))
     return told(arguments, {**row, "due": due})
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import pending
 
-    with registry(arguments) as db:
-        rows = _with_accepted(state_folder(arguments), pending(db, arguments.arm))
+    with registry(arguments) as (db, state):
+        rows = _with_accepted(state, pending(db, arguments.arm))
     return told(arguments, {"due": rows})
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import dismiss
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         dismiss(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
     return told(arguments, {"id": arguments.number, "dismissed": True})
 
@@ -186,7 +176,7 @@ def _dismiss(arguments: argparse.Namespace) -> Answer:
 def _alarms(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.drift_alarms import alarms
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         rows = alarms(db, arguments.arm)
     return told(arguments, {"alarms": [dict(row) for row in rows]}, VERDICT_NO if rows else DONE)
 
@@ -194,7 +184,7 @@ def _alarms(arguments: argparse.Namespace) -> Answer:
 def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.drift_alarms import acknowledge_alarm
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         row = acknowledge_alarm(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
     return told(arguments, dict(row))
 

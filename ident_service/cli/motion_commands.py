@@ -264,8 +264,8 @@ def described_arm(arguments: argparse.Namespace) -> ArmConfig:
 def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
     """Return what opening the arm of a verb, or zeroing it, would write into its drives; nothing is written."""
     from ident_service.operations.drive_configuration import (
+        drives_document,
         planned_configuration,
-        planned_document,
         planned_text,
         planned_zero,
     )
@@ -274,7 +274,7 @@ def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
     planned = planned_zero(config) if zero else planned_configuration(config)
     code = VERDICT_NO if any(one.refused for one in planned) else DONE
     text = planned_text(config, planned, "setting home" if zero else "opening")
-    return code, text, planned_document(config, planned)
+    return code, text, drives_document(config, planned)
 
 
 def add_can_log(sub: Parser) -> None:

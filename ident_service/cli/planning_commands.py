@@ -390,14 +390,14 @@ def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
 
 def _import(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm, sheet_file
-    from ident_service.operations.drive_configuration import import_configuration, imported_document, imported_text
+    from ident_service.operations.drive_configuration import drives_document, import_configuration, imported_text
 
     config, dry = load_arm(arguments.arm), arguments.dry_run
     files = [sheet_file(name) for name in arguments.files]
     if not dry:
         _require_name(arguments, config.name, "drives are configured anew")
     found = import_configuration(config, files, dry=dry)
-    return DONE, imported_text(config, found, dry=dry), imported_document(config, found, dry=dry)
+    return DONE, imported_text(config, found, dry=dry), drives_document(config, found, written=not dry)
 
 
 def _store(arguments: argparse.Namespace) -> Answer:

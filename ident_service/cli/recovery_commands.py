@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from ident_service.cli.answer_texts import reidentified_text
-from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import VerbList
-from ident_service.cli.maintenance_commands import registry
 from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
 from ident_service.cli.next_command import command
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
@@ -183,19 +182,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
     found = recover(config, writable_state_folder(arguments), called=arguments.arm)
-    document = {
-        "arm": found.arm,
-        "usable": found.usable,
-        "faults": [asdict(one) for one in found.faults],
-        "moved_by": found.controlling_pid,
-        "seen": None if found.seen is None else watch_document(found.seen),
-        "unreachable": found.unreachable,
-        "zero_lost": found.zero_lost,
-        "reset": list(found.reset),
-        "tripped": found.tripped,
-        "outside": list(found.outside),
-        "steps": list(found.steps),
-    }
+    document = asdict(found) | {"seen": None if found.seen is None else watch_document(found.seen)}
     return DONE if found.usable else VERDICT_NO, _text(found), document
 
 
@@ -224,8 +211,8 @@ def _text(found: Recovery) -> str:
         lines.append(f"  active since {since} UTC: {one.code}: {one.cause}")
     if not found.faults:
         lines.append("  no active faults")
-    if found.controlling_pid is not None:
-        lines.append(f"  process {found.controlling_pid} is moving the arm")
+    if found.moved_by is not None:
+        lines.append(f"  process {found.moved_by} is moving the arm")
     if found.unreachable:
         lines.append(f"  the arm does not answer: {found.unreachable}")
     if found.zero_lost:
@@ -277,9 +264,8 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.motions import new_id
     from ident_service.registry.runs import RUNS, index_run
 
-    state, config, begun = writable_state_folder(arguments), load_arm(arguments.arm), time.time()
-    who = terminal_user(arguments)
-    with registry(arguments) as db:
+    config, begun, who = load_arm(arguments.arm), time.time(), terminal_user(arguments)
+    with registry(arguments) as (db, state):
         number = require_comparable(state, config)
         accepted = accepted_set(state, config.name, number)[1]
         motion = [] if arguments.motion is None else [str(arguments.motion)]
