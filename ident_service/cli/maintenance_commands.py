@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,21 +147,20 @@ def _enabled(arguments: argparse.Namespace) -> Answer:
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import add_event, pending
+    from ident_service.operations.maintenance_schedule import add_event, comparable_dues
 
     with registry(arguments) as (db, state):
         name = _known(db, state, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
-        due = _with_accepted(state, pending(db, name))
+        due = comparable_dues(db, state, name)
     return told(arguments, {**row, "due": due})
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import pending
+    from ident_service.operations.maintenance_schedule import comparable_dues
 
     with registry(arguments) as (db, state):
-        rows = _with_accepted(state, pending(db, arguments.arm))
-    return told(arguments, {"due": rows})
+        return told(arguments, {"due": comparable_dues(db, state, arguments.arm)})
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
@@ -192,10 +190,3 @@ def _ack(arguments: argparse.Namespace) -> Answer:
 def _shown(row: Row) -> dict[str, Any]:
     hidden = {"request", "counted"}
     return {key: value for key, value in row.items() if key not in hidden} | {"enabled": bool(row["enabled"])}
-
-
-def _with_accepted(state: Path, rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return due re-identifications, each with whether its arm has an accepted set."""
-    from ident_service.operations.acceptance import acceptances
-
-    return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in rows]

@@ -195,14 +195,7 @@ def _remove_schedule(client: IdentClient, arguments: argparse.Namespace) -> dict
 def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
-    return {**row, "due": _pending(client, arguments)}
-
-
-def _pending(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    rows = client.get(f"{_API}/{_of_arm(arguments, 'due')}")
-    arms = {row["arm"] for row in rows}
-    accepted = {arm for arm in arms if client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")}
-    return [{**row, "accepted": row["arm"] in accepted} for row in rows]
+    return {**row, "due": client.get(f"{_API}/{_of_arm(arguments, 'due')}")}
 
 
 def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -271,13 +264,12 @@ VERBS: dict[str, RemoteVerb] = {
     **dict.fromkeys(("runs", "motions"), _list("arm most", _newest)),
     "tokens revoke": _posted("name", "tokens/{name}/revoke"),
     "schedules add": _posted("arm cron hours maintenance motion", "schedules"),
-    "schedules": _list("arm", _of_arm),
+    **dict.fromkeys(("schedules", "due"), _list("arm", _of_arm)),
     "schedules remove": _answered("number", _remove_schedule),
     **dict.fromkeys(
         ("schedules enable", "schedules disable"), _posted("number", "schedules/{number}/enabled", also="enabled")
     ),
     "maintenance": _answered("arm note what", _maintenance),
-    "due": _answered("arm", lambda client, arguments: {"due": _pending(client, arguments)}),
     "due dismiss": _answered("note number", _dismiss),
     "alarms": carrying("arm", _alarms),
     "alarms acknowledge": _posted("note number", "alarms/{number}/ack"),
