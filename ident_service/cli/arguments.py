@@ -319,6 +319,15 @@ def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answe
     parser.set_defaults(verb=run, word=word, words=parser, json=False, server=None)
 
 
+def add_arm(sub: argparse.ArgumentParser, *, optional: bool = False, motion: bool = False) -> None:
+    """Add the description of an arm to a verb, and with `motion` the motion that it may follow."""
+    text = "description file, or the name of a shipped one"
+    sub.add_argument("arm", nargs="?" if optional else None, metavar="ARM", help=text)
+    if motion:
+        text = "motion.json; default: the description's"
+        sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help=text)
+
+
 def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable[[str], Any] = str) -> None:
     """Add an option that may be given several times; its value is a list."""
     sub.add_argument(option, action="append", default=[], type=read, metavar=metavar, help=text)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.answer_texts import asked_text, stop_text
 from ident_service.cli.archive_commands import add_by, write_audit_entry
-from ident_service.cli.arguments import Parser, VerbList, seconds, share, speed
+from ident_service.cli.arguments import Parser, VerbList, add_arm, seconds, share, speed
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -350,7 +350,6 @@ def _report_text(report: dict[str, Any]) -> str:
 
 SLOW = 0.2  # of the motion's own speed, while a key is held
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
-_HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: VerbList) -> None:
@@ -362,7 +361,7 @@ def add(verbs: VerbList) -> None:
         more="Sends no torque.",
         examples=("my_arm.yaml", "planar2 --seconds 5"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--seconds", type=seconds, default=2.0)
     sub.add_argument("--tell-samples", action="store_true", help=argparse.SUPPRESS)  # of a daemon
     sub = verbs.add(
@@ -373,8 +372,7 @@ def add(verbs: VerbList) -> None:
         former="check",
         examples=("my_arm.yaml", "planar2 motion/motion.json --confirm planar2", "my_arm.yaml --home"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover` instead of a motion")
     sub.add_argument(
         "--rate-seconds",
@@ -426,7 +424,7 @@ def add(verbs: VerbList) -> None:
     ):
         examples = ("", "planar2") if name == "stop" else ("planar2", "my_arm.yaml")
         sub = verbs.add(name, _stop if name == "stop" else _ask, text, more=more, examples=examples)
-        sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
+        add_arm(sub, optional=name == "stop")
         if name == "supported":
             sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees the arm")
         sub.set_defaults(asks=name)
@@ -438,14 +436,13 @@ def add(verbs: VerbList) -> None:
         former="ack",
         examples=("planar2 following_error", "my_arm.yaml drive_fault --by Ann"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("fault", metavar="FAULT")
     add_by(sub)
 
 
 def _motion(sub: Parser) -> None:
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     sub.add_argument(
         "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
     )

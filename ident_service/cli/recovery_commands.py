@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ident_service.cli.answer_texts import reidentified_text
 from ident_service.cli.archive_commands import add_by, registry, terminal_user
-from ident_service.cli.arguments import VerbList
+from ident_service.cli.arguments import VerbList, add_arm
 from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
 from ident_service.cli.next_command import command
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ident_service.operations.recovery import Recovery
 
 
-_HELP_ARM = "description file, or the name of a shipped one"
 _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 
@@ -52,7 +51,7 @@ def _add_recovery(verbs: VerbList) -> None:
         more="At a tenth of its velocity limits at most.",
         examples=("planar2", "my_arm.yaml --dry-run"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
     sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
@@ -66,7 +65,7 @@ def _add_recovery(verbs: VerbList) -> None:
         more="Sets the zero of incremental encoders, and moves nothing.",
         examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
     add_dry_run(sub)
     add_lease(sub, confirm=False)
@@ -78,7 +77,7 @@ def _add_recovery(verbs: VerbList) -> None:
         more="Exit code 3: the arm is not usable yet.",
         examples=("planar2", "my_arm.yaml --leave-limit"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
@@ -247,8 +246,7 @@ def _add_reidentify(verbs: VerbList) -> None:
         more="Preflight, run, identification, comparison in one (exit code 3: the arm has changed).",
         examples=("planar2", "my_arm.yaml motion/motion.json --confirm my_arm"),
     )
-    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
     add_dry_run(sub)
     add_by(sub)

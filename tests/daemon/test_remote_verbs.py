@@ -388,6 +388,20 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
 
 
 @pytest.mark.slow
+def test_a_fault_elsewhere_is_told_with_what_it_left(state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = quick_text("faulty", 16).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)
+    checked_before(state, text)
+    with daemon_thread(state) as client:
+        client.add_arm(text)
+        assert main(["run", "faulty", "--confirm", "faulty", "--server", client.url, "--state", str(state)]) == 4
+        told, job = capsys.readouterr().out.partition("\nnext: ")[0], next(client.jobs())
+        left = client.answer(job.id)["files"]
+    ended = f"job {job.id}: run, faulted\n{job.detail}\nrun {job.run}\n"
+    files = "".join(f"\n  {name}" for name in left)
+    assert told.endswith(f"{ended}recording until the fault: runs/{job.run}/run.mcap\nfiles: runs/{job.run}{files}")
+
+
+@pytest.mark.slow
 def test_what_is_no_file_here_is_reported_and_files_of_a_description_are_sent(
     state: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
