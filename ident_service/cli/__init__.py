@@ -155,7 +155,9 @@ def _run(words: Sequence[str], *, completes: bool) -> int:
         said = with_arm(arguments, "\n".join([str(error), *notes]))
         print_to_person(f"{head} {said}\n{next_after_error(arguments, error)}")
         if arguments.json:
-            print_error(type(error).__name__, str(error), code, {**({"notes": notes} if notes else {}), **error.facts})
+            more: dict[str, object] = {"notes": notes} if notes else {}
+            more |= {"text": "".join(f"{note}\n" for note in notes)} if arguments.with_text else {}
+            print_error(type(error).__name__, str(error), code, {**more, **error.facts})
         return code
     try:
         text = text if arguments.json else with_arm(arguments, text)

@@ -8,13 +8,14 @@ from __future__ import annotations
 import argparse
 import os
 import pwd
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ident_service.cli.answer_texts import told
 from ident_service.cli.arguments import Parser, VerbList, count
 from ident_service.cli.output import DONE, Answer, print_to_person, state_folder, writable_state_folder
 from ident_service.errors import IdentError, InUse, UsageError
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from ident_service.registry.database import Database
 
 _LONGEST_NAME = 80
-_LINE = 80  # columns of a list
 _RUN = "20261124T101500Z-planar2"  # of the examples
 _RUN_KEYS = ("id", "kind", "arm", "created", "ending")
 _PATIENCE = 1.0  # s to wait for a locked registry when an act that is done is entered in the audit trail
@@ -54,11 +54,13 @@ def terminal_user(arguments: argparse.Namespace) -> str:
 
 @contextmanager
 def registry(arguments: argparse.Namespace) -> Iterator[tuple[Database, Path]]:
-    """Open the registry of the state folder that a verb works on, and return the folder with it."""
+    """Open the registry of the state folder that a verb works on, shipped arms entered; yield it and the folder."""
+    from ident_service.registry.arms import know_shipped
     from ident_service.registry.database import Database
 
     state = writable_state_folder(arguments)
     with Database(state) as db:
+        know_shipped(db)
         yield db, state
 
 
@@ -193,15 +195,14 @@ def _add_lists(verbs: VerbList) -> None:
 
 
 def _arms(arguments: argparse.Namespace) -> Answer:
-    from ident_service.registry.arms import arm_names, know_shipped
+    from ident_service.registry.arms import arm_names
     from ident_service.registry.state_folder import known_arms
 
     with registry(arguments) as (db, state):
-        know_shipped(db)
         rows = [{key: row[key] for key in ("name", "source", "description")} for row in arm_names(db)]
     named = {row["name"] for row in rows}
     rows += [{"name": name, "source": "file", "description": ""} for name in known_arms(state) if name not in named]
-    return DONE, "".join(map(arm_line, rows)), {"arms": rows}
+    return told(arguments, {"arms": rows})
 
 
 def _runs(arguments: argparse.Namespace) -> Answer:
@@ -210,8 +211,7 @@ def _runs(arguments: argparse.Namespace) -> Answer:
     with registry(arguments) as (db, state):
         unreadable = rebuild_runs(db, state)
         rows = [{key: row[key] for key in _RUN_KEYS} for row in runs(db, arguments.arm, most=arguments.most)]
-    text = "".join(f"not listed: {line}\n" for line in unreadable)
-    return DONE, (runs_text(rows) + text), {"runs": rows, "not_listed": unreadable}
+    return told(arguments, {"runs": rows, "not_listed": unreadable})
 
 
 def _motions(arguments: argparse.Namespace) -> Answer:
@@ -219,25 +219,7 @@ def _motions(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         rows = [dict(row) for row in motions(db, arguments.arm, most=arguments.most)]
-    return DONE, motions_text(rows), {"motions": rows}
-
-
-def arm_line(row: Mapping[str, Any]) -> str:
-    """Format one arm as a line of the list."""
-    line = f"{row['name']:<20} {row['source']:<9} {row['description']}".rstrip()
-    return f"{line if len(line) <= _LINE else line[: _LINE - 3] + '...'}\n"
-
-
-def runs_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format runs as a list, one per line."""
-    lines = [f"{row['id']:<40} {row['arm']:<14} {row['kind']:<12} {row['ending']}".rstrip() + "\n" for row in rows]
-    return "".join(lines) or "no runs yet\n"
-
-
-def motions_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format motions as a list, one per line."""
-    lines = [f"{row['id']:<40} {row['arm']:<14} {row['duration']:.1f} s, by {row['added_by']}\n" for row in rows]
-    return "".join(lines) or "no motions yet\n"
+    return told(arguments, {"motions": rows})
 
 
 def _accept(arguments: argparse.Namespace) -> Answer:
@@ -245,8 +227,7 @@ def _accept(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, state):
         act = accept(db, state, arguments.run.resolve(), arguments.note, terminal_user(arguments))
-    path = current_file(state, act.arm)
-    return DONE, f"{act.arm}: acceptance {act.number}; current: {path}\n", {**asdict(act), "current": str(path)}
+    return told(arguments, {**asdict(act), "current": str(current_file(state, act.arm))})
 
 
 def _rollback(arguments: argparse.Namespace) -> Answer:
@@ -254,9 +235,7 @@ def _rollback(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, state):
         act = rollback(db, state, arguments.arm, arguments.note, terminal_user(arguments), arguments.to)
-    path = current_file(state, act.arm)
-    text = f"{act.arm}: acceptance {act.number} is the set of {act.origin} ({act.run}); current: {path}\n"
-    return DONE, text, {**asdict(act), "current": str(path)}
+    return told(arguments, {**asdict(act), "current": str(current_file(state, act.arm))})
 
 
 def _import(arguments: argparse.Namespace) -> Answer:
@@ -287,7 +266,7 @@ def _prune(arguments: argparse.Namespace) -> Answer:
         "recordings": [asdict(one) for one in gone],
         "left_alone": untold,
     }
-    return DONE, pruned_text(document), document
+    return told(arguments, document)
 
 
 def _delete(arguments: argparse.Namespace) -> Answer:
@@ -297,8 +276,7 @@ def _delete(arguments: argparse.Namespace) -> Answer:
     delete = {"run": deletion.delete_run, "motion": deletion.delete_motion, "arm": deletion.delete_arm}[kind]
     with registry(arguments) as (db, state), deleted_with_anyway(kind, arguments.name):
         found = delete(db, state, arguments.name, terminal_user(arguments), anyway=arguments.anyway)
-    document = {"deleted": arguments.name, "dependents": [asdict(one) for one in found]}
-    return DONE, deleted_text(document), document
+    return told(arguments, {"deleted": arguments.name, "dependents": [asdict(one) for one in found]})
 
 
 @contextmanager
@@ -333,17 +311,3 @@ def _restore(arguments: argparse.Namespace) -> Answer:
     text += "tokens that were revoked since then count again (ident tokens), the owner's does not: the daemon writes "
     text += "a new one; each arm needs a new preflight\n"
     return DONE, text, {**asdict(done), "state": str(state)}
-
-
-def deleted_text(document: Mapping[str, Any]) -> str:
-    """Format the answer of `delete`: what was deleted, and what becomes of the entries that referred to it."""
-    lines = "".join(f"  {one['kind']} {one['id']}: {one['becomes']}\n" for one in document["dependents"])
-    return f"{document['deleted']}: deleted\n{lines}"
-
-
-def pruned_text(document: Mapping[str, Any]) -> str:
-    """Format the answer of `prune`: the recordings that were deleted, or would be."""
-    gone, verb = document["recordings"], "deleted" if document["deleted"] else "would be deleted; add --yes"
-    text = "".join(f"{one['run']}/{one['name']}  {one['bytes'] / 2**20:.1f} MiB\n" for one in gone)
-    text += "".join(f"skipped: {line}\n" for line in document["left_alone"])
-    return f"{text}{len(gone)} recordings, {document['bytes'] / 2**20:.1f} MiB, {verb}\n"

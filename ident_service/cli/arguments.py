@@ -307,6 +307,7 @@ def _describe(parser: Parser, word: str, text: str, more: str, examples: Sequenc
 def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answer]) -> None:
     """Add the options that a verb shares with others, and what is to be run."""
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else")
+    parser.add_argument("--with-text", action="store_true", help=argparse.SUPPRESS)  # of a daemon
     if word in LOCAL_ONLY:
         parser.absent["--server"] = LOCAL_ONLY[word]
     else:
@@ -316,6 +317,15 @@ def _answer(parser: Parser, word: str, run: Callable[[argparse.Namespace], Answe
         "--state", metavar="DIR", help="state folder (default: $IDENT_STATE, or the user's XDG state folder)"
     )
     parser.set_defaults(verb=run, word=word, words=parser, json=False, server=None)
+
+
+def add_arm(sub: argparse.ArgumentParser, *, optional: bool = False, motion: bool = False) -> None:
+    """Add the description of an arm to a verb, and with `motion` the motion that it may follow."""
+    text = "description file, or the name of a shipped one"
+    sub.add_argument("arm", nargs="?" if optional else None, metavar="ARM", help=text)
+    if motion:
+        text = "motion.json; default: the description's"
+        sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help=text)
 
 
 def repeatable(sub: Parser, option: str, metavar: str, text: str, read: Callable[[str], Any] = str) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
+from ident_service.cli.answer_texts import told
 from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import VerbList
 from ident_service.cli.completion import SHELLS, install_completion
@@ -112,14 +110,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         rows = tokens(db)
-    text = "".join(map(token_line, rows)) or "no tokens yet; `ident serve` makes the first\n"
-    return DONE, text, {"tokens": [dict(row) for row in rows]}
-
-
-def token_line(row: Mapping[str, Any]) -> str:
-    """Format one access token as a line of the list."""
-    since = datetime.fromtimestamp(row["created"], UTC).strftime("%Y-%m-%d")
-    return f"{row['name']:<24} {row['role']:<9} since {since}{', revoked' if row['revoked'] else ''}\n"
+    return told(arguments, {"tokens": [dict(row) for row in rows]})
 
 
 def _revoke(arguments: argparse.Namespace) -> Answer:
@@ -127,7 +118,7 @@ def _revoke(arguments: argparse.Namespace) -> Answer:
 
     with registry(arguments) as (db, _):
         revoke_token(db, arguments.name, terminal_user(arguments))
-    return DONE, f"{arguments.name}: revoked\n", {"name": arguments.name, "revoked": True}
+    return told(arguments, {"name": arguments.name, "revoked": True})
 
 
 def _port(text: str) -> int:

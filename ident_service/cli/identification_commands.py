@@ -50,6 +50,8 @@ _NO_PLUGINS = {"PYDANTIC_DISABLE_PLUGINS": "__all__"}  # pydantic reads what eve
 # These load all of their modules, a tenth of the time of `ident identify`, which takes LAPACK of the one (as Clarabel
 # does) and Student's t of the other.
 _PARTLY = ("scipy.linalg", "scipy.special")
+OF_ARMS = "arms/*/parameters.json"
+"""Those of a fleet, in folders that a daemon does not send."""
 
 
 def _add_commission(verbs: VerbList) -> None:
@@ -388,13 +390,12 @@ def _fleet_identify(arguments: argparse.Namespace) -> Answer:
     folder = arguments.out or new_run_folder(writable_state_folder(arguments), config.name, "fleets")
     result = identify_fleet(request, folder, lambda line: tell(arguments, line), step_of(arguments))
     good = not result.document["left_out"] and not result.changed
-    files = [f"files: {folder}", f"  {PAGE}, {FLEET}, {TABLE}, arms/*/parameters.json", ""]
-    text = "\n".join([*fleet_lines(result.document), *files])
+    files = [f"files: {folder}", *(f"  {name}" for name in (PAGE, FLEET, TABLE, OF_ARMS)), ""]
+    text = "\n".join([*_fleet_lines(result.document), *files])
     return (DONE if good else VERDICT_NO), text, {"folder": str(folder), **result.document}
 
 
-def fleet_lines(document: Mapping[str, Any]) -> list[str]:
-    """Return what was found, for a terminal, from the content of `fleet.json`."""
+def _fleet_lines(document: Mapping[str, Any]) -> list[str]:
     lines = [
         f"{document['recordings']} recordings of {len(document['arms'])} arms, {len(document['left_out'])} left out"
     ]

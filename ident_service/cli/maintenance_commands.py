@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ident_service.cli.archive_commands import add_by, terminal_user
+from ident_service.cli.answer_texts import told
+from ident_service.cli.archive_commands import add_by, registry, terminal_user
 from ident_service.cli.arguments import Parser, VerbList, count, hours
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, state_folder, writable_state_folder
+from ident_service.cli.output import DONE, VERDICT_NO, Answer
 
 if TYPE_CHECKING:
     from ident_service.registry.database import Database, Row
@@ -93,16 +92,6 @@ def add(verbs: VerbList) -> None:
     _add_number_and_note(sub)
 
 
-def registry(arguments: argparse.Namespace) -> Database:
-    """Open the registry of the state folder, with the shipped arms entered."""
-    from ident_service.registry.arms import know_shipped
-    from ident_service.registry.database import Database
-
-    db = Database(writable_state_folder(arguments))
-    know_shipped(db)
-    return db
-
-
 def _arm(sub: Parser) -> None:
     sub.add_argument("arm", metavar="NAME", help="name of a shipped arm, or of one uploaded to a daemon")
 
@@ -117,133 +106,87 @@ def _add_number_and_note(sub: Parser) -> None:
     add_by(sub)
 
 
-def _known(db: Database, arguments: argparse.Namespace) -> str:
+def _known(db: Database, state: Path, arguments: argparse.Namespace) -> str:
     from ident_service.registry.arms import known_arm
 
-    return known_arm(db, state_folder(arguments), arguments.arm).name
+    return known_arm(db, state, arguments.arm).name
 
 
 def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import DueRule, add_schedule
 
     when = DueRule(arguments.cron, arguments.hours, arguments.maintenance)
-    with registry(arguments) as db:
-        name = _known(db, arguments)
+    with registry(arguments) as (db, state):
+        name = _known(db, state, arguments)
         row = add_schedule(db, name, when, terminal_user(arguments), time.time(), arguments.motion)
-    return DONE, schedule_line(row), _shown(row)
+    return told(arguments, _shown(row))
 
 
 def _list(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import schedules
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         rows = schedules(db, arguments.arm)
-    return DONE, schedules_text(rows), {"schedules": [_shown(row) for row in rows]}
+    return told(arguments, {"schedules": [_shown(row) for row in rows]})
 
 
 def _remove(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import remove_schedule
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         remove_schedule(db, arguments.number, terminal_user(arguments))
-    return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
+    return told(arguments, {"id": arguments.number, "removed": True})
 
 
 def _enabled(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import enable_schedule
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         row = enable_schedule(db, arguments.number, terminal_user(arguments), time.time(), enabled=arguments.enabled)
-    return DONE, schedule_line(row), _shown(row)
+    return told(arguments, _shown(row))
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import add_event, pending
+    from ident_service.operations.maintenance_schedule import add_event, comparable_dues
 
-    with registry(arguments) as db:
-        name = _known(db, arguments)
+    with registry(arguments) as (db, state):
+        name = _known(db, state, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
-        due = _with_accepted(state_folder(arguments), pending(db, name))
-    text = f"{name}: recorded: {row['what']}\n" + "".join(due_line(one) for one in due)
-    if not due:
-        text += f"nothing is due after it; see `ident schedules add {name} --maintenance`\n"
-    return DONE, text, {**row, "due": due}
+        due = comparable_dues(db, state, name)
+    return told(arguments, {**row, "due": due})
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import pending
+    from ident_service.operations.maintenance_schedule import comparable_dues
 
-    with registry(arguments) as db:
-        rows = _with_accepted(state_folder(arguments), pending(db, arguments.arm))
-    return DONE, dues_text(rows), {"due": rows}
+    with registry(arguments) as (db, state):
+        return told(arguments, {"due": comparable_dues(db, state, arguments.arm)})
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.maintenance_schedule import dismiss
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         dismiss(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
-    return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
+    return told(arguments, {"id": arguments.number, "dismissed": True})
 
 
 def _alarms(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.drift_alarms import alarms
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         rows = alarms(db, arguments.arm)
-    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": [dict(row) for row in rows]}
+    return told(arguments, {"alarms": [dict(row) for row in rows]}, VERDICT_NO if rows else DONE)
 
 
 def _ack(arguments: argparse.Namespace) -> Answer:
     from ident_service.operations.drift_alarms import acknowledge_alarm
 
-    with registry(arguments) as db:
+    with registry(arguments) as (db, _):
         row = acknowledge_alarm(db, arguments.number, arguments.note, terminal_user(arguments), time.time())
-    return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", dict(row)
+    return told(arguments, dict(row))
 
 
 def _shown(row: Row) -> dict[str, Any]:
     hidden = {"request", "counted"}
     return {key: value for key, value in row.items() if key not in hidden} | {"enabled": bool(row["enabled"])}
-
-
-def schedule_line(row: Row) -> str:
-    """Format one schedule as a line for a person."""
-    when = f"cron {row['cron']} (UTC)" if row["cron"] else str(row["trigger"])
-    coming = f", next {_day(row['next'])}" if row["cron"] and row["enabled"] else ""
-    return f"{row['id']:>4}  {row['arm']:<16} {when}{coming}{'' if row['enabled'] else ', disabled'}\n"
-
-
-def schedules_text(rows: Sequence[Row]) -> str:
-    """Format schedules as lines for a person."""
-    return "".join(map(schedule_line, rows)) or "nothing is scheduled\n"
-
-
-def due_line(row: Row) -> str:
-    """Format one re-identification that is due as a line for a person; it needs an `accepted` set to compare with."""
-    line = f"due {row['id']}: {row['arm']} since {_day(row['at'])}: {row['cause']}"
-    if row["accepted"]:
-        return f"{line}; `ident reidentify {row['arm']}`\n"
-    return f"{line}; nothing of it has been accepted to compare with: run, identify and accept it first\n"
-
-
-def dues_text(rows: Sequence[Row]) -> str:
-    """Format re-identifications that are due as lines for a person."""
-    return "".join(map(due_line, rows)) or "nothing is due\n"
-
-
-def _with_accepted(state: Path, rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return due re-identifications, each with whether its arm has an accepted set."""
-    from ident_service.operations.acceptance import acceptances
-
-    return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in rows]
-
-
-def alarm_lines(rows: Sequence[Row]) -> str:
-    """Format drift alarms as lines for a person."""
-    lines = [f"{row['id']:>4}  {row['arm']:<16} {_day(row['at'])}  {row['what']}\n" for row in rows]
-    return "".join(lines) or "no open alarms\n"
-
-
-def _day(at: float) -> str:
-    return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M UTC")

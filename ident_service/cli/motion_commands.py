@@ -21,8 +21,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ident_service.cli.answer_texts import asked_text, stop_text
 from ident_service.cli.archive_commands import add_by, write_audit_entry
-from ident_service.cli.arguments import Parser, VerbList, seconds, share, speed
+from ident_service.cli.arguments import Parser, VerbList, add_arm, seconds, share, speed
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
 from ident_service.cli.output import (
     DONE,
@@ -263,8 +264,8 @@ def described_arm(arguments: argparse.Namespace) -> ArmConfig:
 def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
     """Return what opening the arm of a verb, or zeroing it, would write into its drives; nothing is written."""
     from ident_service.operations.drive_configuration import (
+        drives_document,
         planned_configuration,
-        planned_document,
         planned_text,
         planned_zero,
     )
@@ -273,7 +274,7 @@ def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
     planned = planned_zero(config) if zero else planned_configuration(config)
     code = VERDICT_NO if any(one.refused for one in planned) else DONE
     text = planned_text(config, planned, "setting home" if zero else "opening")
-    return code, text, planned_document(config, planned)
+    return code, text, drives_document(config, planned)
 
 
 def add_can_log(sub: Parser) -> None:
@@ -352,7 +353,6 @@ def _report_text(report: dict[str, Any]) -> str:
 
 SLOW = 0.2  # of the motion's own speed, while a key is held
 _PLAIN = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")  # a name that cannot lead out of its folder
-_HELP_ARM = "description file, or the name of a shipped one"
 
 
 def add(verbs: VerbList) -> None:
@@ -364,7 +364,7 @@ def add(verbs: VerbList) -> None:
         more="Sends no torque.",
         examples=("my_arm.yaml", "planar2 --seconds 5"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--seconds", type=seconds, default=2.0)
     sub.add_argument("--tell-samples", action="store_true", help=argparse.SUPPRESS)  # of a daemon
     sub = verbs.add(
@@ -375,8 +375,7 @@ def add(verbs: VerbList) -> None:
         former="check",
         examples=("my_arm.yaml", "planar2 motion/motion.json --confirm planar2", "my_arm.yaml --home"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     sub.add_argument("--home", action="store_true", help="for `ident home` and `ident recover` instead of a motion")
     sub.add_argument(
         "--rate-seconds",
@@ -428,7 +427,7 @@ def add(verbs: VerbList) -> None:
     ):
         examples = ("", "planar2") if name == "stop" else ("planar2", "my_arm.yaml")
         sub = verbs.add(name, _stop if name == "stop" else _ask, text, more=more, examples=examples)
-        sub.add_argument("arm", metavar="ARM", nargs="?" if name == "stop" else None, help=_HELP_ARM)
+        add_arm(sub, optional=name == "stop")
         if name == "supported":
             sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees the arm")
         sub.set_defaults(asks=name)
@@ -440,14 +439,13 @@ def add(verbs: VerbList) -> None:
         former="ack",
         examples=("planar2 following_error", "my_arm.yaml drive_fault --by Ann"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("fault", metavar="FAULT")
     add_by(sub)
 
 
 def _motion(sub: Parser) -> None:
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     sub.add_argument(
         "--out", type=Path, metavar="DIR", help="run folder; must not exist (default: below the state folder)"
     )
@@ -670,24 +668,13 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
         for name in known_arms(state):  # a file was made where there was none
             give_to_owner(state, control_path(state, name))
         write_audit_entry(arguments, "stop", "all arms", reached=reached)
-        text = f"stop requested of {', '.join(reached)}" if reached else "no arm is moving"
-        text += "; motions requested before now will not begin\n"
-        return DONE, text, {"arms": reached, "asked": "stop"}
+        return DONE, stop_text(None, reached), {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
     pid = ControlFile.stop_all(path)
     give_to_owner(state, path)
-    write_audit_entry(arguments, "stop", name, reached=[] if pid is None else [name])
-    text = f"{name}: stop requested of process {pid}" if pid is not None else f"{name} is not moving"
-    text += "" if pid is not None else "; motions requested before now will not begin"
-    return DONE, f"{text}\n", {"arm": name, "asked": "stop", "pid": pid}
-
-
-_ASKED = {
-    "pause": "pause requested of",
-    "resume": "resumption requested of",
-    "finish": "early end requested of",
-    "supported": "support confirmed to",
-}
+    reached = [] if pid is None else [name]
+    write_audit_entry(arguments, "stop", name, reached=reached)
+    return DONE, stop_text(name, reached), {"arm": name, "asked": "stop", "pid": pid}
 
 
 def _ask(arguments: argparse.Namespace) -> Answer:
@@ -705,8 +692,7 @@ def _ask(arguments: argparse.Namespace) -> Answer:
             return _release_drives(arguments)
     pid = ask_process(path, arguments.asks)
     write_audit_entry(arguments, arguments.asks, name, reached=[name])
-    document: dict[str, Any] = {"arm": name, "asked": arguments.asks, "pid": pid}
-    return DONE, f"{name}: {_ASKED[arguments.asks]} process {pid}\n", document
+    return DONE, asked_text(name, arguments.asks), {"arm": name, "asked": arguments.asks, "pid": pid}
 
 
 def _require_typed(arguments: argparse.Namespace, name: str, follows: str) -> None:

@@ -147,6 +147,8 @@ def _checked(ended: Ended) -> list[str]:
     file = str(ended.given.file)
     if not ended.good:
         return ["config", "check", file]
+    if ended.remote and not Path(file).is_file():  # the daemon's own arm
+        return ["preflight", file]
     driver = _driver(file)
     if driver is None:
         return ["identify", "RECORDING", "--arm", file]

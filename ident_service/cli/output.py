@@ -16,13 +16,9 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
-from ident_service.errors import IdentError, UsageError
-
-if TYPE_CHECKING:
-    from ident_service.client import IdentClient
-
+from ident_service.errors import UsageError
 
 DONE, FAILED, USAGE, VERDICT_NO, FAULTED, PERSON_NEEDED = 0, 1, 2, 3, 4, 5
 
@@ -44,9 +40,12 @@ def styled(stream: TextIO | None, text: str, style: str) -> str:
 
 
 def print_answer(arguments: argparse.Namespace, code: int, text: str, document: dict[str, Any], last: str = "") -> None:
-    """Print a verb's answer as text with a last line, or with `--json` as one JSON object."""
+    """Print a verb's answer as text with a last line, or with `--json` as one JSON object.
+
+    A daemon asks for the text in the object, as its `text`.
+    """
     if arguments.json:
-        _print_json({**document, "exit_code": code})
+        _print_json({**document, **({"text": text} if arguments.with_text else {}), "exit_code": code})
     else:
         write(sys.stdout, text + styled(sys.stdout, last, "next") if last else text)
 
@@ -214,59 +213,3 @@ class StopOnSignal:
         if number != signal.SIGHUP:
             before = self._before[signal.Signals(number)]
             signal.signal(number, signal.default_int_handler if before is signal.SIG_IGN else before)
-
-
-_OURS = frozenset({"exit_code", "error"})  # keys that the job's own lines show already
-
-
-def with_answer_lines(_: IdentClient, __: argparse.Namespace, answer: Answer) -> Answer:
-    """Return the answer with its command's JSON object appended to the text as lines."""
-    code, text, document = answer
-    said = {key: value for key, value in document["answer"].items() if key not in _OURS}
-    text += _ticket(said.pop("ticket", None))
-    return code, text + "".join(f"{line}\n" for line in lines_of(said)), document
-
-
-def _ticket(values: Any) -> str:
-    """The table of a preflight, as the command at the arm prints it; nothing where there is none that can be read."""
-    if not isinstance(values, dict):
-        return ""
-    from ident_service.motion.ticket import ticket_from_json
-    from ident_service.operations.arm_checks import ticket_text
-
-    try:
-        return "\n" + ticket_text(ticket_from_json(json.dumps(values)))
-    except IdentError:  # another version's
-        return "".join(f"{line}\n" for line in lines_of(values))
-
-
-def lines_of(value: Any, indent: str = "") -> Iterator[str]:
-    """Yield one line per value of a JSON object or list; nested values are indented by two spaces.
-
-    Lists of plain values, and plain values, stand on the line of their name; sentences have a line each.
-    """
-    pairs = value.items() if isinstance(value, dict) else enumerate(value, 1)
-    for name, part in pairs:
-        if isinstance(part, list) and any(isinstance(one, str) and one.endswith(".") for one in part):  # sentences
-            yield f"{indent}{name}:"
-            yield from (f"{indent}  {one}" for one in part)
-        elif isinstance(part, dict | list) and not _plain(part):
-            yield f"{indent}{name}:"
-            yield from lines_of(part, indent + "  ")
-        else:
-            yield f"{indent}{name}: {_word(part)}"
-
-
-def _plain(part: Any) -> bool:
-    values = part.values() if isinstance(part, dict) else part
-    return not part or (isinstance(part, list) and not any(isinstance(one, dict | list) for one in values))
-
-
-def _word(part: Any) -> str:
-    if isinstance(part, dict | list):
-        return ", ".join(map(_word, part)) or "none"
-    if isinstance(part, bool):
-        return "yes" if part else "no"
-    if isinstance(part, float):
-        return f"{part:.6g}"
-    return "none" if part is None else str(part)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ident_service.cli.arguments import (
     Parser,
     VerbList,
+    add_arm,
     count,
     frequency,
     repeatable,
@@ -66,7 +67,7 @@ def _add_motions(verbs: VerbList) -> None:
             "planar2 --parameter fv2 --after run.mcap",
         ),
     )
-    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    add_arm(sub)
     sub.add_argument("--criterion", choices=_CRITERIA, help="default: the arm's")
     sub.add_argument(
         "--parameter",
@@ -102,8 +103,7 @@ def _add_motions(verbs: VerbList) -> None:
         more="Exit code 3: the arm's limits refuse it.",
         examples=("planar2", "my_arm.yaml motion/motion.json --out preview"),
     )
-    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     _add_prior_data_options(sub)
     sub.add_argument("--out", type=Path, metavar="DIR", help="also write the text and the figures there")
 
@@ -183,9 +183,10 @@ def _progress(arguments: argparse.Namespace) -> Callable[[Progress], None]:
             known = progress.remaining == progress.remaining
             step(f"{progress.phase}: {progress.finished}{found}", None, progress.remaining if known else None)
             return
-        best = "none yet" if progress.best is None else f"{progress.best:.4f}"
+        best = "" if progress.best is None else f", best {progress.best:.4f}"
         left = f", about {progress.remaining:.0f} s left" if progress.remaining == progress.remaining else ""
-        words = f"{progress.phase}: {progress.finished} starts, best {best}, {progress.elapsed:.0f} s{left}"
+        act = "searching" if progress.phase == "starts" else "improving the best"
+        words = f"{act}: {progress.finished} starts complete{best}, {progress.elapsed:.0f} s{left}"
         if progress.elapsed - last[0] >= 10.0:
             last[0] = progress.elapsed
             tell(arguments, words)
@@ -278,9 +279,6 @@ def _check(arguments: argparse.Namespace) -> Answer:
     return DONE if checked.good else VERDICT_NO, description_text(arguments.file, checked), document
 
 
-_HELP_ARM = "description file, or the name of a shipped one"
-
-
 def _add_bus(verbs: VerbList) -> None:
     """Register `bus load`, `bus scan` and `bus probe`."""
     bus = verbs.group("bus", "look at the fieldbus of an arm, configure its drives")
@@ -291,7 +289,7 @@ def _add_bus(verbs: VerbList) -> None:
         more="Exit code 3: too much.",
         examples=("wam7_canopen", "wam7_canopen --rate 500"),
     )
-    load.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(load)
     load.add_argument("--rate", type=frequency, metavar="HZ", help="cycles per second (default: control.rate)")
     sub = bus.add(
         "scan",
@@ -300,7 +298,7 @@ def _add_bus(verbs: VerbList) -> None:
         more="Reads only (exit code 3: not as configured).",
         examples=("wam7_canopen", "my_arm.yaml --json"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
 
     sub = bus.add(
         "probe",
@@ -309,7 +307,7 @@ def _add_bus(verbs: VerbList) -> None:
         more="Modes, units, limits, watchdogs, rate; reads only (exit code 3: unsuitable; 2: a file is no EDS).",
         examples=("wam7_canopen", "my_arm.yaml --eds drive.eds"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     help_eds = "EDS or DCF files to read instead of the drives, without a bus"
     sub.add_argument("--eds", nargs="+", default=[], metavar="FILE", help=help_eds)
 
@@ -320,7 +318,7 @@ def _add_bus(verbs: VerbList) -> None:
         more="One file for each drive; each change is listed, and drives are off meanwhile.",
         examples=("my_arm.yaml j1.dcf j2.dcf --dry-run", "my_arm.yaml j1.dcf j2.dcf --confirm my_arm"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("files", nargs="+", metavar="DCF", help="one for each drive, in the order of the description")
     sub.add_argument("--dry-run", action="store_true", help="list the changes, and write nothing")
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
@@ -330,7 +328,7 @@ def _add_bus(verbs: VerbList) -> None:
     ):
         examples = ("my_arm.yaml --dry-run", "my_arm.yaml --confirm my_arm")
         sub = bus.add(name, _store, text, more=more, examples=examples)
-        sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+        add_arm(sub)
         sub.add_argument("--dry-run", action="store_true", help="ask whether drives can, and write nothing")
         sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person")
         sub.set_defaults(stores=name == "store")
@@ -342,7 +340,7 @@ def _add_bus(verbs: VerbList) -> None:
         more="Probe, frames, EDS hashes, ticket, versions; no secrets.",
         examples=("my_arm.yaml", "my_arm.yaml --run failed_run --out drives.zip"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--out", type=Path, metavar="FILE", help="must not exist (default: below the state folder)")
     sub.add_argument(
         "--run", type=Path, metavar="DIR", help="run folder whose can.log goes along (`ident run --can-log`)"
@@ -356,7 +354,7 @@ def _add_bus(verbs: VerbList) -> None:
         more="With zero torque alone (exit code 3: a promise is broken).",
         examples=("planar2", "my_arm.yaml --confirm my_arm"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument(
         "--confirm", metavar="NAME", help="the arm's name: it is supported, and nobody is within its reach"
     )
@@ -389,14 +387,14 @@ def _require_name(arguments: argparse.Namespace, name: str, what: str) -> None:
 
 def _import(arguments: argparse.Namespace) -> Answer:
     from ident_service.config.load import load_arm, sheet_file
-    from ident_service.operations.drive_configuration import import_configuration, imported_document, imported_text
+    from ident_service.operations.drive_configuration import drives_document, import_configuration, imported_text
 
     config, dry = load_arm(arguments.arm), arguments.dry_run
     files = [sheet_file(name) for name in arguments.files]
     if not dry:
         _require_name(arguments, config.name, "drives are configured anew")
     found = import_configuration(config, files, dry=dry)
-    return DONE, imported_text(config, found, dry=dry), imported_document(config, found, dry=dry)
+    return DONE, imported_text(config, found, dry=dry), drives_document(config, found, written=not dry)
 
 
 def _store(arguments: argparse.Namespace) -> Answer:
@@ -481,7 +479,7 @@ def _add_doctor(verbs: VerbList) -> None:
         more="Exit code 3: not that of the arm.",
         examples=("", "my_arm.yaml --seconds 300"),
     )
-    sub.add_argument("arm", nargs="?", metavar="ARM", help="description file, or the name of a shipped one")
+    add_arm(sub, optional=True)
     sub.add_argument("--seconds", type=seconds, default=60.0, help="duration of the measurement (60)")
 
 
@@ -584,7 +582,7 @@ def _add_emulate(verbs: VerbList) -> None:
         "`quit`.",
         examples=("wam7_canopen --seconds 60", "wam7_canopen --fault 'drive_fault joint=j2 at=1'"),
     )
-    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
+    add_arm(sub)
     form = "'KIND [joint=NAME] [at=S] [duration=S] [size=X] [offset=X,Y,Z]', counted from the first SYNC; repeatable"
     repeatable(sub, "--fault", "FAULT", form)
     sub.add_argument(

@@ -12,9 +12,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from ident_service.cli.archive_commands import add_by, terminal_user
-from ident_service.cli.arguments import VerbList
-from ident_service.cli.maintenance_commands import registry
+from ident_service.cli.answer_texts import reidentified_text
+from ident_service.cli.archive_commands import add_by, registry, terminal_user
+from ident_service.cli.arguments import VerbList, add_arm
 from ident_service.cli.motion_commands import add_can_log, add_dry_run, described_arm, dry_run, run_and_report
 from ident_service.cli.next_command import command
 from ident_service.cli.operator_input import add_lease, requested_lease, stop_or_lapsed
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ident_service.operations.recovery import Recovery
 
 
-_HELP_ARM = "description file, or the name of a shipped one"
 _HELP_OUT = "run folder; must not exist (default: below the state folder)"
 
 
@@ -52,7 +51,7 @@ def _add_recovery(verbs: VerbList) -> None:
         more="At a tenth of its velocity limits at most.",
         examples=("planar2", "my_arm.yaml --dry-run"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)  # former name of `set-home`
     sub.add_argument("--confirm", metavar="NAME", help="with --server: the arm's name, typed by a person")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
@@ -66,7 +65,7 @@ def _add_recovery(verbs: VerbList) -> None:
         more="Sets the zero of incremental encoders, and moves nothing.",
         examples=("my_arm.yaml", "my_arm.yaml --confirm my_arm"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name, typed by a person who sees where it stands")
     add_dry_run(sub)
     add_lease(sub, confirm=False)
@@ -78,7 +77,7 @@ def _add_recovery(verbs: VerbList) -> None:
         more="Exit code 3: the arm is not usable yet.",
         examples=("planar2", "my_arm.yaml --leave-limit"),
     )
-    sub.add_argument("arm", metavar="ARM", help=_HELP_ARM)
+    add_arm(sub)
     sub.add_argument("--leave-limit", action="store_true", help="MOVE the arm slowly back inside its position limits")
     sub.add_argument("--out", type=Path, metavar="DIR", help=_HELP_OUT)
     add_can_log(sub)
@@ -182,19 +181,7 @@ def _recover(arguments: argparse.Namespace) -> Answer:
     if arguments.can_log:
         raise UsageError("--can-log is for --leave-limit; without it nothing moves")
     found = recover(config, writable_state_folder(arguments), called=arguments.arm)
-    document = {
-        "arm": found.arm,
-        "usable": found.usable,
-        "faults": [asdict(one) for one in found.faults],
-        "moved_by": found.controlling_pid,
-        "seen": None if found.seen is None else watch_document(found.seen),
-        "unreachable": found.unreachable,
-        "zero_lost": found.zero_lost,
-        "reset": list(found.reset),
-        "tripped": found.tripped,
-        "outside": list(found.outside),
-        "steps": list(found.steps),
-    }
+    document = asdict(found) | {"seen": None if found.seen is None else watch_document(found.seen)}
     return DONE if found.usable else VERDICT_NO, _text(found), document
 
 
@@ -223,8 +210,8 @@ def _text(found: Recovery) -> str:
         lines.append(f"  active since {since} UTC: {one.code}: {one.cause}")
     if not found.faults:
         lines.append("  no active faults")
-    if found.controlling_pid is not None:
-        lines.append(f"  process {found.controlling_pid} is moving the arm")
+    if found.moved_by is not None:
+        lines.append(f"  process {found.moved_by} is moving the arm")
     if found.unreachable:
         lines.append(f"  the arm does not answer: {found.unreachable}")
     if found.zero_lost:
@@ -259,8 +246,7 @@ def _add_reidentify(verbs: VerbList) -> None:
         more="Preflight, run, identification, comparison in one (exit code 3: the arm has changed).",
         examples=("planar2", "my_arm.yaml motion/motion.json --confirm my_arm"),
     )
-    sub.add_argument("arm", metavar="ARM", help="description file, or the name of a shipped one")
-    sub.add_argument("motion", nargs="?", type=Path, metavar="MOTION", help="motion.json; default: the description's")
+    add_arm(sub, motion=True)
     sub.add_argument("--confirm", metavar="NAME", help="the arm's name: a person confirms that the arm is supported")
     add_dry_run(sub)
     add_by(sub)
@@ -276,9 +262,8 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.motions import new_id
     from ident_service.registry.runs import RUNS, index_run
 
-    state, config, begun = writable_state_folder(arguments), load_arm(arguments.arm), time.time()
-    who = terminal_user(arguments)
-    with registry(arguments) as db:
+    config, begun, who = load_arm(arguments.arm), time.time(), terminal_user(arguments)
+    with registry(arguments) as (db, state):
         number = require_comparable(state, config)
         accepted = accepted_set(state, config.name, number)[1]
         motion = [] if arguments.motion is None else [str(arguments.motion)]
@@ -308,10 +293,7 @@ def _reidentify(arguments: argparse.Namespace) -> Answer:
         "what": verdict.words,
         "comparison": document,
     }
-    lines = f"{text}{verdict.words}\n"
-    if verdict.state == "changed":
-        lines += "a drift alarm is open until `ident alarms acknowledge`, or `ident accept` of another set\n"
-    return EXIT_CODES[verdict.state], lines, answer
+    return EXIT_CODES[verdict.state], reidentified_text(text, verdict.state, verdict.words), answer
 
 
 def _step(arguments: argparse.Namespace, *words: str) -> Answer:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ident_service.cli.answer_texts import asked_text, stop_text, told
 from ident_service.cli.arguments import LOCAL_ONLY, VerbList, columns_files, count
 from ident_service.cli.output import (
     DONE,
@@ -24,7 +26,6 @@ from ident_service.cli.output import (
     StopOnSignal,
     state_folder,
     tell,
-    with_answer_lines,
 )
 from ident_service.cli.progress import step_of, typed
 from ident_service.cli.remote_recordings import file_of, recording, require_registered
@@ -41,7 +42,7 @@ RemoteVerb = tuple[Verb, frozenset[str]]  # and the arguments that are sent to a
 _LOOK = 0.4  # s between looks at a job, and between renewals of its lease
 _CODES = {"done": DONE, "refused": VERDICT_NO, "faulted": FAULTED}
 LIVE = ("queued", "running")
-_TABLE = "\nbase parameter "  # begins the table of a report that the command does not print
+_COMMAND = re.compile(r"`ident ([^`]+)`")
 _JOB = "20261124T101500Z-planar2-7b2f10"  # of the examples
 _MOVE = (
     "check",
@@ -108,7 +109,7 @@ def carrying(words: str, verb: Verb) -> RemoteVerb:
 
 
 def job(
-    words: str, kind: str | None = None, *, more: str = "", ended: Ended = with_answer_lines, **fields: Reader
+    words: str, kind: str | None = None, *, more: str = "", ended: Ended | None = None, **fields: Reader
 ) -> RemoteVerb:
     """Return a verb that is a job with the arguments' values.
 
@@ -116,7 +117,7 @@ def job(
         words: arguments that are fields of the job under their own names.
         kind: of the job; the verb when None.
         more: further arguments, which `fields` read.
-        ended: turns the job's answer into the verb's.
+        ended: turns the job's answer into the verb's; as it is if None.
         fields: reads the value of a field.
     """
 
@@ -161,14 +162,12 @@ def telling_of_arm(arm: str, job: str) -> Iterator[None]:
         raise left_alone(gone, arm, job) from None
 
 
-def job_verb(
-    make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended = with_answer_lines
-) -> Verb:
+def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], ended: Ended | None = None) -> Verb:
     """Return a verb that runs as a job of the daemon.
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
-        ended: turns the job's answer into the verb's.
+        ended: turns the job's answer into the verb's; as it is if None.
     """
 
     def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -181,7 +180,7 @@ def job_verb(
         tell(arguments, f"job {made['id']}")
         with telling_of_arm(arguments.arm, made["id"]) if moves else nullcontext():
             answer = _wait_for_job(client, arguments, made, moves=moves)
-        return ended(client, arguments, answer)
+        return answer if ended is None else ended(client, arguments, answer)
 
     return verb
 
@@ -202,20 +201,6 @@ def _identify(client: IdentClient, arguments: argparse.Namespace) -> dict[str, A
         "feasible_set": arguments.feasible_set,
         "prior": arguments.prior,
     }
-
-
-def _identified(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """Return the answer with the text that the command prints at the daemon's machine, which its run has as a file."""
-    code, text, document = answer
-    run = document["job"]["run"]
-    if run is None or code not in (DONE, VERDICT_NO):
-        return with_answer_lines(client, arguments, answer)
-    files = f"/api/v1/runs/{word_of_address(str(run))}/files"
-    report = client.content(f"{files}/report.txt").decode("utf-8", "replace")
-    summary = report.rpartition(_TABLE)[0] or report
-    printed = "".join(letter for letter in summary if letter.isprintable() or letter == "\n")
-    names = "".join(f"  {name}\n" for name in document["answer"].get("files", ()))
-    return code, f"{text}\n{printed}\nfiles: {files}\n{names}", document
 
 
 def _seconds(_: IdentClient, arguments: argparse.Namespace) -> float | None:
@@ -253,10 +238,12 @@ def _until(arguments: argparse.Namespace) -> dict[str, Any] | None:
 def _home(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     if not arguments.zero:
         return {"arm": arguments.arm}
+    from ident_service.operations.recovery import JointPosture
+
     posture = client.get(f"/api/v1/arms/{word_of_address(arguments.arm)}/home")
     tell(arguments, f"{arguments.arm}: nothing will move. The arm's present posture will count as its home:")
     for joint in posture:
-        tell(arguments, f"  {joint['joint']} at {joint['position']:g} {joint['unit']}")
+        tell(arguments, f"  {JointPosture(**joint)}")
     return {"kind": "zero", "arm": arguments.arm}
 
 
@@ -269,18 +256,14 @@ def _stop(client: IdentClient, arguments: argparse.Namespace) -> Answer:
             f"{arm}: the daemon has no arm of this name, so nothing was stopped; `ident stop --server {client.url}` "
             "stops all"
         ) from None
-    parts = [f"stop requested of {', '.join(answer['arms'])}"] if answer["arms"] else []
-    parts += [f"cancelled: {', '.join(f'job {job}' for job in answer['jobs'])}"] if answer["jobs"] else []
-    names = "; ".join(parts)
-    nobody = "no arm is moving there" if arm is None else f"{arm} is not moving there"
-    return DONE, f"{names or nobody}\n", answer
+    return DONE, stop_text(arm, answer["arms"], answer["jobs"]), answer
 
 
 def _ask(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/{arguments.word}")
     if not answer["reached"]:  # the same exit code as for this verb on the daemon's machine
         raise UsageError(f"{arguments.arm}: not moving there")
-    return DONE, f"{arguments.arm}: {arguments.word} requested\n", answer
+    return DONE, asked_text(arguments.arm, arguments.word), answer
 
 
 def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -291,7 +274,7 @@ def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
             f"{name}: no process of the daemon's machine holds it; nothing has changed. If its drives hold it by "
             f"themselves, `ident supported {name}` there releases them"
         )
-    return DONE, f"{name}: support confirmed\n", answer
+    return DONE, asked_text(name, "supported"), answer
 
 
 def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -301,29 +284,25 @@ def _ack(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
 
 def _list(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    jobs = client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")
-    lines = [f"{job['id']:<44} {job['state']:<12} {job['arm'] or '':<16} by {job['created_by']}\n" for job in jobs]
-    return DONE, "".join(lines) or "no jobs yet\n", {"jobs": jobs}
+    return told(arguments, {"jobs": client.get(f"/api/v1/jobs?most={min(arguments.most, 500)}")})
 
 
 def _show(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return with_answer_lines(
-        client, arguments, job_answer(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE)
-    )
+    return _with_state(job_answer(client, client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}"), DONE))
 
 
 def _watch(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     job = client.get(f"/api/v1/jobs/{word_of_address(arguments.job)}")
-    return with_answer_lines(client, arguments, _wait_for_job(client, arguments, job, moves=False, ours=False))
+    return _with_state(_wait_for_job(client, arguments, job, moves=False, ours=False))
 
 
 def _cancel(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    return job_answer(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE)
+    return _with_state(job_answer(client, client.post(f"/api/v1/jobs/{word_of_address(arguments.job)}/cancel"), DONE))
 
 
 REMOTE: dict[str, RemoteVerb] = {
     "simulate": job("arm seed feasible_set", more="motion", motion=motion_of),
-    "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify, _identified)),
+    "identify": carrying("arm columns feasible_set method prior recordings validate", job_verb(_identify)),
     "design": job(
         "arm starts seed criterion motion",
         more="after chosen search_time",
@@ -406,6 +385,8 @@ def follow(
             continue
         looked, held = time.monotonic(), job["held"]
         job = client.get(f"/api/v1/jobs/{job['id']}")
+        if job["state"] not in LIVE:
+            break
         if job["held"] and not held:
             for fault in client.get(f"/api/v1/arms/{job['arm']}/faults"):
                 tell(arguments, f"fault: {fault['code']}: {fault['cause']}")
@@ -429,16 +410,39 @@ def renew(client: IdentClient, job: str) -> None:
 
 
 def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
-    """Return a job's state and its command's answer, with the exit code of that state unless one is given."""
-    result = client.get(f"/api/v1/jobs/{job['id']}/result")["answer"]
-    lines = [f"job {job['id']}: {job['kind']}, {job['state']}"]
-    lines += [job["detail"]] if job["detail"] else []
-    lines += [f"run {job['run']}"] if job["run"] else []
+    """Return what the command of a job printed, with the exit code of the job's state unless one is given.
+
+    The text begins with how the job ended where that is not in what the command printed. Commands that it names are for
+    the daemon, too.
+    """
+    result = client.get(f"/api/v1/jobs/{job['id']}/result")
+    answer, text = result["answer"], str(result.get("text", ""))
+    if not text or "error" in answer or job["state"] not in ("done", "refused"):
+        text = _state_lines(job) + text
+    text = "".join(letter for letter in text if letter.isprintable() or letter == "\n")
+    text = _COMMAND.sub(lambda found: f"`ident {found[1]}{_server(client, found[1])}`", text)
     if code is None:  # bad input has the code that it has at the machine
         code = USAGE if (job["state"], job["exit_code"]) == ("failed", USAGE) else _CODES.get(job["state"], FAILED)
         if job["state"] == "running":  # its end is known, and cannot be entered
             code = job["exit_code"] or FAILED
-    return code, "\n".join([*lines, ""]), {"job": job, "answer": result}
+    return code, text, {"job": job, "answer": answer}
+
+
+def _server(client: IdentClient, words: str) -> str:
+    verb, _, more = words.partition(" ")
+    return "" if {verb, f"{verb} {more.partition(' ')[0]}"} & set(LOCAL_ONLY) else f" --server {client.url}"
+
+
+def _state_lines(job: dict[str, Any]) -> str:
+    said = (job["detail"], job["run"] and f"run {job['run']}")
+    return "\n".join([f"job {job['id']}: {job['kind']}, {job['state']}", *filter(None, said), ""])
+
+
+def _with_state(answer: Answer) -> Answer:
+    """Return the answer of a verb about a job, which says how the job stands in any case."""
+    code, text, document = answer
+    head = _state_lines(document["job"])
+    return code, text if text.startswith(head.partition("\n")[0]) else head + text, document
 
 
 def typed_name(arguments: argparse.Namespace) -> str:

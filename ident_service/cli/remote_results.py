@@ -13,20 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from ident_service.cli.archive_commands import (
-    arm_line,
-    deleted_text,
-    deleted_with_anyway,
-    motions_text,
-    pruned_text,
-    runs_text,
-)
-from ident_service.cli.daemon_commands import token_line
-from ident_service.cli.identification_commands import accepted_name, fleet_lines
-from ident_service.cli.maintenance_commands import alarm_lines, due_line, dues_text, schedule_line, schedules_text
-from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
+from ident_service.cli.answer_texts import reidentified_text, told
+from ident_service.cli.archive_commands import deleted_with_anyway
+from ident_service.cli.identification_commands import OF_ARMS, accepted_name
+from ident_service.cli.output import DONE, FAILED, VERDICT_NO, Answer, StopOnSignal, tell
 from ident_service.cli.recovery_commands import EXIT_CODES
-from ident_service.cli.remote import RemoteVerb, carrying, confirmation, job, job_verb, motion_of, word_of_address
+from ident_service.cli.remote import (
+    RemoteVerb,
+    carrying,
+    confirmation,
+    job,
+    job_answer,
+    job_verb,
+    motion_of,
+    word_of_address,
+)
 from ident_service.cli.remote_recordings import recording
 from ident_service.errors import ArmError, UsageError
 
@@ -71,59 +72,53 @@ def _with_payload(client: IdentClient, arguments: argparse.Namespace) -> list[di
     return [recording(client, arguments, arm, path) for path in arguments.recordings]
 
 
-def _of_fleet(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """Tell what was found as at the daemon's machine, then download the page, the table and the document."""
-    code, text, document = answer
-    found = document["answer"]
-    if "arms" in found:
-        text += "\n".join([*fleet_lines(found), ""])
-    return _fetched_files(client, arguments, (code, text, document))
-
-
 def _fetched(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """Download the files of an export, where `--out` was given, after its answer's lines."""
-    return _fetched_files(client, arguments, with_answer_lines(client, arguments, answer))
-
-
-def _fetched_files(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """Download the files of an export into the folder `--out`, where it was given."""
     from ident_service.results.manifest import atomic_folder
 
     code, text, document = answer
-    if code not in (DONE, VERDICT_NO):
-        return code, text, document
-    if document["job"]["run"] is None:  # refused before anything was written
-        return code, text, document
+    if code not in (DONE, VERDICT_NO) or document["job"]["run"] is None:  # refused before anything was written
+        return answer
     export = word_of_address(str(document["job"]["run"]))
-    files = client.get(f"{_API}/exports/{export}")["files"]
+    document |= {"export": export}
     if arguments.out is None:
-        listed = "".join(f"  {name}\n" for name in files)
-        return code, f"{text}files of {export}, fetched with --out:\n{listed}", document | {"export": export}
+        return code, f"{text}--out DIR fetches these files\n", document
+    files = client.get(f"{_API}/exports/{export}")["files"]
     if strange := [name for name in files if not _PLAIN.fullmatch(name)]:
         raise ArmError(f"the daemon names a file {strange[0]!r}, which is no plain name; nothing was written")
     with atomic_folder(arguments.out) as folder:
         for name in files:
             (folder / name).write_bytes(client.content(f"{_API}/exports/{export}/files/{name}"))
-    listed = "".join(f"  {name}\n" for name in files)
-    return code, f"{text}files: {arguments.out}\n{listed}", document | {"export": export, "folder": str(arguments.out)}
+    return code, text.replace(f"exports/{export}", str(arguments.out)), document | {"folder": str(arguments.out)}
+
+
+def _fleet(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    code, text, document = _fetched(client, arguments, answer)
+    return code, text if arguments.out is None else text.replace(f"  {OF_ARMS}\n", ""), document
 
 
 def _corrected(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
     """Download the corrected parameters to the file that `--out` names."""
-    code, text, document = with_answer_lines(client, arguments, answer)
+    code, text, document = answer
     if code != DONE:
-        return code, text, document
+        return answer
     export = word_of_address(str(document["job"]["run"]))
     _write(arguments.out, client.content(f"{_API}/exports/{export}/files/parameters.json"))
-    return code, f"{text}file: {arguments.out}\n", document | {"export": export, "file": str(arguments.out)}
+    text = text.replace(f"exports/{export}/parameters.json", str(arguments.out))
+    return code, text, document | {"export": export, "file": str(arguments.out)}
 
 
 def _reported(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
+    """Download the page to the file `--out`, where it was given."""
     code, text, document = answer
-    page = f"{_API}/runs/{word_of_address(str(arguments.run))}/report.html"
-    if code != DONE or arguments.out is None:
-        return code, f"{text}page: {page}\n" if code == DONE else text, document
-    _write(arguments.out, client.content(page))
-    return code, f"{text}file: {arguments.out}\n", document | {"file": str(arguments.out)}
+    if code != DONE:
+        return answer
+    run = word_of_address(str(arguments.run))
+    page = f"{_API}/runs/{run}/report.html"
+    if arguments.out is not None:
+        _write(arguments.out, client.content(page))
+        document |= {"file": str(arguments.out)}
+    return code, text.replace(f"reports/{run}.html", str(arguments.out or f"{client.url}{page}")), document
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -135,42 +130,48 @@ def _write(path: Path, content: bytes) -> None:
         raise ArmError(f"{path}: not written: what the daemon sent for it is not text") from None
 
 
-def _accept(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+def _answered(words: str, values: Callable[[IdentClient, argparse.Namespace], dict[str, Any]]) -> RemoteVerb:
+    """Return a verb that prints what the daemon answers as if it had been done here.
+
+    Args:
+        words: names of the arguments that `values` sends.
+        values: asks the daemon.
+    """
+    return carrying(words, lambda client, arguments: told(arguments, values(client, arguments)))
+
+
+def _posted(words: str, path: str, also: str = "") -> RemoteVerb:
+    """Return a verb whose arguments are posted, by their names, in the address or else in the body.
+
+    Args:
+        words: names of the arguments.
+        path: after the API's, with names in braces.
+        also: further names, of values that the verb itself says.
+    """
+
+    def post(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
+        body = {name: getattr(arguments, name) for name in f"{words} {also}".split()}
+        place = {name: word_of_address(str(body.pop(name))) for name in tuple(body) if f"{{{name}}}" in path}
+        return dict(client.post(f"{_API}/{path.format(**place)}", body))
+
+    return _answered(words, post)
+
+
+def _accept(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     run = word_of_address(str(arguments.run))
     arm = word_of_address(client.get(f"{_API}/runs/{run}")["arm"])
-    act = client.post(f"{_API}/arms/{arm}/acceptances", {"run": run, "note": arguments.note})
-    return DONE, f"{act['arm']}: acceptance {act['number']} is the current one\n", act
+    return dict(client.post(f"{_API}/arms/{arm}/acceptances", {"run": run, "note": arguments.note}))
 
 
-def _rollback(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    body = {"note": arguments.note, "to": arguments.to}
-    act = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/rollback", body)
-    text = f"{act['arm']}: acceptance {act['number']} is the set of {act['origin']} ({act['run']})\n"
-    return DONE, text, act
-
-
-def _delete(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+def _delete(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     kind, name = arguments.kind, word_of_address(arguments.name)
     with deleted_with_anyway(kind, name):
-        done = client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else ""))
-    return DONE, deleted_text(done), done
+        return dict(client.delete(f"{_API}/{kind}s/{name}" + ("?anyway=true" if arguments.anyway else "")))
 
 
-def _prune(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    found = client.post(f"{_API}/recordings/prune", {"keep": arguments.keep, "yes": arguments.yes})
-    return DONE, pruned_text(found), found
-
-
-def _list(
-    path: Callable[[argparse.Namespace], str], text: Callable[[list[dict[str, Any]]], str]
-) -> Callable[[IdentClient, argparse.Namespace], Answer]:
+def _list(words: str, path: Callable[[argparse.Namespace], str]) -> RemoteVerb:
     """Return a verb that prints what the daemon lists at an address."""
-
-    def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-        rows = client.get(f"{_API}/{path(arguments)}")
-        return DONE, text(rows), {str(arguments.word): rows}
-
-    return verb
+    return _answered(words, lambda client, arguments: {arguments.word: client.get(f"{_API}/{path(arguments)}")})
 
 
 def _of_all(arguments: argparse.Namespace) -> str:
@@ -182,67 +183,29 @@ def _newest(arguments: argparse.Namespace) -> str:
     return f"{arguments.word}?most={min(arguments.most, 500)}{arm}"
 
 
-def _revoke(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    row = client.post(f"{_API}/tokens/{word_of_address(arguments.name)}/revoke")
-    return DONE, f"{arguments.name}: revoked\n", row
-
-
 def _of_arm(arguments: argparse.Namespace, path: str = "") -> str:
     return (path or arguments.word) + (f"?arm={quote(arguments.arm, safe='')}" if arguments.arm is not None else "")
 
 
-def _add_schedule(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    body = {name: getattr(arguments, name) for name in ("arm", "cron", "hours", "maintenance", "motion")}
-    row = client.post(f"{_API}/schedules", body)
-    return DONE, schedule_line(row), row
-
-
-def _remove_schedule(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+def _remove_schedule(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     client.ask("DELETE", f"{_API}/schedules/{arguments.number}")
-    return DONE, f"schedule {arguments.number}: removed\n", {"id": arguments.number, "removed": True}
+    return {"id": arguments.number, "removed": True}
 
 
-def _enabled(enabled: bool) -> Callable[[IdentClient, argparse.Namespace], Answer]:
-    def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-        row = client.post(f"{_API}/schedules/{arguments.number}/enabled", {"enabled": enabled})
-        return DONE, schedule_line(row), row
-
-    return verb
-
-
-def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+def _maintenance(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     body = {"what": arguments.what, "note": arguments.note}
     row = client.post(f"{_API}/arms/{word_of_address(arguments.arm)}/maintenance", body)
-    due = _pending(client, arguments)
-    text = f"{arguments.arm}: recorded: {row['what']}\n" + "".join(map(due_line, due))
-    return DONE, text, {**row, "due": due}
+    return {**row, "due": client.get(f"{_API}/{_of_arm(arguments, 'due')}")}
 
 
-def _due(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    rows = _pending(client, arguments)
-    return DONE, dues_text(rows), {"due": rows}
-
-
-def _pending(client: IdentClient, arguments: argparse.Namespace) -> list[dict[str, Any]]:
-    rows = client.get(f"{_API}/{_of_arm(arguments, 'due')}")
-    arms = {row["arm"] for row in rows}
-    accepted = {arm for arm in arms if client.get(f"{_API}/arms/{word_of_address(arm)}/acceptances")}
-    return [{**row, "accepted": row["arm"] in accepted} for row in rows]
-
-
-def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> Answer:
+def _dismiss(client: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     client.post(f"{_API}/due/{arguments.number}/dismiss", {"note": arguments.note})
-    return DONE, f"due {arguments.number}: dismissed\n", {"id": arguments.number, "dismissed": True}
+    return {"id": arguments.number, "dismissed": True}
 
 
 def _alarms(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     rows = client.get(f"{_API}/{_of_arm(arguments)}")
-    return VERDICT_NO if rows else DONE, alarm_lines(rows), {"alarms": rows}
-
-
-def _acknowledge_alarm(client: IdentClient, arguments: argparse.Namespace) -> Answer:
-    row = client.post(f"{_API}/alarms/{arguments.number}/ack", {"note": arguments.note})
-    return DONE, f"alarm {row['id']} of {row['arm']}: acknowledged\n", row
+    return told(arguments, {"alarms": rows}, VERDICT_NO if rows else DONE)
 
 
 def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -267,6 +230,9 @@ def _reidentify(client: IdentClient, arguments: argparse.Namespace) -> Answer:
                 client.post(f"{path}/lease")
             time.sleep(_LOOK)
             row = client.get(path)
+    if row["state"] in ("unchanged", "changed", "impossible"):
+        comparison = job_answer(client, client.get(f"{_API}/jobs/{row['job']}"))[1]
+        return EXIT_CODES[row["state"]], reidentified_text(comparison, row["state"], row["detail"]), row
     text = f"{row['arm']}: {row['detail'] or row['state']}\n" + (f"run {row['run']}\n" if row["run"] else "")
     return EXIT_CODES.get(row["state"], FAILED), text, row
 
@@ -282,7 +248,7 @@ VERBS: dict[str, RemoteVerb] = {
         more="out patterns settle_again",
         arms=lambda _, arguments: arguments.patterns,
         settle_again=lambda _, arguments: arguments.settle_again or None,
-        ended=_of_fleet,
+        ended=_fleet,
     ),
     "figures": job("format", more="out run", run=_run, ended=_fetched),
     "payload": job("refit_offsets", more="out recordings run", run=_run, recordings=_with_payload, ended=_fetched),
@@ -290,24 +256,22 @@ VERBS: dict[str, RemoteVerb] = {
     "verify": job("arm", more="file", run=_run_of_file),
     "feasible": job("arm feasible_set", more="file", run=_run_of_file),
     "project": job("arm feasible_set metric", "correct", more="file out", run=_run_of_file, ended=_corrected),
-    "accept": carrying("note run", _accept),
-    "rollback": carrying("arm note to", _rollback),
-    "prune": carrying("keep yes", _prune),
-    **dict.fromkeys(_DELETES, carrying("anyway name", _delete)),
-    "arms": carrying("", _list(_of_all, lambda rows: "".join(map(arm_line, rows)))),
-    "runs": carrying("arm most", _list(_newest, runs_text)),
-    "motions": carrying("arm most", _list(_newest, motions_text)),
-    "tokens": carrying("", _list(_of_all, lambda rows: "".join(map(token_line, rows)))),
-    "tokens revoke": carrying("name", _revoke),
-    "schedules add": carrying("arm cron hours maintenance motion", _add_schedule),
-    "schedules": carrying("arm", _list(_of_arm, schedules_text)),
-    "schedules remove": carrying("number", _remove_schedule),
-    "schedules enable": carrying("number", _enabled(True)),
-    "schedules disable": carrying("number", _enabled(False)),
-    "maintenance": carrying("arm note what", _maintenance),
-    "due": carrying("arm", _due),
-    "due dismiss": carrying("note number", _dismiss),
+    "accept": _answered("note run", _accept),
+    "rollback": _posted("arm note to", "arms/{arm}/rollback"),
+    "prune": _posted("keep yes", "recordings/prune"),
+    **dict.fromkeys(_DELETES, _answered("anyway name", _delete)),
+    **dict.fromkeys(("arms", "tokens"), _list("", _of_all)),
+    **dict.fromkeys(("runs", "motions"), _list("arm most", _newest)),
+    "tokens revoke": _posted("name", "tokens/{name}/revoke"),
+    "schedules add": _posted("arm cron hours maintenance motion", "schedules"),
+    **dict.fromkeys(("schedules", "due"), _list("arm", _of_arm)),
+    "schedules remove": _answered("number", _remove_schedule),
+    **dict.fromkeys(
+        ("schedules enable", "schedules disable"), _posted("number", "schedules/{number}/enabled", also="enabled")
+    ),
+    "maintenance": _answered("arm note what", _maintenance),
+    "due dismiss": _answered("note number", _dismiss),
     "alarms": carrying("arm", _alarms),
-    "alarms acknowledge": carrying("note number", _acknowledge_alarm),
+    "alarms acknowledge": _posted("note number", "alarms/{number}/ack"),
     "reidentify": carrying("arm confirm motion", _reidentify),
 }

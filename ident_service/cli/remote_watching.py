@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ident_service.cli.motion_commands import SLOW, HeldKey, require_held, require_no_target, require_terminal
-from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell, with_answer_lines
+from ident_service.cli.output import DONE, VERDICT_NO, Answer, StopOnSignal, tell
 from ident_service.cli.remote import (
     RemoteVerb,
     carrying,
@@ -43,12 +43,6 @@ _MOST_FILE = 8 * 2**20  # bytes of all files that a daemon takes
 
 def _recover(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
     return {"arm": arguments.arm, "kind": "leave_limit" if arguments.leave_limit else None}
-
-
-def _recovery_answer(client: IdentClient, arguments: argparse.Namespace, answer: Answer) -> Answer:
-    """The commands of the next steps are for the daemon, too."""
-    code, text, document = with_answer_lines(client, arguments, answer)
-    return code, re.sub(r"`(ident [^`]+)`", rf"`\1 --server {client.url}`", text), document
 
 
 def _known(_: IdentClient, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -95,7 +89,7 @@ def _config_check(client: IdentClient, arguments: argparse.Namespace) -> Answer:
 
     path = Path(arguments.file)
     if not path.is_file():
-        return job_verb(_known, with_answer_lines)(client, arguments)
+        return job_verb(_known)(client, arguments)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -139,7 +133,7 @@ def _hold_to_run(client: IdentClient, arguments: argparse.Namespace, terminal: i
 
 VERBS: dict[str, RemoteVerb] = {
     "watch": job("arm seconds"),
-    "recover": carrying("arm confirm leave_limit", job_verb(_recover, _recovery_answer)),
+    "recover": carrying("arm confirm leave_limit", job_verb(_recover)),
     "base-parameters": job("arm", "base"),
     "preview": job("arm", more="motion", motion=motion_of),
     "bus load": job("arm rate", "bus_load"),

@@ -195,7 +195,8 @@ class Connection:
         hint = "; SSL_CERT_FILE=FILE.pem names the authority that signed the daemon's certificate" if unknown else ""
         if isinstance(error, httpx.ConnectError) and "refused" in str(error):
             hint = "; nobody listens there: the daemon (`ident serve`) has ended, or listens elsewhere"
-        return errors.ArmError(f"{self.url}: cannot be reached: {error or type(error).__name__}{hint}")
+        said = str(error).rstrip(".") or type(error).__name__  # sentences go on after it
+        return errors.ArmError(f"{self.url}: cannot be reached: {said}{hint}")
 
     def _document(self, status: int, content: bytes) -> Any:
         try:

@@ -169,10 +169,11 @@ class JobAnswer(BaseModel):
 
 
 class JobResult(BaseModel):
-    """Answer of a job's command: its one JSON object, empty before there is one."""
+    """Answer of a job's command: its one JSON object, empty before there is one, and its text for a person."""
 
     job: str
     answer: dict[str, Any]
+    text: str = ""
 
 
 class LeaseAnswer(BaseModel):

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ident_service.errors import ParameterError, UsageError
+from ident_service.errors import MustNotBeUsed, ParameterError, UsageError
 from ident_service.operations.drift_alarms import end_alarms
 from ident_service.registry.database import LONGEST_NOTE, Database
 from ident_service.registry.database import note as audit
@@ -71,16 +71,19 @@ def accept(db: Database, state: Path, folder: Path, note: str, who: str, *, arm:
 
     Raises:
         UsageError: no note, no name, nothing was identified in the folder, or it is about another arm.
-        ParameterError: the folder is not what its manifest names, or no body can have its parameters.
+        MustNotBeUsed: no body can have its parameters, or its file says that they must not be used.
+        ParameterError: the folder is not what its manifest names.
     """
+    from ident_service.results.assessment import forbidden_because
     from ident_service.results.run_folder import read_results
 
     note, who = _noted(note), _named(who)
     results = read_results(folder)
     if results.parameters.content.get("feasibility", {}).get("feasible") is not True:
-        raise ParameterError(f"{folder}: these parameters are not feasible; accept a feasible set")
-    if unusable := results.parameters.content.get("unusable"):
-        raise ParameterError(f"{folder}: must not be used: {'; '.join(unusable)}; identify again and accept that")
+        raise MustNotBeUsed(f"{folder}: these parameters are not feasible; accept a feasible set")
+    if forbidden := forbidden_because(results.parameters.content):
+        reasons = "; ".join(reason.rstrip(".") for reason in forbidden)
+        raise MustNotBeUsed(f"{folder}: must not be used: {reasons}; identify again and accept that")
     if arm not in (None, results.config.name):
         raise UsageError(f"{folder.name} is about the arm {results.config.name}, not {arm}")
     arm = results.config.name

@@ -39,13 +39,13 @@ class PlannedDrive:
     """Hold what configuring one drive would write.
 
     Attributes:
-        number: of the drive, from 1.
+        drive: its number, from 1.
         node: its node number.
         changes: in the order in which they would be written.
         refused: why the drive would be refused, then or before; empty where it would not.
     """
 
-    number: int
+    drive: int
     node: int
     changes: tuple[Change, ...]
     refused: str
@@ -159,7 +159,7 @@ class ImportedDrive:
     """Hold what importing a DCF has changed, or would change, in one drive.
 
     Attributes:
-        number: of the drive, from 1.
+        drive: its number, from 1.
         node: its node number.
         file: name of the DCF.
         changes: that were written, or would be.
@@ -167,7 +167,7 @@ class ImportedDrive:
         left: how many are left to opening, which sets them.
     """
 
-    number: int
+    drive: int
     node: int
     file: str
     changes: tuple[Change, ...]
@@ -324,36 +324,17 @@ def imported_text(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: boo
     """Format an import as text, with a last line break."""
     lines = [f"{config.name}: {'what importing would change; nothing was written' if dry else 'imported'}"]
     for one in found:
-        lines += ["", f"drive {one.number}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
+        lines += ["", f"drive {one.drive}, node {one.node}, by {one.file}: {len(one.changes)} entries changed"]
         lines += [*_change_lines(one.changes)]
         lines.append(f"  {one.same} had their value already; {one.left} are set whenever the arm is opened")
     return "\n".join(lines) + "\n"
-
-
-def imported_document(config: ArmConfig, found: Sequence[ImportedDrive], *, dry: bool) -> dict[str, Any]:
-    """Return an import as JSON values."""
-    return {
-        "arm": config.name,
-        "written": not dry,
-        "drives": [
-            {
-                "drive": one.number,
-                "node": one.node,
-                "file": one.file,
-                "changes": list(map(_document, one.changes)),
-                "same": one.same,
-                "left": one.left,
-            }
-            for one in found
-        ],
-    }
 
 
 def planned_text(config: ArmConfig, planned: Sequence[PlannedDrive], what: str = "opening") -> str:
     """Format a dry run of something, in words, as text, with a last line break."""
     lines = [f"{config.name}: what {what} would write; nothing was written, and nothing moved"]
     for one in planned:
-        lines += ["", f"drive {one.number}, node {one.node}: {_count(one)}", *_change_lines(one.changes)]
+        lines += ["", f"drive {one.drive}, node {one.node}: {_count(one)}", *_change_lines(one.changes)]
         lines += [f"  {'REFUSED':<16}{one.refused}"] if one.refused else []
     return "\n".join(lines) + "\n"
 
@@ -376,21 +357,12 @@ def _hex(change: Change, value: int) -> str:
     return f"{value & (1 << 8 * size) - 1:0{2 * size}X}h"
 
 
-def planned_document(config: ArmConfig, planned: Sequence[PlannedDrive]) -> dict[str, Any]:
-    """Return a dry run as JSON values."""
-    return {
-        "arm": config.name,
-        "written": False,
-        "drives": [
-            {
-                "drive": one.number,
-                "node": one.node,
-                "refused": one.refused,
-                "changes": list(map(_document, one.changes)),
-            }
-            for one in planned
-        ],
-    }
+def drives_document(
+    config: ArmConfig, drives: Sequence[PlannedDrive | ImportedDrive], *, written: bool = False
+) -> dict[str, Any]:
+    """Return a dry run or an import as JSON values."""
+    shown = [vars(one) | {"changes": list(map(_document, one.changes))} for one in drives]
+    return {"arm": config.name, "written": written, "drives": shown}
 
 
 def _document(change: Change) -> dict[str, Any]:

@@ -48,8 +48,8 @@ from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
 from ident_service.motion.arm_factory import make_arm
 from ident_service.operations.drive_configuration import (
+    drives_document,
     planned_configuration,
-    planned_document,
     planned_text,
     require_drives,
 )
@@ -775,7 +775,7 @@ def _read(
             one.close()
     try:
         planned = planned_configuration(config, open_bus)
-        yield "configuration", planned_text(config, planned), planned_document(config, planned)
+        yield "configuration", planned_text(config, planned), drives_document(config, planned)
     except DriverError as error:
         yield "configuration", f"nothing was read: {error}\n", None
 

@@ -13,11 +13,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 from cronsim import CronSim, CronSimError
 
 from ident_service.errors import UnknownId, UsageError
+from ident_service.operations.acceptance import acceptances
 from ident_service.registry.database import LONGEST_NOTE, Database, Row, note
 from ident_service.registry.motions import known_motion
 from ident_service.registry.runs import operating_seconds
@@ -260,6 +262,11 @@ def _falls_due(db: Database, row: Row, cause: str, now: float, *, late: bool = F
 def pending(db: Database, arm: str | None = None) -> list[Row]:
     """Return what is due and has not been done, the earliest first."""
     return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (? IS NULL OR arm = ?) ORDER BY id", arm, arm)
+
+
+def comparable_dues(db: Database, state: Path, arm: str | None = None) -> list[dict[str, Any]]:
+    """Return what is due, each with whether its arm has an accepted set to compare with."""
+    return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in pending(db, arm)]
 
 
 def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:

@@ -47,7 +47,7 @@ class Recovery:
     Attributes:
         arm: name.
         faults: that nobody has acknowledged, the earliest first.
-        controlling_pid: process that moves the arm, or None.
+        moved_by: process that moves the arm, or None.
         seen: at the arm, after a reset if there was one; None where it could not be looked at.
         unreachable: why not, or empty.
         zero_lost: why the arm does not know where it stands, or empty; nothing else is then seen of it.
@@ -60,7 +60,7 @@ class Recovery:
 
     arm: str
     faults: tuple[StoredFault, ...]
-    controlling_pid: int | None
+    moved_by: int | None
     seen: Watched | None
     unreachable: str
     zero_lost: str

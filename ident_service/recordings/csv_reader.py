@@ -94,8 +94,10 @@ def parse_header(path: Path, header: str, columns: Mapping[str, Column] | None =
     if columns is None:
         place = {name: index for index, name in enumerate(names)}
     else:
-        problems += [f"no column {one.column!r} for {ours}" for ours, one in columns.items() if one.column not in names]
         place = {ours: names.index(one.column) for ours, one in columns.items() if one.column in names}
+        if absent := [f"{one.column!r} for {ours}" for ours, one in columns.items() if ours not in place]:
+            problems += [f"no {_listed('column', absent, 3)}", "the description or --columns names them so"]
+            raise RecordingError(path, f"line 1: {'; '.join(problems)}; {_what_then(names, columns)}")
     numbers: dict[str, set[int]] = {"q": set(), "dq": set(), "tau": set()}
     for name in place:
         if match := _NAME.fullmatch(name):

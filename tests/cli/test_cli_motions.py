@@ -46,6 +46,11 @@ def read(path: Path) -> dict[str, Any]:
     return content
 
 
+def test_a_search_tells_how_far_it_is_in_words(ident: Ident, designed: DesignedBefore, tmp_path: Path) -> None:
+    ended = ident("design", designed.arm, *QUICK, "--out", tmp_path / "motion")
+    assert re.match(r"searching: 0 starts complete, \d+ s(, about \d+ s left)?\n", ended.out)
+
+
 def test_design_keeps_motion_search_preview_and_drawings(designed: DesignedBefore) -> None:
     assert sorted(path.name for path in designed.folder.iterdir()) == FILES
     motion = read(designed.folder / "motion.json")

@@ -11,7 +11,7 @@ import pytest
 
 from ident_service.config.load import arm_from_json
 from ident_service.daemon.jobs.commands import accepted_description
-from ident_service.errors import ParameterError, UnknownId, UsageError
+from ident_service.errors import MustNotBeUsed, ParameterError, UnknownId, UsageError
 from ident_service.operations.acceptance import accept, acceptances, rollback, synchronise
 from ident_service.operations.run_archive import import_run, prunable_recordings, prune
 from ident_service.registry import jobs as rows
@@ -91,7 +91,7 @@ def test_what_is_not_whole_or_not_feasible_is_not_accepted(db: Database, state: 
     document["feasibility"]["feasible"] = False
     (folder / "parameters.json").write_text(json.dumps(document))
     write_manifest(folder)
-    with pytest.raises(ParameterError, match="are not feasible"):
+    with pytest.raises(MustNotBeUsed, match="are not feasible"):
         accept(db, state, folder, "good", "me")
     for note in ("", " \n", "x" * 2001):
         with pytest.raises(UsageError, match="note"):

@@ -17,7 +17,7 @@ from daemon.verbs_bench import unstable_text
 
 from ident_service import errors
 from ident_service.cli import main
-from ident_service.client import IdentClient
+from ident_service.client import IdentClient, left_alone
 from ident_service.client.connection import error_of
 from ident_service.errors import (
     AccessRefused,
@@ -223,6 +223,27 @@ def test_a_daemon_that_ends_says_what_becomes_of_the_motion(tmp_path: Path) -> N
             process.send_signal(signal.SIGTERM)
             process.wait(60)
     assert not in_use(control_path(state, "quick"))
+
+
+def test_a_line_that_breaks_is_told_in_whole_sentences() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def hang_up() -> None:
+            while True:
+                try:
+                    listening.accept()[0].close()
+                except OSError:
+                    return
+
+        threading.Thread(target=hang_up, daemon=True).start()
+        with IdentClient(f"http://127.0.0.1:{listening.getsockname()[1]}", "x") as client:
+            with pytest.raises(ArmError) as caught:
+                client.get("/api/v1/arms")
+            said = str(left_alone(caught.value, "quick", "j1"))
+        listening.shutdown(socket.SHUT_RDWR)
+    assert ": cannot be reached: " in said
+    assert ". quick stops by itself: " in said
+    assert ".." not in said
 
 
 def test_every_kind_that_the_api_tells_is_an_error_of_the_tree() -> None:

@@ -24,7 +24,6 @@ from daemon.verbs_bench import ON_A_BUS, on_a_bus, singular_copy, unstable_text
 
 from ident_service.cli import main, parser
 from ident_service.cli.arguments import LOCAL_ONLY, Parser
-from ident_service.cli.output import lines_of
 from ident_service.cli.remote import follow, table
 from ident_service.cli.remote_watching import named_files
 from ident_service.client import IdentClient
@@ -123,23 +122,6 @@ def test_no_run_is_a_path(path: str, state: Path, capsys: pytest.CaptureFixture[
         assert "named by id" in capsys.readouterr().err
 
 
-def test_answers_are_reported_in_words() -> None:
-    said = {"arm": "a", "fits": True, "load": 0.25, "none": None, "names": ["x", "y"], "lines": [{"node": 1}], "no": []}
-    assert list(lines_of(said)) == [
-        "arm: a",
-        "fits: yes",
-        "load: 0.25",
-        "none: none",
-        "names: x, y",
-        "lines:",
-        "  1:",
-        "    node: 1",
-        "no: none",
-    ]
-    steps = ["Support the arm.", "`ident acknowledge a x`, when you know the cause."]
-    assert list(lines_of({"steps": steps})) == ["steps:", *(f"  {step}" for step in steps)]
-
-
 def test_a_stop_tells_arms_and_jobs_apart() -> None:
     class Answering(IdentClient):
         def __init__(self, arms: list[str], jobs: list[str]) -> None:
@@ -153,7 +135,7 @@ def test_a_stop_tells_arms_and_jobs_apart() -> None:
 
     assert said(["a", "b"], ["j1"]) == "stop requested of a, b; cancelled: job j1\n"
     assert said([], ["j1", "j2"]) == "cancelled: job j1, job j2\n"
-    assert said([], []) == "no arm is moving there\n"
+    assert said([], []) == "no arm is moving; motions requested before now will not begin\n"
 
 
 def test_a_stop_of_a_name_that_is_no_arm_is_an_error() -> None:
@@ -296,9 +278,6 @@ def test_verbs_are_done_by_a_daemon(
         assert done("prune", "--keep", 1)["deleted"] is False
         assert [row["name"] for row in done("token", "list")["tokens"]] == ["owner"]
         done("token", "revoke", "none", code=2)
-        assert main(["base", "quick", *server]) == 0
-        said = capsys.readouterr().out
-        assert "base_parameters:\n  expressions: " in said
 
         # Ctrl-C in the moment in which a job ends: there is nothing left to cancel, and that is no error.
         ended = client.get("/api/v1/jobs?most=1")[0]
@@ -390,6 +369,8 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         assert job.detail.startswith("stability: ")
         assert main(["jobs", "show", job.id, *server]) == 0
         assert "FAILED     gains are stable" in capsys.readouterr().out
+        assert main(["config", "check", "quick", *server]) == 0
+        assert "\nnext: ident preflight quick --state " in capsys.readouterr().out
         # The commands that are named can be given as they stand.
         fault_file(state, "quick").latch("late_cycle", "a cycle came late")
         assert main(["recover", "quick", *server]) == 3
@@ -404,6 +385,20 @@ def test_a_person_elsewhere_reads_what_one_at_the_machine_does(
         assert main([*next(one for one in commands if one[0] == "acknowledge"), "--state", str(state)]) == 0
         assert main(["recover", "quick", *server]) == 0
         assert client.answer(next(client.jobs()).id)["steps"] == ["`ident preflight quick` for the next motion."]
+
+
+@pytest.mark.slow
+def test_a_fault_elsewhere_is_told_with_what_it_left(state: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = quick_text("faulty", 16).replace("driver:\n", "driver:\n  faults: [{kind: nan_position, at: 25}]\n", 1)
+    checked_before(state, text)
+    with daemon_thread(state) as client:
+        client.add_arm(text)
+        assert main(["run", "faulty", "--confirm", "faulty", "--server", client.url, "--state", str(state)]) == 4
+        told, job = capsys.readouterr().out.partition("\nnext: ")[0], next(client.jobs())
+        left = client.answer(job.id)["files"]
+    ended = f"job {job.id}: run, faulted\n{job.detail}\nrun {job.run}\n"
+    files = "".join(f"\n  {name}" for name in left)
+    assert told.endswith(f"{ended}recording until the fault: runs/{job.run}/run.mcap\nfiles: runs/{job.run}{files}")
 
 
 @pytest.mark.slow

@@ -14,8 +14,8 @@ from ident_service.config.arm import ArmConfig
 from ident_service.errors import DriverError
 from ident_service.operations.drive_configuration import (
     PlannedDrive,
+    drives_document,
     planned_configuration,
-    planned_document,
     planned_text,
     planned_zero,
 )
@@ -64,7 +64,7 @@ def test_every_change_is_reported_with_both_values() -> None:
     text = planned_text(config, found)
     assert text.startswith("weightless: what opening would write; nothing was written, and nothing moved\n")
     assert "6060h           1 (01h) -> 10 (0Ah)  mode of operation" in text
-    document = planned_document(config, found)
+    document = drives_document(config, found)
     assert {"entry": "6060h", "name": "mode of operation", "before": 1, "after": 10} in document["drives"][0]["changes"]
     (limit,) = [change for change in found[0].changes if change.entry.index == 0x3001]
     assert isinstance(limit, Change)

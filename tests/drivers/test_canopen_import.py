@@ -13,8 +13,8 @@ from drivers.canopen import object_dictionary as od
 from ident_service.config.quantities import TextFile
 from ident_service.errors import DriverError, UsageError
 from ident_service.operations.drive_configuration import (
+    drives_document,
     import_configuration,
-    imported_document,
     imported_text,
     store_or_restore,
 )
@@ -55,7 +55,7 @@ def test_what_differs_is_written_and_listed_and_what_is_ours_is_left() -> None:
     assert f"3001h:01        {before[0]} " in text
     assert "-> 4000 " in text
     assert "0 had their value already; 2 are set whenever the arm is opened" in text
-    assert imported_document(config, done, dry=True)["drives"][0]["changes"][0]["after"] == 4000
+    assert drives_document(config, done)["drives"][0]["changes"][0]["after"] == 4000
     (again, _) = import_configuration(config, files, dry=False, open_bus=bench.links)  # type: ignore[arg-type]
     assert (again.changes, again.same) == ((), 2)
     assert bench.downloads() == []

@@ -207,6 +207,15 @@ def test_what_must_not_be_used_is_not_exported(
     assert not (tmp_path / "out").exists()
 
 
+def test_what_must_not_be_used_is_not_accepted(
+    forbidden: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, why = forbidden
+    assert code_of("accept", folder, "--note", "good", "--state", tmp_path) == 3
+    assert f"must not be used: {why.rstrip('.')}; identify again and accept that\n" in capsys.readouterr().err
+    assert not (tmp_path / "arms" / "planar2" / "current").exists()
+
+
 def test_what_is_exported_anyway_is_marked_in_every_file(
     forbidden: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,6 +20,7 @@ from fastapi.routing import APIRoute
 
 from ident_service.cli import main
 from ident_service.daemon.app import PAGES
+from ident_service.daemon.jobs.requests import Base
 from ident_service.daemon.maintenance.reidentification import enter_concluded
 from ident_service.daemon.web.render import STATIC, mark, static
 from ident_service.operations.drift_alarms import Verdict, alarms
@@ -255,6 +256,16 @@ def test_a_motion_needs_the_typed_name_and_a_fresh_page(daemon: Asked) -> None:
     enter(daemon, "viewer")
     assert "data-lease" not in daemon.get(where).text
     daemon.post("/stop", content="", headers=FORM)
+
+
+def test_the_page_of_a_job_shows_what_a_terminal_would(daemon: Asked) -> None:
+    enter(daemon, "viewer")
+    job = daemon.service.engine.create(Base(kind="base", arm="planar2"), "test")["id"]
+    daemon.follow(job)
+    page = daemon.get(f"/jobs/{job}").text
+    assert re.search(r'<pre class="answer"[^>]*>1  Lzz1 - 0.25\*\(m1 \+ m2\) \+ Ia1\n', page)
+    assert "13 base parameters of 28 link parameters</pre>" in page
+    assert complaints(page) == []
 
 
 def test_a_run_is_requested_with_a_target(daemon: Asked) -> None:

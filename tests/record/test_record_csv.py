@@ -198,6 +198,17 @@ def test_a_wrong_column_map_shows_the_columns_that_there_are(tmp_path: Path) -> 
         open_recording(path, ["a"], fmt=RecordingFormat(columns=columns))
 
 
+def test_a_column_map_of_another_arm_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    path = write(tmp_path / "run.csv", "t,q1,tau1\n0,1,2\n")
+    columns = {"t": "t_s"} | {f"{kind}{joint}": f"{kind}_{joint}" for kind in ("q", "tau") for joint in range(1, 7)}
+    with pytest.raises(RecordingError) as caught:
+        open_recording(path, [f"j{joint}" for joint in range(1, 7)], fmt=RecordingFormat(columns=columns))
+    assert str(caught.value) == (
+        f"{path}: line 1: no columns 't_s' for t, 'q_1' for q1, 'q_2' for q2 and 10 more; the description or --columns "
+        "names them so; the file has the columns t, q1, tau1"
+    )
+
+
 def test_other_headers_by_column_map(tmp_path: Path) -> None:
     path = write(tmp_path / "run.csv", "stamp,current,angle,torque\n0.5,9,1,2\n0.6,9,3,4\n")
     columns = {"t": "stamp", "q1": "angle", "tau1": "torque"}

@@ -303,7 +303,7 @@ def test_an_arm_without_brakes_is_held_until_a_person_confirms(
     assert main(["supported", loose[1], *state]) == 2  # nobody moves it, and its drives do not hold it
     assert main(loose) == 1
     assert said[-3:] == ["stopped", WAITS, LOWERS]
-    assert "support confirmed to process" in capsys.readouterr().out
+    assert "planar2: support confirmed\n" in capsys.readouterr().out
     assert fault_file(tmp_path / "state", "planar2").latched() == {}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -55,6 +55,12 @@ _VERBS: Final = {
     "config_check": ("config", "check"),
     "fleet": ("fleet", "identify"),
 }
+_OPTIONS: Final = frozenset(  # fields of requests that the command has as options of the same names
+    (
+        *("seconds", "starts", "seed", "criterion", "home", "speed", "rate", "method", "feasible_set", "prior"),
+        *("metric", "format", "refit_offsets", "settle_again"),
+    )
+)
 FOLDERS: Final = {"design": MOTIONS, **dict.fromkeys(DOWNLOADABLE_KINDS, EXPORTS)}
 
 
@@ -131,35 +137,31 @@ def accepted_description(state: Path, arm: str, number: int) -> Path:
 def _words(db: Database, state: Path, request: asked.AnyJobRequest, arm: KnownArm) -> list[str]:
     path = str(arm.path)
     if isinstance(request, asked.Design):
-        return [path, *_design(db, state, request)]
+        if request.seconds is None and request.starts is None:
+            raise UsageError("a search ends: give seconds, or starts, or both")
+        after = [f"--after={one}" for one in _as_described(db, state, request.after)]
+        return [path, *after, *_options(request, seconds="search_time", parameters="parameter", motion="motion")]
     if isinstance(request, asked.Identify):
         recordings = _recordings(db, state, request.recordings)
         judged = [f"--validate={one}" for one in _recordings(db, state, request.validate_on)]
         judged += _columns(db, state, (*request.recordings, *request.validate_on))
-        chosen = {"method": request.method, "feasible-set": request.feasible_set, "prior": request.prior}
         if request.as_accepted is not None:
             path = str(accepted_description(state, arm.name, request.as_accepted))
-        return [*recordings, "--arm", path, *judged, *_given_options(chosen)]
-    if isinstance(request, asked.Simulate):
-        motion = [] if request.motion is None else [f"--motion={motion_path(db, state, request.motion)}"]
-        return [path, *motion, *_given_options({"seed": request.seed, "feasible-set": request.feasible_set})]
+        return [*recordings, "--arm", path, *judged, *_options(request)]
     if isinstance(request, asked.Fleet):
-        return _fleet(db, state, request, path)
-    if isinstance(request, asked.BusLoad):
-        return [path, *_given_options({"rate": request.rate})]
-    if isinstance(request, asked.Zero):
-        return [path, "--zero", "--confirm", arm.name]
-    if isinstance(request, asked.LeaveLimit):
-        return [path, "--leave-limit"]
-    if isinstance(request, asked.Watch):
-        return [path, f"--seconds={request.seconds!r}", "--tell-samples"]
-    if isinstance(request, asked.Check | asked.Run | asked.Rehearse | asked.Preview):
-        motion = [] if request.motion is None else [str(motion_path(db, state, request.motion))]
-        if isinstance(request, asked.Check):
-            return [path, *motion, *(["--home"] if request.home else []), "--confirm", arm.name]
-        speed = [] if isinstance(request, asked.Preview) else [f"--speed={request.speed!r}"]
-        return [path, *motion, *speed, *(_until(request) if isinstance(request, asked.Run) else [])]
-    return [path]
+        return [*_fleet(db, state, request, path), *_options(request)]
+    motion = getattr(request, "motion", None)
+    moved = [] if motion is None else [str(motion_path(db, state, motion))]
+    if isinstance(request, asked.Simulate):
+        moved = [f"--motion={one}" for one in moved]
+    own = {
+        "check": ["--confirm", arm.name],
+        "zero": ["--zero", "--confirm", arm.name],
+        "leave_limit": ["--leave-limit"],
+        "watch": ["--tell-samples"],
+    }
+    until = _until(request) if isinstance(request, asked.Run) else []
+    return [path, *moved, *_options(request), *own.get(request.kind, []), *until]
 
 
 def _fleet(db: Database, state: Path, request: asked.Fleet, described: str) -> list[str]:
@@ -178,8 +180,7 @@ def _fleet(db: Database, state: Path, request: asked.Fleet, described: str) -> l
             "fleet identify --names` at the daemon's machine"
         )
     files = [str(run_file(db, state, row["run"], row["name"])) for row in found]
-    again = ["--settle-again"] if request.settle_again else []
-    return [*files, f"--arm={described}", f"--names={_OF_RUN}", f"--store={state / 'fleet' / 'store'}", *again]
+    return [*files, f"--arm={described}", f"--names={_OF_RUN}", f"--store={state / 'fleet' / 'store'}"]
 
 
 def _until(request: asked.Run) -> list[str]:
@@ -188,46 +189,26 @@ def _until(request: asked.Run) -> list[str]:
     return [f"--until={request.until.share!r}", *(f"--parameter={one}" for one in request.until.parameters)]
 
 
-def _design(db: Database, state: Path, request: asked.Design) -> list[str]:
-    if request.seconds is None and request.starts is None:
-        raise UsageError("a search ends: give seconds, or starts, or both")
-    after = [f"--after={path}" for path in _as_described(db, state, request.after)]
-    chosen = {
-        "search-time": request.seconds,
-        "starts": request.starts,
-        "seed": request.seed,
-        "criterion": request.criterion,
-    }
-    parameters = [f"--parameter={expression}" for expression in request.parameters]
-    return [*after, *parameters, *_given_options({**chosen, "motion": request.motion})]
-
-
 def _about_a_run(db: Database, state: Path, request: _OfARun) -> Command:
     folder, arm = run_folder(db, state, request.run), str(known_run(db, request.run)["arm"])
     made = new_id(arm) if request.kind in DOWNLOADABLE_KINDS else None
     place = state / (REPORTS if isinstance(request, asked.Report) else EXPORTS)
-    if isinstance(request, asked.Verify):
-        described = None if request.arm is None else str(known_arm(db, state, request.arm).path)
-        words = ["verify", str(run_file(db, state, request.run, PARAMETERS)), *_given_options({"arm": described})]
+    more = list[str]()
+    if isinstance(request, asked.Verify | asked.Feasible | asked.Correct):
+        folder = run_file(db, state, request.run, PARAMETERS)
+        more = [] if request.arm is None else [f"--arm={known_arm(db, state, request.arm).path}"]
     elif isinstance(request, asked.Compare):
-        words = ["compare", str(folder), str(run_folder(db, state, request.other))]
-    elif isinstance(request, asked.Feasible | asked.Correct):
-        conditions = None if request.arm is None else str(known_arm(db, state, request.arm).path)
-        words = [request.kind, str(run_file(db, state, request.run, PARAMETERS))]
-        words += _given_options({"feasible-set": request.feasible_set, "arm": conditions})
-        if isinstance(request, asked.Correct):
-            words += [f"--metric={request.metric}", "--out", str(place / str(made) / PARAMETERS)]
-    elif isinstance(request, asked.Report):
-        words = ["report", str(folder), "--out", str(place / f"{request.run}.html")]
+        more = [str(run_folder(db, state, request.other))]
     elif isinstance(request, asked.Payload):
-        words = ["payload", str(folder), *_as_described(db, state, request.recordings), "--out", str(place / str(made))]
-        words += ["--refit-offsets"] if request.refit_offsets else []
-    else:
-        formats = request.format if isinstance(request, asked.Figures) else ",".join(request.formats)
-        words = [request.kind, str(folder), "--format", formats, "--out", str(place / str(made))]
+        more = _as_described(db, state, request.recordings)
+    elif isinstance(request, asked.Export):
+        more = ["--format", ",".join(request.formats)]
+    words = [request.kind, str(folder), *more, *_options(request)]
     if made is not None or isinstance(request, asked.Report):
         # `correct` writes a file, not a folder, so the folder is made here; `keep` removes it if it stays empty.
         (place / str(made) if isinstance(request, asked.Correct) else place).mkdir(parents=True, exist_ok=True)
+        names = {"report": f"{request.run}.html", "correct": f"{made}/{PARAMETERS}"}
+        words += ["--out", str(place / names.get(request.kind, str(made)))]
     return Command((*words, *_common_options(state)), arm, False, made or request.run, (), LEASE_SECONDS)
 
 
@@ -275,10 +256,21 @@ def range_words(one: asked.RecordingReference) -> str:
     return "@" + ":".join("" if seconds is None else f"{seconds:.9f}" for seconds in (one.start, one.end))
 
 
-def _given_options(options: Mapping[str, object]) -> list[str]:
-    """Return options that have a value, each in one word, so that no value can pass for an option."""
-    return [f"--{name}={value}" for name, value in options.items() if value is not None]
+def _options(request: asked.AnyJobRequest, **others: str) -> list[str]:
+    """Return a request's values as options, each in one word, so that no value can pass for an option.
+
+    Args:
+        request: whose fields of `_OPTIONS` have the options of their names.
+        others: options of further fields, or of the same.
+    """
+    words = list[str]()
+    for name, value in request:
+        option = others.get(name, name if name in _OPTIONS else "").replace("_", "-")
+        if option and value is not None and value is not False:
+            each = value if isinstance(value, tuple) else (value,)
+            words += [f"--{option}" if one is True else f"--{option}={one}" for one in each]
+    return words
 
 
 def _common_options(state: Path) -> tuple[str, ...]:
-    return ("--json", "--state", str(state))
+    return ("--json", "--with-text", "--state", str(state))

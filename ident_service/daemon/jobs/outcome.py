@@ -59,11 +59,13 @@ class ProcessOutput:
 
     Attributes:
         answer: its one JSON object; empty where it had none.
+        text: what a person would have read at its terminal.
         log: the end of its output, without samples (`printed_samples`).
     """
 
     answer: dict[str, Any] = field(default_factory=dict)
     log: str = ""
+    text: str = ""
 
 
 def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
@@ -83,7 +85,8 @@ def process_output(folder: Path, most: int = _LAST) -> ProcessOutput:
     except OSError:
         log = ""
     # Not by `splitlines`, which takes the mark of samples for the end of a line.
-    return ProcessOutput(answer, "\n".join(line for line in log.split("\n") if not line.startswith(rows.SAMPLES)))
+    lines = [line for line in log.split("\n") if not line.startswith(rows.SAMPLES)]
+    return ProcessOutput(answer, "\n".join(lines), str(answer.pop("text", "")))
 
 
 def printed_samples(folder: Path, offset: int) -> tuple[list[dict[str, Any]], int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -300,6 +300,11 @@ AnyJobRequest = Annotated[
     Field(discriminator="kind"),
 ]
 """Any request for a job; `kind` tells which."""
+
+KINDS: Final[dict[str, type[RequestBody]]] = {
+    get_args(model.model_fields["kind"].annotation)[0]: model for model in get_args(get_args(AnyJobRequest)[0])
+}
+"""The requests by their kinds."""
 
 MOVES = frozenset({"check", "rehearse", "run", "home", "leave_limit", "zero"})
 """Kinds of jobs that may command torque or set the encoders' zero: they need a lease and a person's confirmation."""

@@ -17,7 +17,7 @@ from ident_service.daemon.jobs.child_process import ANSWER, LOG, PROCESS, name_o
 _MOST = 64 * 1024
 _VERBS = frozenset({"check", "rehearse", "run", "home", "recover"})
 _LOOKS = (("watch",), ("recover",), ("bus", "scan"), ("bus", "probe"))
-_OPTIONS_OF_LOOKS = ("--json", "--state", "--seconds=")
+_OPTIONS_OF_LOOKS = ("--json", "--with-text", "--state", "--tell-samples")
 
 
 def main() -> int:
@@ -53,7 +53,7 @@ def taken(words: list[str]) -> bool:
         return True
     # A list of allowed options: argparse accepts a prefix of an option, such as `--leave`, for the whole.
     options = [word for word in words if word.startswith("-")]
-    good = all(word.startswith(_OPTIONS_OF_LOOKS[2]) or word in _OPTIONS_OF_LOOKS[:2] for word in options)
+    good = all(word.startswith("--seconds=") or word in _OPTIONS_OF_LOOKS for word in options)
     return good and any(tuple(words[: len(look)]) == look for look in _LOOKS)
 
 

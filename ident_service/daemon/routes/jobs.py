@@ -166,8 +166,8 @@ def get_log(service: Serving, _: Viewer, job: Id) -> PlainTextResponse:
 def get_result(service: Serving, _: Viewer, job: Id) -> answers.JobResult:
     """Return what the command of a job answered."""
     row = rows.known_job(service.db, job)
-    answer = process_output(service.state / JOBS / row["id"]).answer
-    return answers.JobResult(job=row["id"], answer=_named(answer, service, row))
+    output = process_output(service.state / JOBS / row["id"])
+    return answers.JobResult(job=row["id"], **_named({"answer": output.answer, "text": output.text}, service, row))
 
 
 @router.get("/jobs/{job}/events", response_class=StreamingResponse, responses=_STREAM)
@@ -266,7 +266,7 @@ def without_paths(value: Any, state: str, named: Mapping[str, str] = NOTHING) ->
     if isinstance(value, str):
         for place, name in named.items():
             value = value.replace(place, name)
-        return value.replace(f"{state}/", "")
+        return value.replace(f" --state {state}", "").replace(f"{state}/", "")
     if isinstance(value, list):
         return [without_paths(part, state, named) for part in value]
     if isinstance(value, dict):

@@ -74,13 +74,17 @@ class EventAnswer(BaseModel):
 
 
 class DueAnswer(BaseModel):
-    """Re-identification that is due; it waits for a person unless it has begun by itself."""
+    """Re-identification that is due; it waits for a person unless it has begun by itself.
+
+    `accepted` says whether its arm has an accepted set to compare with.
+    """
 
     id: int
     arm: str
     schedule: int
     cause: str
     at: float
+    accepted: bool
 
 
 class ReidentificationAnswer(BaseModel):
@@ -214,7 +218,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
     """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
-    return [DueAnswer(**row) for row in planned.pending(service.db, arm)]
+    return [DueAnswer(**row) for row in planned.comparable_dues(service.db, service.state, arm)]
 
 
 @router.post("/due/{number}/dismiss", status_code=204)

@@ -21,7 +21,7 @@ from ident_service.daemon.dependencies import Operator, Service, Serving, Viewer
 from ident_service.daemon.errors import status_of
 from ident_service.daemon.jobs.commands import JOBS
 from ident_service.daemon.jobs.outcome import process_output
-from ident_service.daemon.jobs.requests import MOVES, ArmName, Id
+from ident_service.daemon.jobs.requests import KINDS, MOVES, ArmName, Id
 from ident_service.daemon.maintenance.reidentification import (
     known_reidentification,
     reidentifications,
@@ -281,7 +281,6 @@ def _ticket(path: Path, config: ArmConfig) -> tuple[bool, str]:
 
 
 router = APIRouter(include_in_schema=False, route_class=PageRoute)
-_NUMBERS: Final = {"speed": float, "seconds": float, "seed": int, "starts": int, "until": float}
 _KINDS: Final = frozenset({"design", "identify", "simulate", "report", "export", "watch"})
 
 
@@ -525,12 +524,8 @@ def _alarms(service: Service, arm: str | None) -> list[dict[str, Any]]:
 def _requested_job(arm: str, form: dict[str, str]) -> dict[str, Any]:
     """Return the job that a form asks for; empty fields are left out."""
     kind = form.get("kind", "")
-    given = {key: value for key, value in form.items() if value and key in _FIELDS.get(kind, ())}
-    try:
-        asked: dict[str, Any] = {key: _NUMBERS.get(key, str)(value) for key, value in given.items()}
-    except ValueError:
-        raise UsageError(f"{kind}: a number is missing, or is none") from None
-    asked["kind"] = kind
+    fields = {*KINDS[kind].model_fields, "recording", "validation"} if kind in KINDS else set[str]()
+    asked: dict[str, Any] = {key: value for key, value in form.items() if value and key in fields}
     if kind == "export":
         asked["formats"] = [name.removeprefix("format-") for name in form if name.startswith("format-")]
     if kind in ("report", "export"):
@@ -542,19 +537,6 @@ def _requested_job(arm: str, form: dict[str, str]) -> dict[str, Any]:
         if "validation" in asked:
             asked["validate_on"] = [{"run": asked.pop("validation")}]
     return {**asked, "arm": arm}
-
-
-_FIELDS: Final[dict[str, tuple[str, ...]]] = {
-    "design": ("seconds", "seed", "criterion"),
-    "check": ("motion",),
-    "rehearse": ("motion", "speed"),
-    "run": ("motion", "speed", "until"),
-    "identify": ("recording", "validation", "method"),
-    "simulate": ("motion",),
-    "watch": ("seconds",),
-    "report": ("run",),
-    "export": ("run",),
-}
 
 
 def _confirmation(service: Service, who: Access, arm: str, form: dict[str, str], problem: str) -> Response:

@@ -43,7 +43,8 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"
     attends = attends and row["kind"] != "rehearse"  # its lease is kept by the held button on its own page
     entered = row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None
-    answer = {} if live else _answer(service, row)
+    said = jobs.get_result(service, _NOBODY, row["id"])
+    answer = {} if live else said.answer
     return page(
         "job",
         who,
@@ -56,6 +57,7 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
         entered=entered,
         exports=_exported(service, row),
         answer=answer,
+        text="" if live else said.text.strip(),
         checks=_checks(answer),
         found=identified_set(service, row["run"]) if entered and not live else None,
         facts=run_facts(service, row["run"]) if entered and not live else None,
@@ -71,12 +73,6 @@ def live_joints(service: Service, row: Row) -> list[dict[str, Any]]:
         return joint_facts(known_arm(service.db, service.state, str(row["arm"])).config)
     except IdentError:
         return []
-
-
-def _answer(service: Service, row: Row) -> dict[str, Any]:
-    """Return what a job's command answered, without what the page shows elsewhere."""
-    answer: dict[str, Any] = jobs.get_result(service, _NOBODY, row["id"]).answer
-    return {key: value for key, value in answer.items() if key not in _ELSEWHERE and value not in (None, [], {}, "")}
 
 
 def _checks(answer: dict[str, Any]) -> list[dict[str, Any]]:
@@ -100,7 +96,6 @@ def _checks(answer: dict[str, Any]) -> list[dict[str, Any]]:
     ]
 
 
-_ELSEWHERE: Final = frozenset({"exit_code", "folder", "path", "file", "error", "report"})
 _NOBODY: Final = Access("page", "viewer")
 
 
