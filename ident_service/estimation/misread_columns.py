@@ -190,17 +190,19 @@ class MisreadColumns:
 def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> MisreadColumns | None:
     """Return the reading of the columns that explains recordings best, where it is far better than theirs; else None.
 
-    Nothing is tried where every joint's torque is predicted to a tenth. At most a minute of the recordings is fitted.
+    Nothing is tried where every joint's torque is predicted to a tenth, and all of them together to 4 %. At most a minute
+    of the recordings is fitted.
 
     Args:
         estimate: what was identified.
         recordings: that it was fitted to; without them only signs of torques are tried, on the estimate's equations.
     """
-    own = estimate.candidates[estimate.chosen].moving.joint_relative_percent
-    if own.max(initial=0.0) < SUSPECTED_FROM:
+    moving = estimate.candidates[estimate.chosen].moving
+    own = moving.joint_relative_percent
+    if own.max(initial=0.0) < SUSPECTED_FROM and moving.relative_percent < _CONCERNED:
         return None
     # Weights of the joints come from their errors with the columns as they are: a joint that is wrong counts less.
-    rms = estimate.candidates[estimate.chosen].moving.joint_rms
+    rms = moving.joint_rms
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     weights /= np.exp(np.mean(np.log(weights)))
     parts = _samples(recordings, estimate.prepared.model)
