@@ -190,8 +190,8 @@ class MisreadColumns:
 def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> MisreadColumns | None:
     """Return the reading of the columns that explains recordings best, where it is far better than theirs; else None.
 
-    Nothing is tried where every joint's torque is predicted to a tenth, and all of them together to 4 %. At most a minute
-    of the recordings is fitted.
+    Nothing is tried where every joint's torque is predicted to a tenth, and all of them together to 4 %. Of the
+    recordings at most a minute is fitted.
 
     Args:
         estimate: what was identified.
