@@ -32,10 +32,12 @@ from ident_service.config.yaml_source import read_without_base
 from ident_service.errors import ConfigError, ModelError, Problem, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.limited_process import answer_within, run_limited_process
-from ident_service.model.mechanism import count_mechanism, parse_xml, read_mechanism, require_urdf
+from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
+from ident_service.model.plain_mjcf import build_from_mjcf
 from ident_service.model.solids import Capsule as Pill
 from ident_service.model.solids import corners as corners_of
 from ident_service.model.urdf import origin_of, solid_of
+from ident_service.model.xml_elements import parse_xml
 
 MOST_MESH_BYTES: Final = 64 * 2**20
 _LEAST_RADIUS = 0.005  # m
@@ -685,7 +687,9 @@ _DEADLINE = 120.0  # s
 
 def _mjcf_document(path: Path) -> dict[str, Any]:
     try:
-        model = pin.buildModelFromMJCF(str(path))
+        model = build_from_mjcf(path, pin.buildModelFromMJCF, path.parent)
+    except ModelError as error:
+        return {"error": str(error)}
     except Exception as error:  # noqa: BLE001 - pinocchio raises whatever its XML libraries raise
         return {"error": f"not an MJCF that can be read: {error}"}
     bodies = [one for one in model.frames if one.type == pin.FrameType.BODY]
@@ -734,7 +738,9 @@ def _mjcf_edges(model: pin.Model, bodies: Sequence[pin.Frame]) -> Iterator[list[
 def _mjcf_capsules(model: pin.Model, path: Path) -> tuple[dict[str, list[Any]], list[str]]:
     """Return capsules around the collision geometry of each body, in its frame, and bodies with unreadable meshes."""
     try:
-        shapes = pin.buildGeomFromMJCF(model, str(path), pin.COLLISION).geometryObjects
+        shapes = build_from_mjcf(
+            path, lambda plain: pin.buildGeomFromMJCF(model, plain, pin.COLLISION).geometryObjects, path.parent
+        )
     except Exception:  # noqa: BLE001 - a mesh is not there, or cannot be read
         return {}, [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     exact: dict[str, list[Capsule]] = {}

@@ -409,6 +409,49 @@ def test_angles_are_called_rounded_where_all_of_them_may_be(angles: tuple[float,
     assert angles_barely_rounded(angles) == rounded
 
 
+@pytest.mark.slow
+def test_a_base_whose_mesh_is_not_there_has_no_geometry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = '<link name="base_link"/>'
+    assert base in BARS
+    mesh = (
+        '<link name="base_link"><collision><geometry><mesh filename="package://none/base.stl"/></geometry></collision>'
+    )
+    config, said = described(tmp_path, BARS.replace(base, f"{mesh}</link>"), capsys)
+    assert "a mesh of base, elbow, shoulder could not be read; capsules are guessed where none of a link was" in said
+    assert config.geometry["base"] == ()
+    assert config.geometry["shoulder"]
+    assert main(["config", "check", str(tmp_path / "bars.yaml")]) == 0
+
+
+@pytest.mark.slow
+def test_gravity_and_the_range_of_a_slide_are_the_mjcfs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "gantry.xml").write_text(
+        '<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="b">'
+        '<joint name="x" type="slide" axis="1 0 0" range="0 1.5"/><geom type="sphere" size=".1" mass="1"/>'
+        '<body name="c" pos="0 0 .2"><joint name="y" axis="0 0 1" range="-90 90"/>'
+        '<geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/></body></body></worldbody></mujoco>'
+    )
+    assert main(["new", str(tmp_path / "gantry.xml"), "--out", str(tmp_path / "gantry.yaml")]) == 0
+    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; of gantry.xml\n" in capsys.readouterr().out
+    text, config = (tmp_path / "gantry.yaml").read_text(), load_arm(tmp_path / "gantry.yaml")
+    assert "\ngravity: [0.0, -9.81, 0.0] # m/s^2 in the base frame; of gantry.xml\n" in text
+    assert config.gravity == (0.0, -9.81, 0.0)
+    assert config.joints["x"].position == (0.0, 1.5)
+    assert config.joints["y"].position == pytest.approx((-math.pi / 2, math.pi / 2))
+
+
+@pytest.mark.slow
+def test_gravity_is_turned_into_the_frame_of_a_tilted_base(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lying = BARS.replace('<link name="base_link"/>', link("root", 1.0) + '<link name="base_link"/>').replace(
+        "</robot>", joint("wall", "fixed", "root", "base_link", "0 0 0.5 1.5707963267948966 0 0") + "</robot>"
+    )
+    (tmp_path / "bars.urdf").write_text(lying)
+    words = ["new", str(tmp_path / "bars.urdf"), "--base", "base_link", "--out", str(tmp_path / "bars.yaml")]
+    assert main(words) == 0
+    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; the root of bars.urdf stands upright" in capsys.readouterr().out
+    assert load_arm(tmp_path / "bars.yaml").gravity == (0.0, -9.81, 0.0)
+
+
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "bars.urdf").write_text(BARS.replace(BOUNDS, 'lower="-115" upper="115"'))
     assert main(["new", str(tmp_path / "bars.urdf"), "--out", str(tmp_path / "bars.yaml")]) == 2
