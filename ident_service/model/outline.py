@@ -173,6 +173,7 @@ def read_source(path: Path, convention: str | None = None) -> Source:
 
 
 _DH = ("type", "theta", "d", "a", "alpha")
+_OFFSET = "offset"  # of the joint's variable, as data sheets call theta, or d of a slide
 _LIMITS = ("lower", "upper", "velocity", "torque")
 _SCALES = {"": 1.0, "rad": 1.0, "m": 1.0, "mm": 1e-3, "deg": np.pi / 180.0, "rad/s": 1.0, "deg/s": np.pi / 180.0,
            "m/s": 1.0, "Nm": 1.0, "N": 1.0}  # fmt: skip
@@ -193,7 +194,7 @@ def _csv_table(path: Path, text: str, convention: str | None) -> tuple[DHTable, 
     for column, head in enumerate(heads):
         found = _COLUMN.fullmatch(head)
         name, unit = (found[1].lower(), (found[2] or "").replace(" ", "")) if found else (head, "")
-        known = ("joint", *_DH, *_LIMITS)
+        known = ("joint", *_DH, _OFFSET, *_LIMITS)
         if name not in known:
             problems.append(
                 Problem(path, numbered[0][0], 1, f"column {column + 1}: {head!r} is none of {', '.join(known)}")
@@ -271,6 +272,13 @@ def _table(
                 values[key] = number.validate_python(row.pop(key))
             except ValidationError as error:
                 problems.append(replace(place(joint), message=f"{name}: {key}: {error.errors()[0]['msg']}"))
+        if _OFFSET in row:
+            key = "d" if row.get("type") == "prismatic" else "theta"
+            if key in row:
+                problems.append(
+                    replace(place(joint), message=f"{name}: {_OFFSET}: is another name of its {key}; give one of both")
+                )
+            row[key] = row.pop(_OFFSET)
         bounds = values["lower"], values["upper"]
         limits[name] = plausible_limits(bounds, values["velocity"], values["torque"])
     try:
@@ -279,7 +287,7 @@ def _table(
         for one in error.errors(include_url=False):
             joint = next((k for k, name in enumerate(rows) if name in one["loc"]), 0)
             where = ": ".join(str(part) for part in one["loc"] if part != "joints")
-            known = f"; known are {', '.join((*_DH, *_LIMITS))}" if one["type"] == "extra_forbidden" else ""
+            known = f"; known are {', '.join((*_DH, _OFFSET, *_LIMITS))}" if one["type"] == "extra_forbidden" else ""
             said = one["msg"].removeprefix("Value error, ")
             problems.append(replace(place(joint), message=f"{where}: {said}{known}"))
     if problems:

@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from documents.walk import blocks
 from helpers.examples import NIGHT
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -30,6 +31,10 @@ from ident_service.model.arm_model import arm_model, control_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.likely_bodies import perturbed_body
 from ident_service.model.outline import (
+    _DH,
+    _LIMITS,
+    _OFFSET,
+    _SCALES,
     Outline,
     arm_part,
     capsule_around,
@@ -250,10 +255,45 @@ def test_a_table_in_yaml_is_the_same_table(tmp_path: Path) -> None:
         assert (csv.limits[name].velocity or 0.0) == pytest.approx(yml.limits[name].velocity or 0.0)
 
 
+def test_the_table_of_the_documents_is_read(tmp_path: Path) -> None:
+    page = (CONFIGS.parent / "docs" / "your-own-arm.md").read_text(encoding="utf-8")
+    (table,) = (block for block in blocks(page) if block.file == "table.csv")
+    (tmp_path / "table.csv").write_text(table.text)
+    read = read_source(tmp_path / "table.csv")
+    assert read.table is not None
+    assert read.table.convention == "standard"
+    assert read.table.joints["shoulder"].model_dump() == pytest.approx(
+        {"type": "revolute", "theta": math.pi / 2, "d": 0.0, "a": 0.35, "alpha": 0.0}
+    )
+    assert read.limits["waist"].position == pytest.approx((-math.radians(170), math.radians(170)))
+    assert (read.limits["waist"].effort, read.limits["elbow"].velocity) == (40.0, None)
+    # Its page names every column and unit.
+    (_, part) = page.split("## From a DH table")
+    for word in (*_DH, *_LIMITS, "joint", _OFFSET, *filter(None, _SCALES)):
+        assert f"`{word}`" in part.partition("## ")[0]
+
+
+def test_an_offset_is_theta_or_the_d_of_a_slide(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("# convention: modified\ntype, offset, d\n, 90 deg, 0.1\nprismatic, 0.2,\n")
+    (tmp_path / "t.yaml").write_text(
+        "convention: modified\njoints: {j1: {d: 0.1, offset: 90 deg}, j2: {type: prismatic, offset: 0.2}}\n"
+    )
+    for name in ("t.csv", "t.yaml"):
+        table = read_source(tmp_path / name).table
+        assert table is not None
+        assert (table.joints["j1"].theta, table.joints["j1"].d) == pytest.approx((math.pi / 2, 0.1))
+        assert (table.joints["j2"].theta, table.joints["j2"].d) == (0.0, 0.2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
+        (
+            "t.csv",
+            "# convention: standard\na, theta, offset\n0.5, 0, 1\n",
+            "3:1: j1: offset: is another name of its theta",
+        ),
         ("t.csv", "a, alpha\n0.5, 0\n", "which convention is it? Give --convention standard"),
         ("t.csv", "# convention: standard\na, aplha\n0.5, 0\n", "t.csv:2:1: column 2: 'aplha' is none of joint, type"),
         ("t.csv", "# convention: standard\na [inch]\n5\n", "t.csv:2:1: column 1: unit 'inch' is none of rad, m"),
