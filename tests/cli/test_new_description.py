@@ -472,7 +472,9 @@ def test_gravity_and_the_range_of_a_slide_are_the_mjcfs(tmp_path: Path, capsys: 
         '<geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/></body></body></worldbody></mujoco>'
     )
     assert main(["new", str(tmp_path / "gantry.xml"), "--out", str(tmp_path / "gantry.yaml")]) == 0
-    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; of gantry.xml\n" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; of gantry.xml\n" in told
+    assert "in a folder made for it" not in told
     text, config = (tmp_path / "gantry.yaml").read_text(), load_arm(tmp_path / "gantry.yaml")
     assert "\ngravity: [0.0, -9.81, 0.0] # m/s^2 in the base frame; of gantry.xml\n" in text
     assert config.gravity == (0.0, -9.81, 0.0)
@@ -486,10 +488,14 @@ def test_gravity_is_turned_into_the_frame_of_a_tilted_base(tmp_path: Path, capsy
         "</robot>", joint("wall", "fixed", "root", "base_link", "0 0 0.5 1.5707963267948966 0 0") + "</robot>"
     )
     (tmp_path / "bars.urdf").write_text(lying)
-    words = ["new", str(tmp_path / "bars.urdf"), "--base", "base_link", "--out", str(tmp_path / "bars.yaml")]
+    words = ["new", str(tmp_path / "bars.urdf"), "--base", "base_link", "--out", str(tmp_path / "made" / "bars.yaml")]
     assert main(words) == 0
-    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; the root of bars.urdf stands upright" in capsys.readouterr().out
-    assert load_arm(tmp_path / "bars.yaml").gravity == (0.0, -9.81, 0.0)
+    told = capsys.readouterr().out
+    assert told.splitlines()[0].endswith(
+        "bars.yaml: description written, with a simulated driver, in a folder made for it"
+    )
+    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; the root of bars.urdf stands upright" in told
+    assert load_arm(tmp_path / "made" / "bars.yaml").gravity == (0.0, -9.81, 0.0)
 
 
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
