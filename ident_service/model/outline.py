@@ -396,6 +396,8 @@ def _mesh_file(mesh: ET.Element, folder: Path) -> Array | None:
         scale = np.array([float(value) for value in (mesh.get("scale") or "1 1 1").split()])
     except ValueError:
         return None
+    if scale.shape != (3,) or not np.isfinite(scale).all() or not scale.all():
+        return None
     return mesh_triangles(path, scale)
 
 

@@ -463,6 +463,14 @@ def test_a_base_whose_mesh_is_not_there_has_no_geometry(tmp_path: Path, capsys: 
     assert main(["config", "check", str(tmp_path / "bars.yaml")]) == 0
 
 
+@pytest.mark.parametrize("scale", ["0.001", "1 1", "0 1 1", "nan 1 1", "one"])
+def test_a_mesh_whose_scale_is_none_is_not_read(scale: str, tmp_path: Path) -> None:
+    (tmp_path / "bar.stl").write_bytes(box_stl(0.15, 0.02, 0.01))
+    here = BARS.replace("package://boxes/", "")
+    assert urdf_outline(here, tmp_path).unread == frozenset()
+    assert urdf_outline(here.replace('"2 1 1"', f'"{scale}"'), tmp_path).unread == {"upper", "lower"}
+
+
 @pytest.mark.slow
 def test_gravity_and_the_range_of_a_slide_are_the_mjcfs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "gantry.xml").write_text(
