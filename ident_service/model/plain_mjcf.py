@@ -26,7 +26,8 @@ _GRAVITY: Final = "0 0 -9.81"  # MuJoCo's default
 _UNCHANGED: Final[Mapping[str, tuple[float, ...]]] = {
     "settotalmass": (), "boundmass": (0.0,), "boundinertia": (0.0,), "inertiagrouprange": (0.0, 5.0),
 }  # fmt: skip
-_SAVE = "load it in MuJoCo, save what it makes of it (mujoco.mj_saveLastXML), and take that out of the new file"
+_SAVE = "load the file in MuJoCo and save it (mujoco.mj_saveLastXML)"
+_SAVE_BODIES = f"give the compiler saveinertial='true', {_SAVE}, and take that out of the new file"
 _MASSLESS: Final = {"pos": "0 0 0", "mass": "0", "diaginertia": "0 0 0"}
 _UNWRITTEN: Final = ("replicate", "attach", "composite", "flexcomp")  # elements that MuJoCo makes bodies of
 
@@ -127,9 +128,9 @@ def _require_own_masses(compiler: ET.Element) -> None:
     for key, unchanged in _UNCHANGED.items():
         values = _numbers(compiler.get(key, ""))
         if values and tuple(values) != unchanged and not (key == "settotalmass" and values[0] <= 0.0):
-            raise ModelError(f"compiler {key}={compiler.get(key, '')[:40]!r} is not supported; {_SAVE}")
+            raise ModelError(f"compiler {key}={compiler.get(key, '')[:40]!r} is not supported; {_SAVE_BODIES}")
     if compiler.get("balanceinertia") == "true":
-        raise ModelError(f"compiler balanceinertia='true' is not supported; {_SAVE}")
+        raise ModelError(f"compiler balanceinertia='true' is not supported; {_SAVE_BODIES}")
     if compiler.get("coordinate", "local") != "local":
         raise ModelError("compiler coordinate='global' is not supported; load and save the file in MuJoCo 2.3.3")
     if not ((order := compiler.get("eulerseq", "xyz")).islower() or order.isupper()):
@@ -182,7 +183,7 @@ class _Writer:
         """Write into a body, with the class around it."""
         for element in body:
             if element.tag in _UNWRITTEN:
-                raise ModelError(f"<{element.tag}> is not supported; load the file in MuJoCo and save it there")
+                raise ModelError(f"<{element.tag}> is not supported; {_SAVE}")
             self._write_angles(element)
             if element.tag in ("body", "frame"):
                 if element.tag == "frame":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exports.export_bench import mujoco_torque
+from exports.export_bench import mujoco_torque, needed
 from helpers.random_arms import random_states
 
 from ident_service.config.kinematics import Kinematics
@@ -168,7 +168,7 @@ def test_a_gravity_that_is_none_is_refused(words: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (whole(SLIDE_AND_HINGE, '<compiler settotalmass="7"/>'), "compiler settotalmass='7' is not supported; load it"),
+        (whole(SLIDE_AND_HINGE, '<compiler settotalmass="7"/>'), "compiler settotalmass='7' is not supported; give"),
         (whole(SLIDE_AND_HINGE, '<compiler boundmass="0.1"/>'), "boundmass='0.1' is not supported"),
         (whole(SLIDE_AND_HINGE, '<compiler boundinertia="0.1"/>'), "boundinertia='0.1' is not supported"),
         (whole(SLIDE_AND_HINGE, '<compiler inertiagrouprange="0 1"/>'), "inertiagrouprange='0 1' is not supported"),
@@ -183,6 +183,24 @@ def test_what_would_be_another_arm_is_refused(text: str, words: str) -> None:
     with pytest.raises(ModelError) as caught:
         plain_mjcf(text)
     assert words in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "refused", ['boundmass="0.5"', 'boundinertia="0.5"', 'inertiagrouprange="0 1"', 'eulerseq="xYz"']
+)
+def test_what_mujoco_saves_of_a_refused_file_is_read(refused: str, tmp_path: Path) -> None:
+    """The remedy that a refusal names."""
+    mujoco = needed("mujoco")
+    text = whole(RADIAN, f'<compiler angle="radian" saveinertial="true" {refused}/>')
+    text = text.replace("<geom", '<geom group="2" type="box" size=".1 .1 .3"/><geom', 1)
+    before = mujoco.MjModel.from_xml_string(text)
+    mujoco.mj_saveLastXML(str(tmp_path / "saved.xml"), before)
+    saved = (tmp_path / "saved.xml").read_text().replace(refused, "")
+    read = mechanism(saved)
+    states = random_states(np.random.default_rng(1), 8, len(read.names))
+    found, chain = torques(read, states)
+    np.testing.assert_allclose(found, mujoco_torque(text, chain, states)[0], rtol=1e-3, atol=1e-3)  # of few digits
 
 
 @pytest.mark.slow
