@@ -215,11 +215,11 @@ def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
 
 
 def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Return the arm of an MJCF as JSON values; `part` selects it, as in a URDF."""
+    """Return the arm of an MJCF, in a folder of its own, as JSON values; `part` selects it, as in a URDF."""
     text, unknown = Path(path).read_text(encoding="utf-8-sig"), set[str]()
 
     def build() -> pin.Model:
-        model = build_from_mjcf(Path(path), pin.buildModelFromMJCF)
+        model = build_from_mjcf(Path(path), Path(path).parent, pin.buildModelFromMJCF)
         model.gravity = pin.Motion(np.array(mjcf_gravity(text)), np.zeros(3))
         unknown.update(bodies_of_meshes(plain_mjcf(text)))
         return model

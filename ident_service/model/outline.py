@@ -3,7 +3,8 @@
 Meshes are read by coal (assimp): what a description says of bodies are capsules, which people can check and correct. An
 MJCF, with its meshes, is read in a process of its own, as everywhere (`mechanism.py`).
 
-`python -m ident_service.model.outline FILE` prints the outline of an MJCF as one JSON object.
+`python -m ident_service.model.outline FILE FOLDER` prints the outline of an MJCF as one JSON object. It writes a copy into
+FOLDER.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import io
 import math
 import re
 import sys
+import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -642,7 +644,8 @@ def mjcf_outline(path: Path) -> Outline:
     Raises:
         ModelError: it cannot be read.
     """
-    document = run_limited_process("ident_service.model.outline", path, _DEADLINE)
+    with tempfile.TemporaryDirectory() as folder:
+        document = run_limited_process("ident_service.model.outline", path, _DEADLINE, folder)
     if (error := document.get("error")) is not None:
         raise ModelError(f"{path.name}: {error}")
     efforts = _mjcf_efforts(parse_xml(path.read_text(encoding="utf-8")))
@@ -695,9 +698,9 @@ _MOST_SECONDS: Final = 60  # of computing
 _DEADLINE = 120.0  # s
 
 
-def _mjcf_document(path: Path) -> dict[str, Any]:
+def _mjcf_document(path: Path, folder: Path) -> dict[str, Any]:
     try:
-        model = build_from_mjcf(path, pin.buildModelFromMJCF, path.parent)
+        model = build_from_mjcf(path, folder, pin.buildModelFromMJCF, path.parent)
     except ModelError as error:
         return {"error": str(error)}
     except Exception as error:  # noqa: BLE001 - pinocchio raises whatever its XML libraries raise
@@ -720,7 +723,7 @@ def _mjcf_document(path: Path) -> dict[str, Any]:
         one.get("joint1" if one.get("joint2") is None else "joint2", "")
         for one in parse_xml(path.read_text(encoding="utf-8")).findall("equality/joint")
     }
-    capsules, unread = _mjcf_capsules(model, path)
+    capsules, unread = _mjcf_capsules(model, path, folder)
     return {
         "edges": [edge for edge in edges if edge[0]],
         "roots": roots,
@@ -745,11 +748,11 @@ def _mjcf_edges(model: pin.Model, bodies: Sequence[pin.Frame]) -> Iterator[list[
         yield [parent, body.name, str(model.names[joint]), joint != other, length]
 
 
-def _mjcf_capsules(model: pin.Model, path: Path) -> tuple[dict[str, list[Any]], list[str]]:
+def _mjcf_capsules(model: pin.Model, path: Path, folder: Path) -> tuple[dict[str, list[Any]], list[str]]:
     """Return capsules around the collision geometry of each body, in its frame, and bodies with unreadable meshes."""
     try:
         shapes = build_from_mjcf(
-            path, lambda plain: pin.buildGeomFromMJCF(model, plain, pin.COLLISION).geometryObjects, path.parent
+            path, folder, lambda plain: pin.buildGeomFromMJCF(model, plain, pin.COLLISION).geometryObjects, path.parent
         )
     except Exception:  # noqa: BLE001 - a mesh is not there, or cannot be read
         return {}, [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -797,7 +800,7 @@ def _surface(solid: Any) -> Array | None:
 
 def main(words: list[str]) -> int:
     """Read the outline of one MJCF within the limits of memory and time, and print it as JSON."""
-    return answer_within(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0])))
+    return answer_within(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0]), Path(words[1])))
 
 
 if __name__ == "__main__":

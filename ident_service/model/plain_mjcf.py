@@ -11,7 +11,6 @@ are not read with a description. What changes masses as a whole is refused. MuJo
 from __future__ import annotations
 
 import math
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -32,22 +31,22 @@ _MASSLESS: Final = {"pos": "0 0 0", "mass": "0", "diaginertia": "0 0 0"}
 _UNWRITTEN: Final = ("replicate", "attach", "composite", "flexcomp")  # elements that MuJoCo makes bodies of
 
 
-def build_from_mjcf(path: Path, build: Callable[[str], Any], meshes: Path | None = None) -> Any:
+def build_from_mjcf(path: Path, folder: Path, build: Callable[[str], Any], meshes: Path | None = None) -> Any:
     """Return what `build` makes of the path of the file, rewritten.
 
     Args:
         path: of an MJCF whose elements were counted.
-        build: called with the path of a file beside nothing.
+        folder: where the rewritten file goes. Its owner removes it: what reads the file may break off.
+        build: called with the path of that file.
         meshes: folder that the file's own names of meshes begin in; none are read when None.
 
     Raises:
         ModelError: what pinocchio would misread and is not rewritten.
     """
     text = plain_mjcf(path.read_text(encoding="utf-8-sig", errors="surrogatepass"), meshes)
-    with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / path.name
-        plain.write_text(text, encoding="utf-8")
-        return build(str(plain))
+    plain = folder / f"plain {path.name}"
+    plain.write_text(text, encoding="utf-8")
+    return build(str(plain))
 
 
 def plain_mjcf(text: str, meshes: Path | None = None) -> str:
