@@ -3,7 +3,7 @@
 Meshes are read by coal (assimp): what a description says of bodies are capsules, which people can check and correct. An
 MJCF, with its meshes, is read in a process of its own, as everywhere (`mechanism.py`).
 
-`python -m ident_service.model.outline FILE FOLDER` prints the outline of an MJCF as one JSON object. It writes a copy into
+`python -m ident_service.model.outline FILE FOLDER` prints the outline of an MJCF as one JSON object. A copy goes into
 FOLDER.
 """
 
