@@ -222,7 +222,12 @@ def _add_configs(verbs: VerbList) -> None:
     )
     help_source = "URDF (.urdf, .xml), MJCF (.xml), or DH table (.csv, .yaml)"
     new.add_argument("source", metavar="FILE", type=Path, help=help_source)
-    new.add_argument("--out", metavar="FILE", type=Path, help="file to write (default: NAME.yaml here)")
+    new.add_argument(
+        "--out",
+        metavar="FILE",
+        type=Path,
+        help="file to write; its folder is made where there is none (default: NAME.yaml here)",
+    )
     new.add_argument("--name", help="of the arm (default: the file's)")
     new.add_argument("--base", metavar="LINK", help="base link of the arm (default: found)")
     new.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where the gripper begins)")
@@ -264,9 +269,11 @@ def _new(arguments: argparse.Namespace) -> Answer:
     def tell(line: str) -> None:
         print_to_person(f"{line} ...\n")
 
+    folder = Path.cwd() if arguments.out is None else arguments.out.parent
+    made = not folder.exists()
     words = (arguments.source, arguments.out, arguments.name, arguments.base, arguments.tip)
     path, guessed = new_description(*words, tell, arguments.convention)
-    lines = [f"{path}: description written, with a simulated driver"]
+    lines = [f"{path}: description written, with a simulated driver{', in a folder made for it' if made else ''}"]
     lines += ["guessed or chosen:", *(f"  {line}" for line in guessed)] if guessed else []
     return DONE, "\n".join([*lines, ""]), {"description": str(path), "guessed": list(guessed)}
 

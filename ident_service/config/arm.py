@@ -509,7 +509,8 @@ class ArmConfig(ExtendedSection):
     transmission: Transmission | None = None
     """Gears and couplings between motors and joints."""
     geometry: Geometry = Field(default_factory=dict)
-    """Capsules of links, by joint name or `base`, in the links' frames; they replace the geometry of a URDF."""
+    """Capsules of links, by joint name or `base`, in the links' frames; they replace the geometry of a URDF. An empty
+    list is a link without any."""
     workspace: Workspace = Workspace()
     """Obstacles and allowed space."""
     supply: Supply | None = None

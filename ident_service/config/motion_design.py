@@ -105,7 +105,7 @@ class Workspace(Section):
     never are."""
 
 
-Geometry = dict[str, Annotated[tuple[Capsule, ...], Field(min_length=1)]]
+Geometry = dict[str, tuple[Capsule, ...]]
 
 
 class Supply(Section):

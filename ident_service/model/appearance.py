@@ -18,9 +18,10 @@ from ident_service.errors import ModelError, UsageError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.collision import link_bodies
-from ident_service.model.mechanism import parse_xml, read_mechanism
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.solids import Body, Capsule
 from ident_service.model.urdf import origin_of
+from ident_service.model.xml_elements import parse_xml
 
 _STICK = 0.02  # radius, as a share of the sum of the lengths from joint to joint
 _LEAST = 0.005  # m, of an arm whose joints all meet in one point

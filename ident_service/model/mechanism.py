@@ -12,7 +12,6 @@ import json
 import math
 import re
 import tempfile
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -56,6 +55,7 @@ class Mechanism:
         damping: [N m s/rad or N s/m], shape (joints,).
         dry_friction: [N m or N], shape (joints,).
         held: where all other movable joints are held [rad or m].
+        gravity: in the frame of the base [m/s^2], shape (3,): the file's; of a URDF, downwards in its root's frame.
         frames: name of each link to its joint (-1: the world), and its rotation and translation in that joint's frame.
     """
 
@@ -70,6 +70,7 @@ class Mechanism:
     damping: Array
     dry_friction: Array
     held: Mapping[str, float]
+    gravity: Array
     frames: Mapping[str, tuple[int, Array, Array]]
 
 
@@ -128,24 +129,6 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
     except expat.ExpatError as error:
         raise ModelError(f"{name}: not a {kind.upper()} that can be read: {error}") from None
     counter.finish()
-
-
-def parse_xml(text: str) -> ET.Element:
-    """Return the elements of a file that was counted, names with undeclared prefixes as they are.
-
-    Tools of simulators add attributes such as `drake:acceleration`, and often do not declare their prefixes.
-
-    Raises:
-        ModelError: not well-formed.
-    """
-    builder, parser = ET.TreeBuilder(), expat.ParserCreate("utf-8")
-    parser.StartElementHandler = lambda tag, attributes: builder.start(tag, attributes)
-    parser.EndElementHandler = builder.end
-    try:
-        parser.Parse(text.encode("utf-8", "surrogatepass"), True)
-    except expat.ExpatError as error:
-        raise ModelError(f"not well-formed XML: {error}") from None
-    return builder.close()
 
 
 def require_urdf(file: TextFile) -> None:
@@ -398,7 +381,7 @@ class _Counter:
 
     def __init__(self, name: str, kind: Kind) -> None:
         self._name, self._urdf = name, kind == "urdf"
-        self._link = "link" if self._urdf else "body"
+        self._link = ("link",) if self._urdf else ("body", "frame")
         self._elements = self._depth = self._links = self._bodies_open = 0
         self._joint_parent, self._joint_child = "", ""
         self._parents: dict[str, str] = {}
@@ -412,7 +395,7 @@ class _Counter:
             self._refuse(f"more than {MOST_ATTRIBUTES} attributes of one element")
         if self._depth > _DEEPEST_ELEMENTS:
             self._refuse(f"more than {_DEEPEST_ELEMENTS} elements in one another")
-        if tag == self._link:
+        if tag in self._link:
             self._links += 1
             if self._links > MOST_LINKS:
                 self._refuse(f"more than {MOST_LINKS} links")
@@ -427,7 +410,7 @@ class _Counter:
     def end(self, tag: str) -> None:
         self._depth -= 1
         if not self._urdf:
-            self._bodies_open -= tag == "body"
+            self._bodies_open -= tag in self._link
         elif tag == "joint":
             if self._joint_child in self._parents:
                 self._refuse(f"link {self._joint_child!r} is the child of two joints")
@@ -483,6 +466,7 @@ def _mechanism(document: Mapping[str, Any]) -> Mechanism:
         damping=array("damping", n),
         dry_friction=array("dry_friction", n),
         held=document["held"],
+        gravity=array("gravity", 3),
         frames={
             name: (joint, np.array(rotation).reshape(3, 3), np.array(translation))
             for name, joint, rotation, translation in document["frames"]

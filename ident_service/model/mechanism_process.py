@@ -13,8 +13,9 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -23,6 +24,8 @@ from numpy.typing import NDArray
 
 from ident_service.errors import ModelError
 from ident_service.model.limited_process import answer_within
+from ident_service.model.plain_mjcf import bodies_of_meshes, build_from_mjcf, mjcf_gravity, plain_mjcf
+from ident_service.model.xml_elements import parse_xml
 
 if TYPE_CHECKING:
     from ident_service.config.quantities import TextFile
@@ -58,8 +61,6 @@ def mimics(file: TextFile) -> dict[str, Mimic]:
     found: dict[str, Mimic] = {}
     if "mimic" not in file.text:
         return found
-    from ident_service.model.mechanism import parse_xml  # which loads what no MJCF needs
-
     robot = parse_xml(file.text)
     # Numbers were checked by pinocchio's reader.
     for joint in robot.findall("joint"):
@@ -193,6 +194,7 @@ def _rest(model: pin.Model, name: str) -> float:
 def _rebase(model: pin.Model, base: str) -> None:
     """Move the model's world frame to the frame of a link that does not move."""
     to_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement.inverse()
+    model.gravity = pin.Motion(to_base.rotation @ model.gravity.linear, np.zeros(3))
     for k in range(1, model.njoints):
         if model.parents[k] == 0:
             model.jointPlacements[k] = to_base * model.jointPlacements[k]
@@ -213,8 +215,16 @@ def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
 
 
 def mjcf_document(path: str, part: str | None) -> dict[str, Any]:
-    """Return the arm of an MJCF as JSON values; `part` selects it, as in a URDF."""
-    return _document("MJCF", lambda: pin.buildModelFromMJCF(path), part, dict)
+    """Return the arm of an MJCF, in a folder of its own, as JSON values; `part` selects it, as in a URDF."""
+    text, unknown = Path(path).read_text(encoding="utf-8-sig"), set[str]()
+
+    def build() -> pin.Model:
+        model = build_from_mjcf(Path(path), Path(path).parent, pin.buildModelFromMJCF)
+        model.gravity = pin.Motion(np.array(mjcf_gravity(text)), np.zeros(3))
+        unknown.update(bodies_of_meshes(plain_mjcf(text)))
+        return model
+
+    return _document("MJCF", build, part, dict, unknown)
 
 
 def delta_from_inertia(inertia: pin.Inertia) -> NDArray[np.float64]:
@@ -224,7 +234,11 @@ def delta_from_inertia(inertia: pin.Inertia) -> NDArray[np.float64]:
 
 
 def _document(
-    kind: str, build: Callable[[], pin.Model], part: str | None, followers: Callable[[], dict[str, Mimic]]
+    kind: str,
+    build: Callable[[], pin.Model],
+    part: str | None,
+    followers: Callable[[], dict[str, Mimic]],
+    unknown: Collection[str] = (),
 ) -> dict[str, Any]:
     held: dict[str, float] = {}
     try:
@@ -244,12 +258,16 @@ def _document(
     for k in range(1, n + 1):
         joint = model.joints[k].shortname()
         if not joint.startswith(_SUPPORTED) or joint in _UNSUPPORTED:
-            return {"error": f"joint {model.names[k]!r} is a {joint}; only revolute and prismatic joints are supported"}
+            more = "; give each of several joints of a body a body of its own" if "Composite" in joint else ""
+            said = f"joint {model.names[k]!r} is a {joint}; only revolute and prismatic joints are supported{more}"
+            return {"error": said}
         # Of the joint alone: data of a whole model hold the cube of its joints.
         screw = np.asarray(model.joints[k].createData().S).reshape(6)
         turns = bool(np.any(screw[3:]))
         revolute.append(turns)
         axes.append((screw[3:] if turns else screw[:3]).tolist())
+    # Links with a body whose mass is not known have none.
+    without = {int(one.parentJoint) for one in model.frames if one.type == pin.FrameType.BODY and one.name in unknown}
     placements = [model.jointPlacements[k] for k in range(1, n + 1)]
     dry = model.upperDryFrictionLimit if hasattr(model, "upperDryFrictionLimit") else model.friction
     return {
@@ -259,11 +277,14 @@ def _document(
         "axes": axes,
         "rotation": [placement.rotation.tolist() for placement in placements],
         "translation": [placement.translation.tolist() for placement in placements],
-        "bodies": [delta_from_inertia(model.inertias[k]).tolist() for k in range(1, n + 1)],
+        "bodies": [
+            [0.0] * 10 if k in without else delta_from_inertia(model.inertias[k]).tolist() for k in range(1, n + 1)
+        ],
         "armature": model.armature.tolist(),
         "damping": model.damping.tolist(),
         "dry_friction": dry.tolist(),
         "held": held,
+        "gravity": model.gravity.linear.tolist(),
         "frames": [
             [one.name, int(one.parentJoint) - 1, one.placement.rotation.tolist(), one.placement.translation.tolist()]
             for one in model.frames

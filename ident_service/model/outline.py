@@ -3,7 +3,8 @@
 Meshes are read by coal (assimp): what a description says of bodies are capsules, which people can check and correct. An
 MJCF, with its meshes, is read in a process of its own, as everywhere (`mechanism.py`).
 
-`python -m ident_service.model.outline FILE` prints the outline of an MJCF as one JSON object.
+`python -m ident_service.model.outline FILE FOLDER` prints the outline of an MJCF as one JSON object. A copy goes into
+FOLDER.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import io
 import math
 import re
 import sys
+import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,10 +34,12 @@ from ident_service.config.yaml_source import read_without_base
 from ident_service.errors import ConfigError, ModelError, Problem, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.limited_process import answer_within, run_limited_process
-from ident_service.model.mechanism import count_mechanism, parse_xml, read_mechanism, require_urdf
+from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
+from ident_service.model.plain_mjcf import build_from_mjcf
 from ident_service.model.solids import Capsule as Pill
 from ident_service.model.solids import corners as corners_of
 from ident_service.model.urdf import origin_of, solid_of
+from ident_service.model.xml_elements import parse_xml
 
 MOST_MESH_BYTES: Final = 64 * 2**20
 _LEAST_RADIUS = 0.005  # m
@@ -171,6 +175,7 @@ def read_source(path: Path, convention: str | None = None) -> Source:
 
 
 _DH = ("type", "theta", "d", "a", "alpha")
+_OFFSET = "offset"  # of the joint's variable, as data sheets call theta, or d of a slide
 _LIMITS = ("lower", "upper", "velocity", "torque")
 _SCALES = {"": 1.0, "rad": 1.0, "m": 1.0, "mm": 1e-3, "deg": np.pi / 180.0, "rad/s": 1.0, "deg/s": np.pi / 180.0,
            "m/s": 1.0, "Nm": 1.0, "N": 1.0}  # fmt: skip
@@ -191,7 +196,7 @@ def _csv_table(path: Path, text: str, convention: str | None) -> tuple[DHTable, 
     for column, head in enumerate(heads):
         found = _COLUMN.fullmatch(head)
         name, unit = (found[1].lower(), (found[2] or "").replace(" ", "")) if found else (head, "")
-        known = ("joint", *_DH, *_LIMITS)
+        known = ("joint", *_DH, _OFFSET, *_LIMITS)
         if name not in known:
             problems.append(
                 Problem(path, numbered[0][0], 1, f"column {column + 1}: {head!r} is none of {', '.join(known)}")
@@ -269,6 +274,13 @@ def _table(
                 values[key] = number.validate_python(row.pop(key))
             except ValidationError as error:
                 problems.append(replace(place(joint), message=f"{name}: {key}: {error.errors()[0]['msg']}"))
+        if _OFFSET in row:
+            key = "d" if row.get("type") == "prismatic" else "theta"
+            if key in row:
+                problems.append(
+                    replace(place(joint), message=f"{name}: {_OFFSET}: is another name of its {key}; give one of both")
+                )
+            row[key] = row.pop(_OFFSET)
         bounds = values["lower"], values["upper"]
         limits[name] = plausible_limits(bounds, values["velocity"], values["torque"])
     try:
@@ -277,7 +289,7 @@ def _table(
         for one in error.errors(include_url=False):
             joint = next((k for k, name in enumerate(rows) if name in one["loc"]), 0)
             where = ": ".join(str(part) for part in one["loc"] if part != "joints")
-            known = f"; known are {', '.join((*_DH, *_LIMITS))}" if one["type"] == "extra_forbidden" else ""
+            known = f"; known are {', '.join((*_DH, _OFFSET, *_LIMITS))}" if one["type"] == "extra_forbidden" else ""
             said = one["msg"].removeprefix("Value error, ")
             problems.append(replace(place(joint), message=f"{where}: {said}{known}"))
     if problems:
@@ -385,6 +397,8 @@ def _mesh_file(mesh: ET.Element, folder: Path) -> Array | None:
     try:
         scale = np.array([float(value) for value in (mesh.get("scale") or "1 1 1").split()])
     except ValueError:
+        return None
+    if scale.shape != (3,) or not np.isfinite(scale).all() or not scale.all():
         return None
     return mesh_triangles(path, scale)
 
@@ -630,7 +644,8 @@ def mjcf_outline(path: Path) -> Outline:
     Raises:
         ModelError: it cannot be read.
     """
-    document = run_limited_process("ident_service.model.outline", path, _DEADLINE)
+    with tempfile.TemporaryDirectory() as folder:
+        document = run_limited_process("ident_service.model.outline", path, _DEADLINE, folder)
     if (error := document.get("error")) is not None:
         raise ModelError(f"{path.name}: {error}")
     efforts = _mjcf_efforts(parse_xml(path.read_text(encoding="utf-8")))
@@ -683,9 +698,11 @@ _MOST_SECONDS: Final = 60  # of computing
 _DEADLINE = 120.0  # s
 
 
-def _mjcf_document(path: Path) -> dict[str, Any]:
+def _mjcf_document(path: Path, folder: Path) -> dict[str, Any]:
     try:
-        model = pin.buildModelFromMJCF(str(path))
+        model = build_from_mjcf(path, folder, pin.buildModelFromMJCF, path.parent)
+    except ModelError as error:
+        return {"error": str(error)}
     except Exception as error:  # noqa: BLE001 - pinocchio raises whatever its XML libraries raise
         return {"error": f"not an MJCF that can be read: {error}"}
     bodies = [one for one in model.frames if one.type == pin.FrameType.BODY]
@@ -706,7 +723,7 @@ def _mjcf_document(path: Path) -> dict[str, Any]:
         one.get("joint1" if one.get("joint2") is None else "joint2", "")
         for one in parse_xml(path.read_text(encoding="utf-8")).findall("equality/joint")
     }
-    capsules, unread = _mjcf_capsules(model, path)
+    capsules, unread = _mjcf_capsules(model, path, folder)
     return {
         "edges": [edge for edge in edges if edge[0]],
         "roots": roots,
@@ -731,10 +748,12 @@ def _mjcf_edges(model: pin.Model, bodies: Sequence[pin.Frame]) -> Iterator[list[
         yield [parent, body.name, str(model.names[joint]), joint != other, length]
 
 
-def _mjcf_capsules(model: pin.Model, path: Path) -> tuple[dict[str, list[Any]], list[str]]:
+def _mjcf_capsules(model: pin.Model, path: Path, folder: Path) -> tuple[dict[str, list[Any]], list[str]]:
     """Return capsules around the collision geometry of each body, in its frame, and bodies with unreadable meshes."""
     try:
-        shapes = pin.buildGeomFromMJCF(model, str(path), pin.COLLISION).geometryObjects
+        shapes = build_from_mjcf(
+            path, folder, lambda plain: pin.buildGeomFromMJCF(model, plain, pin.COLLISION).geometryObjects, path.parent
+        )
     except Exception:  # noqa: BLE001 - a mesh is not there, or cannot be read
         return {}, [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     exact: dict[str, list[Capsule]] = {}
@@ -781,7 +800,7 @@ def _surface(solid: Any) -> Array | None:
 
 def main(words: list[str]) -> int:
     """Read the outline of one MJCF within the limits of memory and time, and print it as JSON."""
-    return answer_within(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0])))
+    return answer_within(_MOST_MEMORY, _MOST_SECONDS, lambda: _mjcf_document(Path(words[0]), Path(words[1])))
 
 
 if __name__ == "__main__":

@@ -20,9 +20,10 @@ from ident_service.config.motion_design import BASE
 from ident_service.errors import ModelError
 from ident_service.model.arm_model import ArmModel
 from ident_service.model.chain import WORLD, Array, Chain
-from ident_service.model.mechanism import parse_xml, read_mechanism
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.parameter_layout import about_center, joint_drives
 from ident_service.model.solids import Body, Box, Capsule, Cylinder, Solid, rotation_rpy
+from ident_service.model.xml_elements import parse_xml
 
 BASE_LINK = "base_link"
 

@@ -149,7 +149,8 @@ def _require_own_meshes(source: Path) -> None:
         ModelError: not a URDF, or larger than one is.
     """
     from ident_service.model.drawn_meshes import SAFE_MESHES
-    from ident_service.model.mechanism import count_mechanism, parse_xml
+    from ident_service.model.mechanism import count_mechanism
+    from ident_service.model.xml_elements import parse_xml
 
     text = source.read_text(encoding="utf-8")
     count_mechanism(TextFile(name=source.name, text=text), "urdf")

@@ -31,9 +31,10 @@ from ident_service.model.base_parameters import base_parameters, remarks_on_angl
 from ident_service.model.chain import Array
 from ident_service.model.collision import CollisionModel, share_touching
 from ident_service.model.likely_bodies import likely_bodies, lines_of, perturbed_body, with_file_bodies
-from ident_service.model.mechanism import parse_xml, read_mechanism
+from ident_service.model.mechanism import read_mechanism
 from ident_service.model.outline import FileLimits, Source, arm_capsules, arm_part, read_source
 from ident_service.model.pinocchio_models import InverseDynamics
+from ident_service.model.xml_elements import parse_xml
 from ident_service.motion.safety_monitor import TORQUE_RATE, TORQUE_RATE_SHARE
 from ident_service.operations.commissioning import require_clear_from_home
 from ident_service.preflight.stability import LEAST_GAIN_MARGIN, delay_of, stability
@@ -48,6 +49,9 @@ _DRAFT_SECONDS = 20.0  # of a motion
 LARGEST_USE = 0.6  # share of the limits of the first motion that is tried
 
 
+_DOWN = (0.0, 0.0, -9.81)  # m/s^2
+
+
 @dataclass
 class Draft:
     """Decided content of a description, to be written as YAML.
@@ -56,6 +60,8 @@ class Draft:
         name: of the arm.
         source: name of the file that it is made from.
         part: the keys of its kinematics.
+        gravity: in the base frame [m/s^2].
+        gravity_origin: in words, where gravity is from.
         joints: keys of each joint.
         origins: of each joint's keys, where their values come from.
         geometry: capsules of links whose meshes are replaced.
@@ -75,6 +81,8 @@ class Draft:
     name: str
     source: str
     part: dict[str, Any]
+    gravity: list[float] = field(default_factory=lambda: [*_DOWN])
+    gravity_origin: str = "the base stands upright"
     joints: dict[str, dict[str, Any]] = field(default_factory=dict)
     origins: dict[str, dict[str, str]] = field(default_factory=dict)
     geometry: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
@@ -126,7 +134,7 @@ name: {_flow(draft.name)}
 
 {_kinematics(draft.part)}
 
-gravity: [0, 0, -9.81] # m/s^2 in the base frame: the arm stands upright
+gravity: {_flow(draft.gravity)} # m/s^2 in the base frame; {draft.gravity_origin}
 terms: [drive_inertia, viscous, coulomb, offset]
 """
     ]
@@ -299,6 +307,7 @@ def new_description(
             return arm_model(load_arm(trial), bodies=False)  # what is none is guessed
 
         draft.remarks += _part_remark(loaded(), draft)
+        _gravity(draft, loaded())
         tell("joints and bodies")
         _joints(draft, loaded(), read.limits)
         _bodies(draft, loaded, read)
@@ -325,7 +334,7 @@ def _always_guessed(draft: Draft) -> list[str]:
     gains = " and ".join(f"kp {kp:g} with kd {kd:g}" for kp, kd in pairs)
     mass = f"constraints.total_mass: at most {draft.total_mass:g} kg, twice what the links have"
     return [
-        "gravity: the base stands upright",
+        f"gravity: {draft.gravity_origin}" if draft.gravity == [*_DOWN] else _said_gravity(draft),
         "terms: each joint has drive inertia, viscous and Coulomb friction, and an offset",
         "joints: acceleration, jerk and following_error from the velocity and torque limits; drive_inertia from them, "
         f"too; gains, {gains}, for the simulated arm; home, where the arm is clear of itself",
@@ -356,6 +365,27 @@ def _part_remark(model: ArmModel, draft: Draft) -> list[str]:
     return [f"the arm: {ends}{more} (change it with --base and --tip)"]
 
 
+def _gravity(draft: Draft, model: ArmModel) -> None:
+    """Set gravity in the base frame: an MJCF's, or downwards in the frame of a URDF's root."""
+    kinematics = model.config.kinematics
+    file = kinematics.urdf or kinematics.mjcf
+    if file is None:
+        return
+    of_mjcf = kinematics.mjcf is not None
+    gravity = read_mechanism(file, "mjcf" if of_mjcf else "urdf", kinematics).gravity
+    if of_mjcf:
+        draft.gravity_origin += f", as in {draft.source}"
+    if not np.allclose(gravity, _DOWN, rtol=0.0, atol=1e-9):
+        draft.gravity = [round(float(value), 9) + 0.0 for value in gravity]
+        draft.gravity_origin = f"of {draft.source}" if of_mjcf else f"the root of {draft.source} stands upright"
+
+
+def _said_gravity(draft: Draft) -> str:
+    return (
+        f"gravity: {' '.join(f'{value:g}' for value in draft.gravity)} m/s^2 in the base frame; {draft.gravity_origin}"
+    )
+
+
 def _joint_angles(urdf: TextFile) -> Iterator[float]:
     """Yield the angles [rad] of the joints' frames of a URDF that was read."""
     for origin in parse_xml(urdf.text).iterfind("joint/origin"):
@@ -369,7 +399,9 @@ def _joints(draft: Draft, model: ArmModel, file_limits: Mapping[str, FileLimits]
     if likely.guessed:
         draft.prior = _named(model, likely.delta)
         why = (
-            "a DH table has none" if model.config.kinematics.dh else "the file's have no mass, or an unphysical inertia"
+            "a DH table has none"
+            if model.config.kinematics.dh
+            else "the file's have no mass, that of a mesh, or an unphysical inertia"
         )
         draft.remarks.append(f"bodies of {', '.join(likely.guessed)}: rods; {why}")
     model = replace(model, prior=likely.delta)
@@ -517,7 +549,7 @@ def _bodies(draft: Draft, loaded: Callable[[], ArmModel], read: Source) -> None:
     draft.geometry = {
         owner: [one.model_dump(by_alias=True, mode="json") for one in found]
         for owner, found in capsules.items()
-        if found
+        if found or owner in unread  # none instead of the mesh
     }
     if unread:
         draft.remarks.append(

@@ -38,6 +38,7 @@ from ident_service.results.export.urdf import write_urdf
 from ident_service.results.manifest import (
     atomic_folder,
     replacing_folder,
+    require_folder_of,
     require_place,
     require_replaceable,
     write_atomically,
@@ -125,6 +126,7 @@ def correct_file(
         UsageError, ConfigError, ParameterError: the file or the arm cannot be used, or `out` not written.
         SolverError: the solver stopped without an optimum.
     """
+    require_folder_of(out)
     file, conditions, notes, layout = _read(path, kind, arm, notation)
     result = feasibility_correction(
         file.values, file.base, conditions, _covariance(path, file) if metric == "covariance" else None
@@ -213,10 +215,13 @@ def compare_files(paths: Sequence[Path], out: Path | None = None) -> tuple[Compa
         ParameterError: one is torn, changed or foreign, or they have nothing in common.
         ConfigError: an arm in a folder is not one that this version reads.
     """
+    one_file = out is not None and out.suffix == ".json" and not out.is_dir()
+    if out is not None and one_file:
+        require_folder_of(out)
     comparison = compare([read_side(path) for path in paths])
     if out is None:
         return comparison, ()
-    if out.suffix == ".json" and not out.is_dir():
+    if one_file:
         write_comparison(out, comparison)
         return comparison, (out,)
     with atomic_folder(out) as staging:

@@ -43,6 +43,7 @@ from ident_service.recordings.mcap_reader import McapRecording
 from ident_service.recordings.open import open_recording
 from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.evidence import PredictionTrace
+from ident_service.results.manifest import require_folder_of
 from ident_service.results.report_files import read_evidence_of, read_reported
 from ident_service.results.run_folder import ARM, PARAMETERS
 
@@ -98,8 +99,8 @@ def view_run(
         )
     if save is not None and save.exists():
         raise UsageError(f"{save}: exists already; give a file that does not")
-    if save is not None and not save.parent.is_dir():
-        raise UsageError(f"{save}: there is no folder {save.parent}; make it first, or give another place")
+    if save is not None:
+        require_folder_of(save)
     config = _config(folder)
     model = arm_model(config)
     shown = list(_recordings(folder, recordings, model))

@@ -43,6 +43,16 @@ def require_place(folder: Path) -> None:
         raise UsageError(f"{folder}: cannot be written: no permission in {place}")
 
 
+def require_folder_of(file: Path) -> None:
+    """Refuse a file whose folder is not there, before work is done for it.
+
+    Raises:
+        UsageError: there is no such folder.
+    """
+    if not file.parent.is_dir():
+        raise UsageError(f"{file}: there is no folder {file.parent}; make it first, or give another place")
+
+
 @contextmanager
 def atomic_folder(folder: Path) -> Iterator[Path]:
     """Yield a place to build a folder's content in, which gets its name when the block ends without an error.

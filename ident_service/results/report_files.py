@@ -18,7 +18,14 @@ from ident_service.results.assessment import Assessment, assess
 from ident_service.results.evidence.evidence import Evidence
 from ident_service.results.evidence.file import EVIDENCE, read_evidence, write_evidence
 from ident_service.results.evidence.gathering import gather_evidence
-from ident_service.results.manifest import MANIFEST, atomic_folder, hashes, write_atomically, write_manifest
+from ident_service.results.manifest import (
+    MANIFEST,
+    atomic_folder,
+    hashes,
+    require_folder_of,
+    write_atomically,
+    write_manifest,
+)
 from ident_service.results.parameter_file import read_parameters
 from ident_service.results.plots import Canvas
 from ident_service.results.report.figures import figures
@@ -110,8 +117,8 @@ def make_report(folder: Path, out: Path | None = None) -> tuple[Path, Assessment
     results = read_reported(folder)
     if out is not None and out.is_dir():
         raise UsageError(f"{out}: is a folder; give the name of a file")
-    if out is not None and not out.parent.is_dir():
-        raise UsageError(f"{out}: there is no folder {out.parent}; make it first, or give another place")
+    if out is not None:
+        require_folder_of(out)
     if out is not None and out.name in {*results.sha256, MANIFEST} - {REPORT_PAGE} and out.parent.samefile(folder):
         raise UsageError(f"{out}: is one of the results; give another name")
     page = report_html(read_evidence_of(results), results.parameters, results.config, _others(results.sha256))

@@ -75,6 +75,13 @@ def test_what_is_no_folder_of_an_identification_says_what_it_is(folder: Path, id
     ended = ident("report", folder, "--out", page)
     assert ended.code == 2
     assert f"{page}: there is no folder {page.parent}; make it first" in ended.err
+    file, parameters = page.with_suffix(".json"), folder / "parameters.json"
+    for words in (("project", parameters), ("compare", parameters, parameters)):
+        ended = ident(*words, "--out", file)
+        assert (ended.code, ended.err) == (
+            2,
+            f"ident: {file}: there is no folder {file.parent}; make it first, or give another place\n",
+        )
     # What `ident payload` leaves: no evidence, and a comparison where the bare arm was known.
     (folder / "evidence.json").unlink()
     (folder / "payload.json").write_text("{}")

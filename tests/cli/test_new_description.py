@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
+from documents.walk import blocks
 from helpers.examples import NIGHT
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -30,6 +31,10 @@ from ident_service.model.arm_model import arm_model, control_model
 from ident_service.model.base_parameters import base_parameters
 from ident_service.model.likely_bodies import perturbed_body
 from ident_service.model.outline import (
+    _DH,
+    _LIMITS,
+    _OFFSET,
+    _SCALES,
     Outline,
     arm_part,
     capsule_around,
@@ -250,10 +255,45 @@ def test_a_table_in_yaml_is_the_same_table(tmp_path: Path) -> None:
         assert (csv.limits[name].velocity or 0.0) == pytest.approx(yml.limits[name].velocity or 0.0)
 
 
+def test_the_table_of_the_documents_is_read(tmp_path: Path) -> None:
+    page = (CONFIGS.parent / "docs" / "your-own-arm.md").read_text(encoding="utf-8")
+    (table,) = (block for block in blocks(page) if block.file == "table.csv")
+    (tmp_path / "table.csv").write_text(table.text)
+    read = read_source(tmp_path / "table.csv")
+    assert read.table is not None
+    assert read.table.convention == "standard"
+    assert read.table.joints["shoulder"].model_dump() == pytest.approx(
+        {"type": "revolute", "theta": math.pi / 2, "d": 0.0, "a": 0.35, "alpha": 0.0}
+    )
+    assert read.limits["waist"].position == pytest.approx((-math.radians(170), math.radians(170)))
+    assert (read.limits["waist"].effort, read.limits["elbow"].velocity) == (40.0, None)
+    # Its page names every column and unit.
+    (_, part) = page.split("## From a DH table")
+    for word in (*_DH, *_LIMITS, "joint", _OFFSET, *filter(None, _SCALES)):
+        assert f"`{word}`" in part.partition("## ")[0]
+
+
+def test_an_offset_is_theta_or_the_d_of_a_slide(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("# convention: modified\ntype, offset, d\n, 90 deg, 0.1\nprismatic, 0.2,\n")
+    (tmp_path / "t.yaml").write_text(
+        "convention: modified\njoints: {j1: {d: 0.1, offset: 90 deg}, j2: {type: prismatic, offset: 0.2}}\n"
+    )
+    for name in ("t.csv", "t.yaml"):
+        table = read_source(tmp_path / name).table
+        assert table is not None
+        assert (table.joints["j1"].theta, table.joints["j1"].d) == pytest.approx((math.pi / 2, 0.1))
+        assert (table.joints["j2"].theta, table.joints["j2"].d) == (0.0, 0.2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
+        (
+            "t.csv",
+            "# convention: standard\na, theta, offset\n0.5, 0, 1\n",
+            "3:1: j1: offset: is another name of its theta",
+        ),
         ("t.csv", "a, alpha\n0.5, 0\n", "which convention is it? Give --convention standard"),
         ("t.csv", "# convention: standard\na, aplha\n0.5, 0\n", "t.csv:2:1: column 2: 'aplha' is none of joint, type"),
         ("t.csv", "# convention: standard\na [inch]\n5\n", "t.csv:2:1: column 1: unit 'inch' is none of rad, m"),
@@ -407,6 +447,63 @@ def test_rounded_angles_are_taken_for_exact(tmp_path: Path, capsys: pytest.Captu
 )
 def test_angles_are_called_rounded_where_all_of_them_may_be(angles: tuple[float, ...], rounded: bool) -> None:
     assert angles_barely_rounded(angles) == rounded
+
+
+@pytest.mark.slow
+def test_a_base_whose_mesh_is_not_there_has_no_geometry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = '<link name="base_link"/>'
+    assert base in BARS
+    mesh = (
+        '<link name="base_link"><collision><geometry><mesh filename="package://none/base.stl"/></geometry></collision>'
+    )
+    config, said = described(tmp_path, BARS.replace(base, f"{mesh}</link>"), capsys)
+    assert "a mesh of base, elbow, shoulder could not be read; capsules are guessed where none of a link was" in said
+    assert config.geometry["base"] == ()
+    assert config.geometry["shoulder"]
+    assert main(["config", "check", str(tmp_path / "bars.yaml")]) == 0
+
+
+@pytest.mark.parametrize("scale", ["0.001", "1 1", "0 1 1", "nan 1 1", "one"])
+def test_a_mesh_whose_scale_is_none_is_not_read(scale: str, tmp_path: Path) -> None:
+    (tmp_path / "bar.stl").write_bytes(box_stl(0.15, 0.02, 0.01))
+    here = BARS.replace("package://boxes/", "")
+    assert urdf_outline(here, tmp_path).unread == frozenset()
+    assert urdf_outline(here.replace('"2 1 1"', f'"{scale}"'), tmp_path).unread == {"upper", "lower"}
+
+
+@pytest.mark.slow
+def test_gravity_and_the_range_of_a_slide_are_the_mjcfs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "gantry.xml").write_text(
+        '<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="b">'
+        '<joint name="x" type="slide" axis="1 0 0" range="0 1.5"/><geom type="sphere" size=".1" mass="1"/>'
+        '<body name="c" pos="0 0 .2"><joint name="y" axis="0 0 1" range="-90 90"/>'
+        '<geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/></body></body></worldbody></mujoco>'
+    )
+    assert main(["new", str(tmp_path / "gantry.xml"), "--out", str(tmp_path / "gantry.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; of gantry.xml\n" in told
+    assert "in a folder made for it" not in told
+    text, config = (tmp_path / "gantry.yaml").read_text(), load_arm(tmp_path / "gantry.yaml")
+    assert "\ngravity: [0.0, -9.81, 0.0] # m/s^2 in the base frame; of gantry.xml\n" in text
+    assert config.gravity == (0.0, -9.81, 0.0)
+    assert config.joints["x"].position == (0.0, 1.5)
+    assert config.joints["y"].position == pytest.approx((-math.pi / 2, math.pi / 2))
+
+
+@pytest.mark.slow
+def test_gravity_is_turned_into_the_frame_of_a_tilted_base(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    lying = BARS.replace('<link name="base_link"/>', link("root", 1.0) + '<link name="base_link"/>').replace(
+        "</robot>", joint("wall", "fixed", "root", "base_link", "0 0 0.5 1.5707963267948966 0 0") + "</robot>"
+    )
+    (tmp_path / "bars.urdf").write_text(lying)
+    words = ["new", str(tmp_path / "bars.urdf"), "--base", "base_link", "--out", str(tmp_path / "made" / "bars.yaml")]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    assert told.splitlines()[0].endswith(
+        "bars.yaml: description written, with a simulated driver, in a folder made for it"
+    )
+    assert "gravity: 0 -9.81 0 m/s^2 in the base frame; the root of bars.urdf stands upright" in told
+    assert load_arm(tmp_path / "made" / "bars.yaml").gravity == (0.0, -9.81, 0.0)
 
 
 def test_degrees_in_limits_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

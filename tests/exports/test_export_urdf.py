@@ -167,6 +167,22 @@ def test_the_shipped_files_keep_everything_else(name: str) -> None:
     assert skeleton(text) == skeleton(original)
 
 
+def test_of_a_file_with_rounded_angles_these_are_exact_and_nothing_else_changes(tmp_path: Path) -> None:
+    rounded = FOREIGN.replace('rpy="0 0.4 0"', 'rpy="1.5708  -0.2 0"')
+    assert rounded != FOREIGN
+    arm_of_file(tmp_path, "urdf", rounded)
+    description = tmp_path / "arm.yaml"
+    description.write_text(description.read_text().replace("urdf: arm.urdf", "urdf: arm.urdf, snap: true"))
+    model = arm_model(load_arm(description))
+    delta = weights(model)
+    text, notes = written(model, delta)
+    assert 'rpy="1.5707963267948966 -0.2 0.0"' in text
+    assert "rpy: angles that kinematics.snap takes as exact have all digits, as in the model" in notes
+    without = re.compile('rpy="[^"]*"')
+    assert without.sub("", skeleton(text)) == without.sub("", skeleton(rounded))
+    assert not any(one.startswith("rpy") for one in written(foreign(tmp_path), delta)[1])
+
+
 def tag(line: str) -> str:
     found = re.match(r"[-+]\s*<(/?\w+)", line)
     assert found is not None, line

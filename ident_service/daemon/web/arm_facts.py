@@ -117,7 +117,8 @@ def joint_facts(config: ArmConfig) -> list[dict[str, Any]]:
 def _joints(config: ArmConfig) -> tuple[tuple[str, ...], tuple[bool, ...]]:
     """Return the joints' names and whether they turn; the daemon loads no parser of pinocchio for them."""
     from ident_service.model.chain import chain_from_dh
-    from ident_service.model.mechanism import count_mechanism, parse_xml, read_mechanism
+    from ident_service.model.mechanism import count_mechanism, read_mechanism
+    from ident_service.model.xml_elements import parse_xml
 
     kinematics = config.kinematics
     if kinematics.dh is not None:

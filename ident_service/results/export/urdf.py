@@ -406,6 +406,8 @@ def urdf_export(
     own = model.config.kinematics if model.config.kinematics.urdf is not None else None
     if own is not None:
         text, notes = original_urdf(model, delta, has)
+        if own.snap:
+            notes = (*notes, "rpy: angles that kinematics.snap takes as exact have all digits, as in the model")
     else:
         text = urdf_text(model, delta)
     gravity = "gravity" if model.chain.gravity.any() else ""
