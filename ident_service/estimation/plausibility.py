@@ -37,6 +37,8 @@ _TURNS = 100.0  # rad, for joints without limits
 _TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
 _JUMP = 20.0  # times the usual step between samples
 _LEAST_JUMP = 0.02  # rad or m
+_TURN, _ABOUT_A_TURN = 2.0 * np.pi, 0.5  # rad, and what a joint itself may move meanwhile
+_USUAL_OF_A_TURN = 0.1  # share of it that the usual step may be, which other turns are part of
 _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
 # Gravity alone may hold a torque on one side of zero, but seldom of so many joints at almost nothing.
@@ -135,6 +137,11 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
 def torque_missing(seen: JointQuality) -> bool:
     """Return whether a joint's torque never changes although it moves: what was recorded is not its torque."""
     return seen.torque[0] == seen.torque[1] and seen.standstill < _AT_REST
+
+
+def wrapped(seen: JointQuality) -> bool:
+    """Return whether the largest step of a revolute joint is a whole turn, which no arm moves between two samples."""
+    return abs(seen.largest_step - _TURN) < _ABOUT_A_TURN and seen.usual_step < _USUAL_OF_A_TURN * _TURN
 
 
 def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQuality]]) -> tuple[str, ...]:
@@ -299,6 +306,12 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     unit, small = ("rad", "degrees") if revolute else ("m", "millimetres")
     low, high = seen.position
     described = model.config.joints.get(name)
+    if revolute and wrapped(seen):
+        yield (
+            f"{name} jumps by {seen.largest_step:.4g} rad between two samples, {seen.where:.4g} s after the first: that"
+            " is a whole turn, as of an angle that is recorded within one turn; unwrap the positions (numpy.unwrap)"
+        )
+        return
     limits = None if described is None else described.position
     if limits is not None:
         room = _OUTSIDE * (limits[1] - limits[0])
