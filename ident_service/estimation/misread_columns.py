@@ -198,10 +198,7 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     own = estimate.candidates[estimate.chosen].moving.joint_relative_percent
     if own.max(initial=0.0) < SUSPECTED_FROM:
         return None
-    # Weights of the joints come from their errors with the columns as they are: a joint that is wrong counts less.
-    rms = estimate.candidates[estimate.chosen].moving.joint_rms
-    weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
-    weights /= np.exp(np.mean(np.log(weights)))
+    weights = weights_of_joints(estimate.candidates[estimate.chosen].moving)
     parts = _samples(recordings, estimate.prepared.model)
     as_read = _equations(estimate, parts, None, _DELAYS) if recordings else _equations_of_estimate(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
@@ -226,9 +223,9 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
             after = _constrained_error(estimate, equations.information(reading), weights)
         except SolverError:  # it explains nothing, and must not end what has been identified
             continue
-        gains = _gains(before.joint_relative_percent, after.joint_relative_percent)
-        gained = float(gains.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
-        enough = gains.sum() >= np.log(BETTER) and gains.min() >= -np.log(NONE_WORSE)
+        gained_by = gains(before, after)
+        gained = float(gained_by.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
+        enough = gained_by.sum() >= np.log(BETTER) and gained_by.min() >= -np.log(NONE_WORSE)
         if reading.of_measured_position:
             enough = enough and after.relative_percent * _WHOLE_BETTER < before.relative_percent
         if enough and after.relative_percent < EXPLAINED and (best is None or gained > most):
@@ -299,6 +296,21 @@ def _best_of_each_kind(readings: Sequence[Reading], errors: Iterable[Array], bef
         if alike not in found or gain > found[alike][0]:
             found[alike] = gain, reading
     return list(found.values())
+
+
+def weights_of_joints(as_read: TorqueError) -> Array:
+    """Return weights by the joints' errors as recordings are read: a joint that is wrong counts less; shape (joints,).
+
+    Their geometric mean is 1.
+    """
+    rms = as_read.joint_rms
+    weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
+    return np.asarray(weights / np.exp(np.mean(np.log(weights))))
+
+
+def gains(before: TorqueError, after: TorqueError) -> Array:
+    """Return per joint the logarithm of the factor by which its error shrinks, shape (joints,)."""
+    return _gains(before.joint_relative_percent, after.joint_relative_percent)
 
 
 def _constrained_error(estimate: Estimate, information: Information, weights: Array) -> TorqueError:

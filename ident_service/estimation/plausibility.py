@@ -17,13 +17,16 @@ from ident_service.config.arm import JointTerm
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
-from ident_service.estimation.misread_columns import misread_columns
+from ident_service.estimation.misread_columns import gains, misread_columns
+from ident_service.estimation.misread_gravity import misread_gravity
 from ident_service.estimation.uncertainty import jackknife, widening
 from ident_service.model.arm_model import ArmModel
 from ident_service.recordings.quality import JointQuality
 from ident_service.recordings.recording import Recording
 
 LARGEST_ERROR = 30.0  # percent of the torque (eq. 84): a controller is better off without such a model
+# A joint that feels almost nothing has a torque of noise, which no model predicts: 86 % on the KUKA's last one.
+WORSE_THAN_NOTHING, NOT_SMALL = 120.0, 0.5  # percent of a joint's torque, and of its torque on the fitted recordings
 MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and percent from which that counts
 CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
 WRONG_SIGN = 8.0  # standard deviations by which friction must be negative
@@ -81,10 +84,18 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
         recordings: that it was fitted to, to find columns that were misread; without them only wrong signs of torques
             are found.
     """
-    misread = misread_columns(estimate, recordings)
+    names = estimate.model.chain.names
+    misread, gravity = misread_columns(estimate, recordings), misread_gravity(estimate, recordings)
+    if gravity is not None and (misread is None or gravity.gained > float(gains(misread.before, misread.after).sum())):
+        return (gravity.sentence(names),)
     if misread is not None:
-        return (misread.sentence(estimate.model.chain.names),)
-    return (*_errors(estimate.candidates[estimate.chosen]), *_compare_with_unconstrained(estimate))
+        return (misread.sentence(names),)
+    own = estimate.candidates[estimate.chosen]
+    return (
+        *_errors(own),
+        *_joints_worse_than_nothing(own, names),
+        *_compare_with_unconstrained(estimate),
+    )
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
@@ -216,6 +227,26 @@ def _errors(own: Candidate) -> Iterator[str]:
             f"its torque error is {error:.0f} % where joints move on {name} but {fitted:.1f} % on the fitted"
             " recordings: compare load, tool and columns of the two recordings, and fit to a motion that excites more"
         )
+
+
+def _joints_worse_than_nothing(own: Candidate, names: Sequence[str]) -> Iterator[str]:
+    """Yield a reason for each joint whose torque is farther from what is predicted than from zero."""
+    fitted = ("the recordings that it was fitted to", own.identification, own.moving)
+    judged = [(score.recording, score.error, score.moving) for score in own.validation] or [fitted]
+    for joint, name in enumerate(names):
+        recording, whole, moving = max(judged, key=lambda one: float(one[2].joint_relative_percent[joint]))
+        error = moving.joint_relative_percent[joint]
+        usual = (
+            100.0 * own.moving.joint_rms[joint] / max(own.moving.joint_relative_percent[joint], np.finfo(float).tiny)
+        )
+        if (
+            min(error, whole.joint_relative_percent[joint]) > WORSE_THAN_NOTHING
+            and moving.joint_rms[joint] > NOT_SMALL * usual
+        ):
+            yield (
+                f"the torque of {name} is off by {error:.0f} % of itself where it moves on {recording}, so that none at"
+                " all would be a better prediction: compare unit, gear and column of its torque and its position"
+            )
 
 
 def _compare_with_unconstrained(estimate: Estimate) -> Iterator[str]:
