@@ -48,6 +48,7 @@ _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
 _JOINTS_WITH_SIGN, _NEARLY_NOTHING = 4, 0.01  # and share of a joint's largest torque
 _CLIPPED, _CLIPPED_ERROR = 0.05, 10.0  # share of the samples, and percent of the joint's torque, only together
 _WEAKEST = 0.005  # of its limit, that the torque of some joint reaches in every motion
+_GOES_ON = 0.1  # of a joint's whole range of torque, in which it changes while a position is frozen
 _AT_REST = 0.9  # share of the time at standstill from which a joint need not feel a changing torque
 
 
@@ -367,6 +368,14 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
         yield (
             f"{name} jumps by {seen.largest_step:.3g} {unit} between two samples, {seen.usual_step:.2g} as a rule: cut"
             f" or mend the samples {seen.where:.4g} s after the first"
+        )
+    frozen = seen.frozen
+    if frozen is not None and frozen.torque[1] - frozen.torque[0] > _GOES_ON * (seen.torque[1] - seen.torque[0]):
+        yield (
+            f"the position of {name} stops changing {frozen.where:.4g} s after the first sample, from one sample to the"
+            f" next, while it moves at {frozen.speed:.2g} {unit}/s, and its torque goes on changing: for"
+            f" {frozen.seconds:.3g} s its encoder was frozen, or the joint blocked; leave that time out"
+            " (FILE@START:END), or record again"
         )
     if torque_missing(seen):
         yield (
