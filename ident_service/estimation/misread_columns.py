@@ -50,7 +50,7 @@ _DELAYS = 3e-3 * np.sign(_BOTH_WAYS) * 1.15 ** np.abs(_BOTH_WAYS)  # s; to half 
 _GEARS = 1.5 ** np.array([n for n in range(-13, 14) if n])  # of a position: to two hundred
 _ZEROS = np.radians([n for n in range(-150, 181, 30) if n])  # that a position may be off by
 _FINER = 3  # times that the best of these are made finer, by halves
-_CONCERNED, _WHOLE_BETTER = 4.0, 1.3  # percent of all torques to try these, and factor by which it must shrink
+WHOLE_CONCERNED, _WHOLE_BETTER = 4.0, 1.3  # percent of all torques to try these, and factor by which it must shrink
 
 _NO_DELAYS = np.empty(0)
 
@@ -199,12 +199,9 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     """
     moving = estimate.candidates[estimate.chosen].moving
     own = moving.joint_relative_percent
-    if own.max(initial=0.0) < SUSPECTED_FROM and moving.relative_percent < _CONCERNED:
+    if own.max(initial=0.0) < SUSPECTED_FROM and moving.relative_percent < WHOLE_CONCERNED:
         return None
-    # Weights of the joints come from their errors with the columns as they are: a joint that is wrong counts less.
-    rms = moving.joint_rms
-    weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
-    weights /= np.exp(np.mean(np.log(weights)))
+    weights = weights_of_joints(moving)
     parts = _samples(recordings, estimate.prepared.model)
     as_read = _equations(estimate, parts, None, _DELAYS) if recordings else _equations_of_estimate(estimate)
     before = _constrained_error(estimate, as_read.information(None), weights)
@@ -232,9 +229,9 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
             after = _constrained_error(estimate, equations.information(reading), weights)
         except SolverError:  # it explains nothing, and must not end what has been identified
             continue
-        gains = _gains(before.joint_relative_percent, after.joint_relative_percent)
-        gained = float(gains.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
-        enough = gains.sum() >= np.log(BETTER) and gains.min() >= -np.log(NONE_WORSE)
+        gained_by = gains(before, after)
+        gained = float(gained_by.sum()) - (0.0 if reading.negates else np.log(LIKELIER))
+        enough = gained_by.sum() >= np.log(BETTER) and gained_by.min() >= -np.log(NONE_WORSE)
         if reading.is_measured and reading.which != "torque":
             enough = enough and after.relative_percent * _WHOLE_BETTER < before.relative_percent
         if enough and after.relative_percent < EXPLAINED and (best is None or gained > most):
@@ -272,7 +269,7 @@ def _of_positions(
 
     kinds: tuple[_Which, ...] = ("position", "both")
     found = tried([one for which in kinds for one in _signs_and_exchanges(which, estimate, joints)])
-    if before.relative_percent < _CONCERNED:
+    if before.relative_percent < WHOLE_CONCERNED:
         return found
     thin = [replace(part, some=part.some[slice(None, None, _THINNED)]) for part in parts]
     for joint in range(estimate.model.chain.joints):  # those before it feel it, too
@@ -311,6 +308,21 @@ def _best_of_each_kind(readings: Sequence[Reading], errors: Iterable[Array], bef
         if alike not in found or gain > found[alike][0]:
             found[alike] = gain, reading
     return list(found.values())
+
+
+def weights_of_joints(as_read: TorqueError) -> Array:
+    """Return weights by the joints' errors as recordings are read: a joint that is wrong counts less; shape (joints,).
+
+    Their geometric mean is 1.
+    """
+    rms = as_read.joint_rms
+    weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
+    return np.asarray(weights / np.exp(np.mean(np.log(weights))))
+
+
+def gains(before: TorqueError, after: TorqueError) -> Array:
+    """Return per joint the logarithm of the factor by which its error shrinks, shape (joints,)."""
+    return _gains(before.joint_relative_percent, after.joint_relative_percent)
 
 
 def _constrained_error(estimate: Estimate, information: Information, weights: Array) -> TorqueError:

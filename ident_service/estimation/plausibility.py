@@ -17,13 +17,16 @@ from ident_service.config.arm import JointTerm
 from ident_service.estimation.feasible.problems import constrained_least_squares
 from ident_service.estimation.identify import Candidate, Estimate
 from ident_service.estimation.least_squares import TorqueError, ordinary_least_squares, torque_error
-from ident_service.estimation.misread_columns import misread_columns
+from ident_service.estimation.misread_columns import gains, misread_columns
+from ident_service.estimation.misread_gravity import misread_gravity
 from ident_service.estimation.uncertainty import jackknife, widening
 from ident_service.model.arm_model import ArmModel
 from ident_service.recordings.quality import JointQuality
 from ident_service.recordings.recording import Recording
 
 LARGEST_ERROR = 30.0  # percent of the torque (eq. 84): a controller is better off without such a model
+# A joint that feels almost nothing has a torque of noise, which no model predicts: 86 % on the KUKA's last one.
+WORSE_THAN_NOTHING, NOT_SMALL = 120.0, 0.5  # percent of a joint's torque, and of its torque on the fitted recordings
 MUCH_WORSE, WORSE_FROM = 4.0, 10.0  # times the error on what was fitted to, and percent from which that counts
 CONSTRAINED_WORSE, CONSTRAINED_FROM = 1.8, 2.0  # times the unconstrained error, and percent from which that counts
 WRONG_SIGN = 8.0  # standard deviations by which friction must be negative
@@ -37,12 +40,15 @@ _TURNS = 100.0  # rad, for joints without limits
 _TOO_FAST, _TOO_STRONG = 4.0, 4.0  # times the limit of the description
 _JUMP = 20.0  # times the usual step between samples
 _LEAST_JUMP = 0.02  # rad or m
+_TURN, _ABOUT_A_TURN = 2.0 * np.pi, 0.5  # rad, and what a joint itself may move meanwhile
+_USUAL_OF_A_TURN = 0.1  # share of it that the usual step may be, which other turns are part of
 _DENSITY = 1000.0  # kg for an arm of one metre, growing with its volume
 _SAMPLES_OF_A_JUMP = 100  # with fewer samples the usual step is unknown
 # Gravity alone may hold a torque on one side of zero, but seldom of so many joints at almost nothing.
 _JOINTS_WITH_SIGN, _NEARLY_NOTHING = 4, 0.01  # and share of a joint's largest torque
 _CLIPPED, _CLIPPED_ERROR = 0.05, 10.0  # share of the samples, and percent of the joint's torque, only together
 _WEAKEST = 0.005  # of its limit, that the torque of some joint reaches in every motion
+_GOES_ON = 0.1  # of a joint's whole range of torque, in which it changes while a position is frozen
 _AT_REST = 0.9  # share of the time at standstill from which a joint need not feel a changing torque
 
 
@@ -79,10 +85,18 @@ def reasons_against(estimate: Estimate, recordings: Sequence[Recording] = ()) ->
         recordings: that it was fitted to, to find columns that were misread; without them only wrong signs of torques
             are found.
     """
-    misread = misread_columns(estimate, recordings)
+    names = estimate.model.chain.names
+    misread, gravity = misread_columns(estimate, recordings), misread_gravity(estimate, recordings)
+    if gravity is not None and (misread is None or gravity.gained > float(gains(misread.before, misread.after).sum())):
+        return (gravity.sentence(names),)
     if misread is not None:
-        return (misread.sentence(estimate.model.chain.names),)
-    return (*_errors(estimate.candidates[estimate.chosen]), *_compare_with_unconstrained(estimate))
+        return (misread.sentence(names),)
+    own = estimate.candidates[estimate.chosen]
+    return (
+        *_errors(own),
+        *_joints_worse_than_nothing(own, names),
+        *_compare_with_unconstrained(estimate),
+    )
 
 
 def reasons_in_length(estimate: Estimate, seconds: float) -> tuple[str, ...]:
@@ -135,6 +149,11 @@ def reasons_in_recording(recording: str, joints: Sequence[JointQuality], model: 
 def torque_missing(seen: JointQuality) -> bool:
     """Return whether a joint's torque never changes although it moves: what was recorded is not its torque."""
     return seen.torque[0] == seen.torque[1] and seen.standstill < _AT_REST
+
+
+def wrapped(seen: JointQuality) -> bool:
+    """Return whether the largest step of a revolute joint is a whole turn, which no arm moves between two samples."""
+    return abs(seen.largest_step - _TURN) < _ABOUT_A_TURN and seen.usual_step < _USUAL_OF_A_TURN * _TURN
 
 
 def torque_clipped(estimate: Estimate, recordings: Sequence[Sequence[JointQuality]]) -> tuple[str, ...]:
@@ -209,6 +228,26 @@ def _errors(own: Candidate) -> Iterator[str]:
             f"its torque error is {error:.0f} % where joints move on {name} but {fitted:.1f} % on the fitted"
             " recordings: compare load, tool and columns of the two recordings, and fit to a motion that excites more"
         )
+
+
+def _joints_worse_than_nothing(own: Candidate, names: Sequence[str]) -> Iterator[str]:
+    """Yield a reason for each joint whose torque is farther from what is predicted than from zero."""
+    fitted = ("the recordings that it was fitted to", own.identification, own.moving)
+    judged = [(score.recording, score.error, score.moving) for score in own.validation] or [fitted]
+    for joint, name in enumerate(names):
+        recording, whole, moving = max(judged, key=lambda one: float(one[2].joint_relative_percent[joint]))
+        error = moving.joint_relative_percent[joint]
+        usual = (
+            100.0 * own.moving.joint_rms[joint] / max(own.moving.joint_relative_percent[joint], np.finfo(float).tiny)
+        )
+        if (
+            min(error, whole.joint_relative_percent[joint]) > WORSE_THAN_NOTHING
+            and moving.joint_rms[joint] > NOT_SMALL * usual
+        ):
+            yield (
+                f"the torque of {name} is off by {error:.0f} % of itself where it moves on {recording}, so that none at"
+                " all would be a better prediction: compare unit, gear and column of its torque and its position"
+            )
 
 
 def _compare_with_unconstrained(estimate: Estimate) -> Iterator[str]:
@@ -299,6 +338,12 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
     unit, small = ("rad", "degrees") if revolute else ("m", "millimetres")
     low, high = seen.position
     described = model.config.joints.get(name)
+    if revolute and wrapped(seen):
+        yield (
+            f"{name} jumps by {seen.largest_step:.4g} rad between two samples, {seen.where:.4g} s after the first: that"
+            " is a whole turn, as of an angle that is recorded within one turn; unwrap the positions (numpy.unwrap)"
+        )
+        return
     limits = None if described is None else described.position
     if limits is not None:
         room = _OUTSIDE * (limits[1] - limits[0])
@@ -323,6 +368,14 @@ def _of_joint(name: str, seen: JointQuality, model: ArmModel, *, revolute: bool)
         yield (
             f"{name} jumps by {seen.largest_step:.3g} {unit} between two samples, {seen.usual_step:.2g} as a rule: cut"
             f" or mend the samples {seen.where:.4g} s after the first"
+        )
+    frozen = seen.frozen
+    if frozen is not None and frozen.torque[1] - frozen.torque[0] > _GOES_ON * (seen.torque[1] - seen.torque[0]):
+        yield (
+            f"the position of {name} stops changing {frozen.where:.4g} s after the first sample, from one sample to the"
+            f" next, while it moves at {frozen.speed:.2g} {unit}/s, and its torque goes on changing: for"
+            f" {frozen.seconds:.3g} s its encoder was frozen, or the joint blocked; leave that time out"
+            " (FILE@START:END), or record again"
         )
     if torque_missing(seen):
         yield (

@@ -174,6 +174,7 @@ def record_motion(
     metadata = {"arm": model.config.name, "arm_sha256": model.config.sha256, "motion": motion.name}
     description = urdf_text(model, model.prior, visible_bodies(model))
     metadata["clock"] = "virtual" if arm.clock.lock_step else "monotonic"
+    metadata["driver"] = "" if model.config.driver is None else model.config.driver.kind
     recorder = RecorderProcess(
         path,
         model.chain.names,

@@ -458,6 +458,7 @@ def run_motion(
         attachments["excitation.json"] = excitation.encode()
     metadata = {"arm": config.name, "arm_sha256": config.sha256, "motion": name, "speed": repr(speed)}
     metadata["clock"] = "virtual" if clock.lock_step else "monotonic"
+    metadata["driver"] = "" if config.driver is None else config.driver.kind
     recording = folder / "run.mcap"
     description = urdf_text(model, model.prior, visible_bodies(model))
     recorder = RecorderProcess(

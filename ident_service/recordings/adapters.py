@@ -114,6 +114,16 @@ def time_range(recording: Recording) -> tuple[float, float]:
     return (recording.start, recording.end) if isinstance(recording, RangeRecording) else (-np.inf, np.inf)
 
 
+def driver_of(recording: Recording) -> str:
+    """Return the kind of driver that a recording of this package was made with; empty where it does not say."""
+    if isinstance(recording, McapRecording):
+        # Files of earlier versions tell their clock alone; virtual time is that of simulated arms.
+        virtual = recording.metadata.get("clock") == "virtual"
+        return recording.metadata.get("driver", "simulated" if virtual else "")
+    whole = getattr(recording, "whole", None)
+    return "" if whole is None else driver_of(whole)
+
+
 def overlap(one: Recording, other: Recording) -> bool:
     """Return whether two recordings share samples: those of the same file, unless their ranges do not overlap."""
     (start, end), (other_start, other_end) = time_range(one), time_range(other)

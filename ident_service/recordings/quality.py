@@ -28,6 +28,30 @@ MUCH_JITTER: Final = 0.05  # of a period, standard deviation
 _MUCH_SATURATION: Final = 0.001
 _MUCH_STANDSTILL: Final = 0.5
 _LEAST_STEP: Final = 1e-12  # below is the rounding of numbers of the size of an angle
+FROZEN: Final = 0.5  # s for which a position must not change
+_FROZEN_OVER: Final = 0.005  # s, over which the speed before is measured, twice
+# A joint that comes to rest is slower over the second of the two, and has few counts of its encoder in it: to be as
+# fast to a quarter, it has to brake twice as hard as this in that time, or from one sample to the next.
+_EVEN, _FROZEN_COUNTS = 0.25, 8.0
+_FROZEN_SPEED, _FROZEN_BRAKING = 0.05, 20.0  # rad/s and rad/s^2, or m/s and m/s^2
+_SETTLED: Final = 0.25  # s after which a torque has come to rest with its joint
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """A stretch of time in which a position stays as it is, though the joint moved evenly up to the sample before.
+
+    Attributes:
+        where: it begins [s] after the first sample of the recording.
+        speed: of the joint just before [rad/s or m/s].
+        seconds: that it lasts.
+        torque: smallest and largest in it, after a quarter of a second [N m or N].
+    """
+
+    where: float
+    speed: float
+    seconds: float
+    torque: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -50,6 +74,7 @@ class JointQuality:
         where: that step ends [s] after the first sample.
         usual_step: root mean square of all other steps [rad or m].
         steps: their number.
+        frozen: the longest stretch of time in which the position is frozen; None for none.
     """
 
     name: str
@@ -65,6 +90,7 @@ class JointQuality:
     steps: int = 0
     position_at: tuple[float, float] = (0.0, 0.0)
     clipped: float = 0.0
+    frozen: Frozen | None = None
 
 
 @dataclass(frozen=True)
@@ -201,6 +227,7 @@ class _Joints:
         self._still, self._pairs = np.zeros(joints), 0
         self._timing = ArrivalTest(stamps)
         self._plateaus = [(_Plateau(), _Plateau()) for _ in range(joints)]
+        self._rests = [_Rests(stamps) for _ in range(joints)]
 
     def add(self, block: Block) -> None:
         """Add the next samples to the statistics."""
@@ -233,6 +260,8 @@ class _Joints:
         for joint, (top, bottom) in enumerate(self._plateaus):
             top.add(torque[:, joint], moves[:, joint])
             bottom.add(-torque[:, joint], moves[:, joint])
+        for joint, rests in enumerate(self._rests):
+            rests.add(block.stamp_ns, position[:, joint], torque[:, joint])
         self._tail = cut(run, max(0, len(run.stamp_ns) - lag), len(run.stamp_ns))
 
     def _usual(self, joint: int) -> float:
@@ -282,6 +311,7 @@ class _Joints:
                     steps=self._steps,
                     position_at=(float(self._position_at[0, k]), float(self._position_at[1, k])),
                     clipped=clipped / samples,
+                    frozen=self._rests[k].frozen(),
                 )
             )
         return tuple(found)
@@ -318,3 +348,93 @@ class _Plateau:
     def samples(self) -> int:
         """Return the number of samples in runs of at least `PLATEAU`."""
         return self._counted + (self._run if self._run >= PLATEAU else 0)
+
+
+class _Rests:
+    """Find long stretches of time in which a position does not change at all, and how the joint moved before."""
+
+    def __init__(self, stamps: Grid) -> None:
+        self._period, self._first_ns = stamps.own_period_s, stamps.first_ns
+        self._lag = max(1, round(_FROZEN_OVER / self._period))
+        self._least = max(1, round(FROZEN / self._period))  # steps
+        self._settled = round(_SETTLED / self._period)
+        self._times, self._positions = np.empty(0, np.int64), np.empty(0)  # of the last samples
+        self._smallest = np.inf
+        self._open: _Rest | None = None
+        self._found: list[_Rest] = []
+
+    def add(self, stamps_ns: NDArray[np.int64], position: Array, torque: Array) -> None:
+        """Add the next samples, shape (samples,)."""
+        known = len(self._positions)
+        times, positions = np.concatenate([self._times, stamps_ns]), np.concatenate([self._positions, position])
+        steps = np.abs(np.diff(positions[max(known - 1, 0) :]))
+        moved = steps[steps > _LEAST_STEP]
+        self._smallest = min(self._smallest, float(moved.min(initial=np.inf)))
+        same = np.concatenate([[False], steps <= _LEAST_STEP, [False]])
+        edges = np.flatnonzero(np.diff(same))
+        origin = max(known - 1, 0)  # of the steps' numbers among all samples at hand
+        goes_on = bool(len(same) > 2 and same[1]) and self._open is not None
+        if self._open is not None and not goes_on:
+            self._close()
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+            first, last = begin + origin, end + origin
+            ends_here = last == len(positions) - 1
+            if not (goes_on and begin == 0):
+                if not ends_here and end - begin < self._least:
+                    continue
+                self._open = self._begun(times, positions, first)
+            if self._open is not None:
+                self._open.extend(torque[max(first + 1 - known, 0) : last + 1 - known], self._settled)
+                if not ends_here:
+                    self._close()
+        keep = max(len(positions) - 2 * self._lag - 1, 0)
+        self._times, self._positions = times[keep:], positions[keep:]
+
+    def _begun(self, times: NDArray[np.int64], positions: Array, first: int) -> _Rest | None:
+        """Return the stretch that begins with a sample; None where the joint did not move evenly up to it."""
+        lag = self._lag
+        if first < 2 * lag:
+            return None
+        seconds = (times[first] - times[first - 2 * lag]) * 1e-9
+        before, last = positions[first - lag] - positions[first - 2 * lag], positions[first] - positions[first - lag]
+        uneven = abs(last - before) > _EVEN * abs(last)
+        over = lag * self._period
+        slow = abs(last) < max(_FROZEN_SPEED, _FROZEN_BRAKING * over) * over
+        if uneven or slow or seconds > 3.0 * over:
+            return None
+        return _Rest((int(times[first]) - self._first_ns) * 1e-9, float(abs(last)))
+
+    def _close(self) -> None:
+        if self._open is not None and self._open.steps >= self._least:
+            self._found.append(self._open)
+        self._open = None
+
+    def frozen(self) -> Frozen | None:
+        """Return the longest stretch that no joint comes to rest in."""
+        if self._open is not None:
+            self._close()
+        enough = _FROZEN_COUNTS * self._smallest
+        found = [one for one in self._found if one.last >= enough and one.low <= one.high]
+        if not found:
+            return None
+        rest = max(found, key=lambda one: one.steps)
+        speed = rest.last / (self._lag * self._period)
+        return Frozen(rest.where, speed, rest.steps * self._period, (rest.low, rest.high))
+
+
+@dataclass
+class _Rest:
+    """Stretch in which a position does not change, after a step [rad or m] of the joint."""
+
+    where: float
+    last: float
+    steps: int = 0
+    low: float = np.inf
+    high: float = -np.inf
+
+    def extend(self, torque: Array, settled: int) -> None:
+        """Add samples; the torques of the first `settled` do not count."""
+        counted = torque[max(settled - self.steps, 0) :]
+        self.low = min(self.low, float(counted.min(initial=np.inf)))
+        self.high = max(self.high, float(counted.max(initial=-np.inf)))
+        self.steps += len(torque)

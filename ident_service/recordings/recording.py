@@ -232,10 +232,14 @@ class _Check:
         if problems:
             index, problem = min(problems)
             after = (int(piece.stamp_ns[index]) - (self._first_ns or 0)) * 1e-9
+            before = int(piece.stamp_ns[index] - step[index])
+            # Of a clock that began anew the stamps stay behind; the pieces that follow are not known here.
+            anew = step[index] < 0 and (piece.stamp_ns[index + 1 : index + 2] <= before).all()
+            remedy = "remove the samples from there on" if anew else "remove this sample, and others like it"
             raise RecordingError(
                 self._path,
                 f"{self._place(self._seen + int(self._order[index]))}, {after:.6f} s after the first: {problem}; "
-                "remove the samples from there on, or record again",
+                f"{remedy}, or record again",
             )
 
     def _not_finite(self, what: str, values: Matrix) -> tuple[int, str] | None:

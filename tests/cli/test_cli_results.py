@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from cli.conftest import Commissioned, Ended, Ident, left_over
 
+from ident_service.results.evidence.file import read_evidence
 from ident_service.results.run_folder import read_results, write_manifest
 
 
@@ -172,3 +173,15 @@ def test_figures_do_not_go_into_the_results(folder: Path, ident: Ident) -> None:
     ended = ident("figures", folder, "--out", folder)
     assert ended.code == 2
     assert "holds the results" in ended.err
+
+
+def test_evidence_says_with_which_driver_its_recordings_were_made(
+    quick: Commissioned, ident: Ident, tmp_path: Path
+) -> None:
+    recordings = sorted(quick.folder.glob("*.mcap"))
+    ended = ident("identify", f"{recordings[0]}@0.5:", "--arm", quick.arm, "--out", tmp_path / "again")
+    assert ended.code in (0, 3)
+    for folder in (quick.folder, tmp_path / "again"):
+        evidence = read_evidence(folder / "evidence.json")
+        assert {one.driver for one in evidence.recordings} == {"simulated"}
+        assert "no commissioning of a real arm" in (folder / "report.html").read_text()

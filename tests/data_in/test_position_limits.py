@@ -1,4 +1,4 @@
-"""Positions outside the limits of a description: told with joint, value and time."""
+"""Positions outside the limits of a description, or wrapped: told with joint, value and time."""
 
 from __future__ import annotations
 
@@ -66,3 +66,32 @@ def test_inside_and_noise_at_a_limit_are_neither() -> None:
         seen = seen_of(4096, row=1200, to=to)
         assert remarks_on_limits("run.csv", seen, model) == ()
         assert reasons_in_recording("run.csv", seen, model) == ()
+
+
+def turning(speed: float, low: float) -> tuple[JointQuality, ...]:
+    """Joints that turn steadily for 15 s; the second is told within one turn, from `low` on."""
+    position = (speed * np.arange(3000) * 0.005)[:, None] * np.ones(2)
+    position[:, 0] *= 0.1
+    position[:, 1] = (position[:, 1] - low) % (2.0 * np.pi) + low
+    return quality(MadeRecording(10**18 + np.arange(3000) * PERIOD_NS, position, position), RecordingFormat()).joints
+
+
+@pytest.mark.parametrize(("speed", "low"), [(0.3, -np.pi), (12.0, 0.0), (12.0, -np.pi)])
+def test_a_wrapped_angle_is_told_as_such(speed: float, low: float) -> None:
+    """It was asked whether the positions are in degrees, or samples were to be cut."""
+    model = planar((-3.14, 3.14), (-3.14, 3.14))
+    reasons = reasons_in_recording("run.csv", turning(speed, low), model)
+    (reason,) = [one for one in reasons if model.chain.names[1] in one]
+    assert "that is a whole turn" in reason
+    assert "unwrap the positions" in reason
+    assert f"jumps by {2.0 * np.pi - 0.005 * speed:.4g} rad" in reason
+
+
+@pytest.mark.parametrize("factor", [1.0, np.degrees(1.0)])
+def test_another_jump_and_a_joint_in_degrees_are_no_whole_turn(factor: float) -> None:
+    model = planar((-1.0, 1.0), (-3.14, 3.14))
+    position = 1.5 * np.sin(np.arange(3000) * 0.01)[:, None] * np.array([0.1, factor])
+    position[1500:, 1] += 3.0 if factor == 1.0 else 0.0
+    seen = quality(MadeRecording(10**18 + np.arange(3000) * PERIOD_NS, position, position), RecordingFormat()).joints
+    (reason,) = [one for one in reasons_in_recording("run.csv", seen, model) if model.chain.names[1] in one]
+    assert "whole turn" not in reason

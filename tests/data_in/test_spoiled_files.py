@@ -135,6 +135,27 @@ def test_a_spoiled_file_is_refused_with_its_place(name: str, tmp_path: Path) -> 
     assert str(caught.value).startswith(f"{tmp_path}/run.csv: ")
 
 
+def swapped_rows(lines: list[str]) -> list[str]:
+    return [*lines[:5], lines[6], lines[5], *lines[7:]]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (REFUSED["infinite"][0], "remove this sample, and others like it"),
+        (rows(lambda lines: [*lines[:9], f"{lines[8].split(',')[0]},9,9,9,9", *lines[9:]]), "remove this sample"),
+        (rows(swapped_rows), "remove this sample"),
+        (REFUSED["rows twice"][0], "remove the samples from there on"),
+        (rows(lambda lines: [*lines, lines[0]]), "remove the samples from there on"),
+    ],
+)
+def test_one_bad_sample_costs_no_others(spoil: Callable[[str], str], words: str, tmp_path: Path) -> None:
+    """For one infinite torque or one repeated stamp the rest of the recording was to go."""
+    (tmp_path / "run.csv").write_text(spoil(good()))
+    with pytest.raises(RecordingError, match=f"; {words}"):
+        grid(open_recording(tmp_path / "run.csv", JOINTS), RecordingFormat())
+
+
 READ: dict[str, Callable[[str], str]] = {
     "byte order mark": lambda text: f"\ufeff{text}",
     "line ends of Windows": lambda text: text.replace("\n", "\r\n"),

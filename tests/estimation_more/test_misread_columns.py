@@ -16,7 +16,7 @@ from ident_service.estimation import misread_columns as misread_module
 from ident_service.estimation import signal_processing
 from ident_service.estimation.identify import Estimate, identify
 from ident_service.estimation.misread_columns import Reading, misread_columns
-from ident_service.estimation.plausibility import reasons_against
+from ident_service.estimation.plausibility import LARGEST_ERROR, reasons_against
 from ident_service.model.arm_model import ArmModel, arm_model
 from ident_service.recordings.adapters import RangeRecording
 from ident_service.recordings.cached_recording import CachedRecording
@@ -113,6 +113,29 @@ def test_the_scale_of_a_position_and_the_columns_of_a_motor_are_named(which: Any
         "the position of elbow seems to have another unit" if which == "position" else "seem to be those of its motor"
     )
     assert seen in reason
+
+
+def unlike(right: SampledRecording) -> SampledRecording:
+    """An elbow whose torque is that of something else, while the shoulder tells what it should be."""
+    torque = right.torque.copy()
+    torque[:, 1] = 0.05 * np.random.default_rng(5).normal(size=len(torque))
+    return replace(right, torque=torque)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("validated", [True, False])
+def test_a_joint_whose_torque_is_predicted_worse_than_by_zero_is_a_reason(validated: bool) -> None:
+    """The error of the whole arm is small; formerly nothing was said against it."""
+    model, right = elbowed()
+    other = replace(with_noise(model, waves(5, 2, highest=0.8)), sha256="5" * 64)
+    recording, unseen = unlike(right), [unlike(other)] if validated else []
+    estimate = identify(model, [recording], unseen, method="ols")
+    own = estimate.candidates[estimate.chosen]
+    judged = own.validation[0].moving if validated else own.moving
+    assert judged.relative_percent < LARGEST_ERROR
+    assert judged.joint_relative_percent[1] > 120.0
+    reasons = reasons_against(estimate, [recording])
+    assert any("the torque of elbow is off by" in one and "none at all" in one for one in reasons), reasons
 
 
 def test_it_is_found_where_both_sides_of_the_equations_are_filtered() -> None:

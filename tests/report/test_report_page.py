@@ -384,11 +384,27 @@ def test_warnings_are_listed(tmp_path: Path) -> None:
     assert "correct what the warnings name" in top.words
 
 
-def test_a_simulated_arm_cannot_pass_for_a_real_one(good: Made) -> None:
-    simulated = good.config.model_copy(update={"driver": SimulatedDriver(kind="simulated")})
-    for config, told in ((simulated, True), (good.config, False)):
-        page = report_html(good.evidence, good.parameters, config, {})
-        assert ("no commissioning of a real arm" in parsed(page).one("header").words) is told
+@pytest.mark.parametrize(
+    ("described", "recorded", "words"),
+    [
+        (True, "simulated", "The arm is simulated: this is no commissioning of a real arm."),
+        (False, "simulated", "The arm is simulated: this is no commissioning of a real arm."),
+        (True, "canopen", ""),  # formerly no commissioning, either
+        (True, "", "The description is of a simulated arm; its recordings do not say which arm they are of."),
+        (False, "", ""),
+        (False, "canopen", ""),
+    ],
+)
+def test_a_simulated_arm_cannot_pass_for_a_real_one_nor_a_real_one_for_it(
+    described: bool, recorded: str, words: str, good: Made
+) -> None:
+    driver = SimulatedDriver(kind="simulated") if described else good.config.driver
+    recordings = tuple(replace(one, driver=recorded) for one in good.evidence.recordings)
+    config = good.config.model_copy(update={"driver": driver})
+    page = report_html(replace(good.evidence, recordings=recordings), good.parameters, config, {})
+    header = parsed(page).one("header").words
+    assert words in header
+    assert ("simulated" in header) is bool(words)
 
 
 def test_the_friction_s_shape_is_in_its_section(good: Made) -> None:

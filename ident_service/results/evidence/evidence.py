@@ -109,6 +109,8 @@ class PredictionTrace:
         joints: one per joint.
         spectra: one per joint; empty where the recording is too short for one.
         spikes: one per joint, None of a joint that never moves; empty in files of earlier versions.
+        driver: kind of driver that the recording says it was made with; empty for files of others and of earlier
+            versions.
     """
 
     name: str
@@ -119,6 +121,7 @@ class PredictionTrace:
     joints: tuple[JointTrace, ...]
     spectra: tuple[Spectrum, ...]
     spikes: tuple[Spike | None, ...] = ()
+    driver: str = ""
 
 
 @dataclass(frozen=True)

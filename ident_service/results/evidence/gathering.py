@@ -29,7 +29,7 @@ from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.blas_threads import one_blas_thread
 from ident_service.model.kinematics import branches, frame_origins, link_poses
 from ident_service.model.parameter_layout import TERM_SYMBOLS, Layout
-from ident_service.recordings.adapters import RangeRecording
+from ident_service.recordings.adapters import RangeRecording, driver_of
 from ident_service.recordings.mcap_reader import Cycles, McapRecording, read_cycles
 from ident_service.recordings.recording import Recording
 from ident_service.results.evidence.evidence import (
@@ -654,6 +654,7 @@ class _TraceCollector:
             joints=traces,
             spectra=self._spectra(),
             spikes=tuple(self._spikes),
+            driver=driver_of(recording),
         )
 
     def _spectra(self) -> tuple[Spectrum, ...]:

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ident_service.config.arm import ArmConfig
-from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, NEGLIGIBLE_TORQUE, WEAK_BELOW, Verdict
 from ident_service.model.arm_model import arm_model
 from ident_service.recordings.quality import MUCH_JITTER
@@ -31,7 +30,7 @@ from ident_service.results.report.figures import (
     relative_deviations,
 )
 from ident_service.results.report.rendering import WORST, Cell, Table, asset, render, vendored
-from ident_service.results.report.verdict import SIMULATED, next_steps, verdict
+from ident_service.results.report.verdict import next_steps, simulated, verdict
 from ident_service.results.summary import WHAT_THEN, noise_and_model, rows_and_filter
 
 _NOTHING = Cell("\u2014")
@@ -277,7 +276,6 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
     found = assess(content)
     order = [one.place for one in found.joints] or list(range(len(evidence.joints)))
     drawn = figures(evidence, parameters, arm_model(config, bodies=False).chain)
-    simulated = isinstance(config.driver, SimulatedDriver)
     link_values = content.get("link_parameters", {})
     return render(
         "report.html",
@@ -285,7 +283,7 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
         styles=(vendored("uPlot.min.css"),),
         title=f"Identification of {config.name}",
         subtitle=_subtitle(parameters, config),
-        simulated=SIMULATED if simulated else "",
+        simulated=simulated(evidence, config),
         assessment=found,
         joints=assessment_table(found),
         joint_rule=joint_rule(),

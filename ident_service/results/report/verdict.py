@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ident_service.config.arm import ArmConfig
+from ident_service.config.simulation import SimulatedDriver
 from ident_service.estimation.uncertainty import IDENTIFIED_BELOW, WEAK_BELOW
 from ident_service.results.assessment import (
     MUCH_WORSE,
@@ -52,8 +54,18 @@ def listed(names: Sequence[str]) -> str:
 
 
 SIMULATED = "The arm is simulated: this is no commissioning of a real arm."
+PERHAPS_SIMULATED = "The description is of a simulated arm; its recordings do not say which arm they are of."
 # The page repeats a file, which anybody may have written; only the verifier, with the arm, can tell.
 _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` checks it in exact arithmetic."
+
+
+def simulated(evidence: Evidence, config: ArmConfig) -> str:
+    """Return that the recordings are of a simulated arm, or may be; empty where they are of a real one."""
+    drivers = {one.driver for one in evidence.recordings}
+    if "simulated" in drivers:
+        return SIMULATED
+    unknown = "" in drivers and isinstance(config.driver, SimulatedDriver)
+    return PERHAPS_SIMULATED if unknown else ""
 
 
 def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
