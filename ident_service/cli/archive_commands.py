@@ -53,14 +53,20 @@ def terminal_user(arguments: argparse.Namespace) -> str:
 
 
 @contextmanager
-def registry(arguments: argparse.Namespace) -> Iterator[tuple[Database, Path]]:
-    """Open the registry of the state folder that a verb works on, shipped arms entered; yield it and the folder."""
+def registry(arguments: argparse.Namespace, *, arms: bool = True) -> Iterator[tuple[Database, Path]]:
+    """Open the registry of the state folder that a verb works on; yield it and the folder.
+
+    Args:
+        arguments: of the verb.
+        arms: whether it is about arms, so that shipped ones are entered.
+    """
     from ident_service.registry.arms import know_shipped
     from ident_service.registry.database import Database
 
     state = writable_state_folder(arguments)
     with Database(state) as db:
-        know_shipped(db)
+        if arms:
+            know_shipped(db)
         yield db, state
 
 

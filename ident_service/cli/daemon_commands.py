@@ -100,7 +100,7 @@ def _serve(arguments: argparse.Namespace) -> Answer:
 def _add(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.tokens import add_token
 
-    with registry(arguments) as (db, _):
+    with registry(arguments, arms=False) as (db, _):
         secret = add_token(db, arguments.name, arguments.role, terminal_user(arguments))
     return DONE, f"{secret}\n", {"name": arguments.name, "role": arguments.role, "token": secret}
 
@@ -108,7 +108,7 @@ def _add(arguments: argparse.Namespace) -> Answer:
 def _list(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.tokens import tokens
 
-    with registry(arguments) as (db, _):
+    with registry(arguments, arms=False) as (db, _):
         rows = tokens(db)
     return told(arguments, {"tokens": [dict(row) for row in rows]})
 
@@ -116,7 +116,7 @@ def _list(arguments: argparse.Namespace) -> Answer:
 def _revoke(arguments: argparse.Namespace) -> Answer:
     from ident_service.registry.tokens import revoke_token
 
-    with registry(arguments) as (db, _):
+    with registry(arguments, arms=False) as (db, _):
         revoke_token(db, arguments.name, terminal_user(arguments))
     return told(arguments, {"name": arguments.name, "revoked": True})
 

@@ -234,10 +234,11 @@ def test_drives_whose_process_stalls_answer_the_last_sync_alone(tmp_path: Path) 
             assert stalled.wait(10.0)
             while ear.take():  # what bringing the drives up took
                 pass
-            heard = list[Frame]()
+            heard, asked = list[Frame](), 0
             while stall.is_set():
                 arm.exchange(None)
-            for _ in range(5):
+                asked += 1
+            for _ in range(after := max(5, 10 - asked)):
                 arm.exchange(None)
             while taken := ear.take():
                 heard += [frame for frame, _ in taken]
@@ -245,14 +246,16 @@ def test_drives_whose_process_stalls_answer_the_last_sync_alone(tmp_path: Path) 
     finally:
         ended.set()
         drives.join()
+    if asked < 5:
+        pytest.skip("this machine let the host send less than five SYNC in 0.3 s")
     syncs = [frame.stamp_ns for frame in heard if frame.identifier == SYNC]
     late = np.diff(syncs[:10]) * 1e-6
     assert len(syncs) >= 10
     assert late.min() > 10.0  # of 20 ms: as they were sent, and not all at once
     answers = {node: [frame for frame in heard if frame.identifier == 0x180 + node] for node in (1, 2)}
     for node, frames in answers.items():
-        # Of those in the stall the last has an answer at most, and the five after it.
-        assert 1 <= len(frames) <= 7, node
+        # Of those in the stall the last has an answer at most, and those after it.
+        assert 1 <= len(frames) <= after + 2, node
         assert len(syncs) - len(frames) >= 3, node
 
 
