@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import shutil
 import subprocess
@@ -63,6 +64,16 @@ def test_the_copy_checks_its_folder_and_promises_no_more(copied: Path) -> None:
         assert (code, err) == (0, ""), (out, err)
         assert out.startswith(f"{path}: consistent with its own conditions: feasible: ")
         assert "proven" not in out
+
+
+def test_the_copy_is_written_for_python_3_10(copied: Path) -> None:
+    """Distributions that are still supported have no later one: hashlib.file_digest, for one, came with 3.11."""
+    source = (copied / "verify.py").read_text(encoding="utf-8")
+    ast.parse(source, feature_version=(3, 10))
+    assert "file_digest" not in source
+    if older := shutil.which("python3.10"):
+        done = subprocess.run([older, "-I", str(copied / "verify.py"), str(copied)], capture_output=True, check=False)
+        assert done.returncode == 0, done.stderr
 
 
 def test_the_copy_says_what_a_forgery_is(copied: Path) -> None:
