@@ -1243,7 +1243,7 @@ def require_folder(folder: Path) -> None:
                 continue
             found = hashlib.sha256()
             with (folder / name).open("rb") as file:
-                while block := file.read(2**20):  # hashlib.file_digest came with Python 3.11
+                while block := file.read(2**20):
                     found.update(block)
             if found.hexdigest() != digest:
                 raise VerificationError(f"{name[:60]}: not what the manifest names; it was changed, or is torn")
