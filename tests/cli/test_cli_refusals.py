@@ -213,7 +213,7 @@ def test_a_correction_that_cannot_be_written(place: Path, ident: Ident) -> None:
     path = place / "p.json"
     path.write_text(json.dumps(TABLE))
     words = ("correct", path, "--out", place / "nowhere" / "c.json")
-    refused(place, ident, words, 2, f"{place / 'nowhere' / 'c.json'}: cannot be written: No such file or directory")
+    refused(place, ident, words, 2, f"{place / 'nowhere' / 'c.json'}: there is no folder {place / 'nowhere'}; make it first")
 
 
 @pytest.mark.parametrize(

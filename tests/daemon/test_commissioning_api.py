@@ -18,7 +18,7 @@ from daemon.verbs_bench import with_run
 
 from ident_service.daemon.dependencies import Service
 from ident_service.daemon.jobs.outcome import printed_samples
-from ident_service.daemon.jobs.queue import Progress
+from ident_service.daemon.jobs.queue import Progress, progress
 from ident_service.daemon.jobs.requests import Run
 from ident_service.daemon.live_stream import live_events
 from ident_service.daemon.routes.jobs import job_answer_document
@@ -102,6 +102,12 @@ def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, 
         assert "typed by a person" in refused.json()["error"]["message"]
         answer = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": ARM})
         assert (answer.status_code, answer.json()["reached"], holder.supported) == (200, True, True)
+
+
+def test_the_next_command_is_no_phase_of_a_job() -> None:
+    """Between the end of its command and its own, a run was at `next: ident recover`."""
+    assert progress("approaching\nexciting\nnext: ident recover planar2\n", 1.0, None).phase == "exciting"
+    assert progress("", 1.0, None).phase == "starting"
 
 
 @pytest.mark.parametrize("held", [True, False])

@@ -79,7 +79,8 @@ def progress(log: str, elapsed: float, typical: float | None) -> Progress:
         elapsed: since it began [s].
         typical: what such jobs took [s]; None before there was one.
     """
-    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    said = (line.strip() for line in log.splitlines())
+    lines = [line for line in said if line and not line.startswith("next: ")]  # a hint at the end is no phase
     phase = lines[-1] if lines else "starting"
     searches = _SEARCH.findall(log)
     if searches:
