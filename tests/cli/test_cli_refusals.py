@@ -212,8 +212,9 @@ def test_a_file_about_another_arm(place: Path, quick: Commissioned, ident: Ident
 def test_a_correction_that_cannot_be_written(place: Path, ident: Ident) -> None:
     path = place / "p.json"
     path.write_text(json.dumps(TABLE))
-    words = ("correct", path, "--out", place / "nowhere" / "c.json")
-    refused(place, ident, words, 2, f"{place / 'nowhere' / 'c.json'}: there is no folder {place / 'nowhere'}; make it first")
+    folder = place / "nowhere"
+    words = ("correct", path, "--out", folder / "c.json")
+    refused(place, ident, words, 2, f"{folder / 'c.json'}: there is no folder {folder}; make it first")
 
 
 @pytest.mark.parametrize(
