@@ -42,11 +42,12 @@ LIKELIER = 2.0  # by which an exchange must explain more than a sign: poor joint
 EXPLAINED = 10.0  # percent of all torques in motion that the right reading leaves at most; wrong geometry leaves more
 _LONGEST = 60.0  # s of recordings that are fitted
 _ROWS = 1000  # that are fitted, about
-_TRIED = 6  # readings besides signs of torques that are fitted under the conditions, while none explains: the best
+# Readings besides signs of torques, and of measured values, that are fitted under the conditions, while none explains.
+_TRIED, _MEASURED_TRIED = 6, 3
 _THINNED = 4  # of these rows, one in so many is fitted to choose among positions
 _BOTH_WAYS = np.concatenate([-np.arange(37.0, 0.0, -1.0), np.arange(1.0, 38.0)])
 _FACTORS = 1.2 ** (_BOTH_WAYS + np.sign(_BOTH_WAYS))  # of a torque: from 1.44, beyond what gains are off, to a thousand
-_DELAYS = 3e-3 * np.sign(_BOTH_WAYS) * 1.15 ** np.abs(_BOTH_WAYS)  # s; to half a second
+_DELAYS = 3e-3 * np.sign(_BOTH_WAYS[::2]) * 1.15 ** np.abs(_BOTH_WAYS[::2])  # s; to half a second
 _GEARS = 1.5 ** np.array([n for n in range(-13, 14) if n])  # of a position: to two hundred
 _ZEROS = np.radians([n for n in range(-150, 181, 30) if n])  # that a position may be off by
 _FINER = 3  # times that the best of these are made finer, by halves
@@ -145,7 +146,7 @@ class MisreadColumns:
             )
         if len(named) == 1:
             if late := self.reading.late:
-                when = f"{abs(late):.2g} s too {'late' if late > 0.0 else 'early'}"
+                when = f"about {abs(late):.2g} s too {'late' if late > 0.0 else 'early'}"
                 return (
                     f"the torque of {named[0]} seems to be stamped {when}: {errors} it moved by that ({each}): give it"
                     " the time of its position where it is recorded"
@@ -217,9 +218,8 @@ def misread_columns(estimate: Estimate, recordings: Sequence[Recording]) -> Misr
     exact = [one for one in found if not (one[1].of_torque_signs or one[1].is_measured)]
     measured = [one for one in found if one[1].is_measured]
     best, most = None, -np.inf
-    for number, (without_conditions, reading) in chain(
-        enumerate(signs, -len(signs)), enumerate(exact), enumerate(measured)
-    ):
+    numbered = chain(enumerate(signs, -len(signs)), enumerate(exact), enumerate(measured, _TRIED - _MEASURED_TRIED))
+    for number, (without_conditions, reading) in numbered:
         if without_conditions < max(most, np.log(BETTER)):  # conditions only add to the error
             continue
         if best is None and number >= _TRIED:
@@ -264,8 +264,14 @@ def _of_positions(
     """Return the best readings of positions, of zeros and scales one for each joint."""
 
     def tried(readings: Sequence[Reading], parts: Sequence[_Part] = parts) -> _Found:
-        errors = [_equations(estimate, parts, one).free_errors([one], weights)[0] for one in readings]
-        return _best_of_each_kind(readings, errors, before)
+        errors: dict[Reading, Array] = {}
+        for one in readings:
+            if one in errors:
+                continue
+            alike = [other for other in readings if replace(other, which=one.which) == one]  # in the positions
+            found = _equations(estimate, parts, one).free_errors(alike, weights)
+            errors |= zip(alike, found, strict=True)
+        return _best_of_each_kind(readings, [errors[one] for one in readings], before)
 
     kinds: tuple[_Which, ...] = ("position", "both")
     found = tried([one for which in kinds for one in _signs_and_exchanges(which, estimate, joints)])

@@ -97,7 +97,7 @@ def test_the_torque_of_one_joint_at_another_time_is_named(samples: int, words: s
     torque[:, 1] = np.roll(torque[:, 1], samples)
     recording = replace(right, torque=torque)
     (reason,) = reasons_against(identified(recording), [recording])
-    assert f"the torque of elbow seems to be stamped {words}" in reason
+    assert f"the torque of elbow seems to be stamped about {words}" in reason
 
 
 @pytest.mark.slow
