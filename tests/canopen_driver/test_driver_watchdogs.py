@@ -139,7 +139,7 @@ def download(node: int, index: int, sub: int, size: int, value: int) -> Frame:
 
 
 def slowed(kind: str, node: int, milliseconds: int) -> Frame:
-    """What makes the watchdog of a drive act after so long."""
+    """Return the frame that sets the time of a drive's watchdog."""
     return {
         "rpdo_timer": download(node, 0x1400, 5, 2, milliseconds),
         "heartbeat": download(node, 0x1016, 1, 4, 127 << 16 | milliseconds),

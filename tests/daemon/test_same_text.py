@@ -1,4 +1,4 @@
-"""What a person reads after a verb is the same whether a daemon did it or this command: places and ids apart."""
+"""Verbs print the same text with `--server` as without, except for places of files and ids."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What real drives do and emulated ones never would, on the wire of a run: a stop by its name, or the run goes on.
+"""Frames as real drives send them and emulated ones do not: the run stops and names the cause, or goes on.
 
 Frames are added, changed, doubled and held back between the bus and the driver; nothing else is touched.
 """

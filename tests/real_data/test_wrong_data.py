@@ -181,7 +181,7 @@ def test_a_column_of_another_scale_zero_or_time_than_the_others(change: Change, 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["ur10", "tx40"])
 def test_torques_without_gravity_are_named(name: str, identified: Identified) -> None:
-    """What holds the links is taken from the torques; their errors of 9 and 6 % were within what is usable."""
+    """Torques less those of gravity are refused; their errors of 9 and 6 % were within what is usable."""
     (case,) = (case for case in CASES if case.arm == name)
     right = identified(name)
     chain, layout = right.model.chain, right.model.layout
