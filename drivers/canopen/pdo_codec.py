@@ -326,6 +326,9 @@ class BusCodec:
             drive.let_go = None
             if drive.error_passive:
                 self._tell(EventCode.DRIVE_PASSIVE, drive.node, f"{emergency_words(ERROR_PASSIVE)}, and not over yet")
+            if (last := drive.emergency) is not None and last.code != ERROR_PASSIVE:
+                words = emergency_words(last.code, last.register, last.vendor)
+                self._tell(EventCode.EMERGENCY, drive.node, f"{words}, and not over yet")
 
     def receive(self, frame: Frame) -> None:
         """Take one frame, whatever it is; never raises."""
@@ -395,6 +398,8 @@ class BusCodec:
         if state is not was:
             if was is DriveState.OPERATION_ENABLED:
                 drive.let_go = status
+            if was is DriveState.FAULT and not drive.error_passive:
+                drive.emergency = None  # it was the fault's, whether or not the drive says that it is over
             bad = state in (DriveState.FAULT, DriveState.FAULT_REACTION)
             words = f"{state} (status word {status:04X}h)" + ("" if was is None else f", was {was}")
             self._tell(EventCode.DRIVE_FAULT if bad else EventCode.DRIVE_STATE, drive.node, words)

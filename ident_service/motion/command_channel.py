@@ -535,6 +535,10 @@ class InterruptibleArm(Arm):
         """Return what a person must do to enable the wrapped arm."""
         return self._arm.operator_action
 
+    def unconfirmed(self) -> tuple[str, ...]:
+        """Return the drives that did not confirm that they are off, see `Arm`."""
+        return self._arm.unconfirmed()
+
     def drive_status(self) -> tuple[AxisStatus, ...]:
         """Return the wrapped arm's drive status."""
         return self._arm.drive_status()

@@ -4,8 +4,9 @@ Behind a light joint a small torque makes a large speed before a push that is la
 asked is not how hard a joint is pushed but what the push must have done. The push c is the correction and the friction
 fed forward. Dry friction f holds a joint that stands still within `[-f, f]`, so the push can change by
 `2 f` from the `c_0` with which the position last changed before the joint must move; one that was sliding is held by
-`f` already, and a change that pushes it on in its direction moves it, but for what friction is larger at rest. With the
-allowance b of the one case or the other
+`f` already, and a change that pushes it on in its direction moves it, but for what friction is larger at rest. If its
+push braked it, what it braked with may end as well: that brings a joint to rest and moves none. With the allowance b of
+these cases, never more than that of a joint that stands,
 
     dv = max(|c - c_0| - b, 0) / m_jj(q) dt          dd = v dt
 
@@ -195,8 +196,9 @@ class FrozenEncoderObserver:
             self._base_fed = [0.0] * len(self._base)
             self._reset_estimate()
             return self._none
-        change, allowed = np.array(shifts), np.array(most)
-        inertia = encoders.inertias(self._dynamics.mass_matrix(position))
+        change, inertia = np.array(shifts), encoders.inertias(self._dynamics.mass_matrix(position))
+        braking = np.maximum(-np.array(self._slid) * (inertia * self._base_answer + self._base_fed), 0.0)
+        allowed = np.minimum(np.array(most) + braking, self._standing)
         own = np.sign(change) * (inertia * (answer - self._base_answer) + fed - self._base_fed)
         push = np.minimum(np.abs(change), own) - allowed
         acting, gained = push > 0.0, push / encoders.inertias(self._least.mass_matrix(position)) * self._period

@@ -13,7 +13,7 @@ from datetime import timedelta
 
 import numpy as np
 
-from drivers.arm import Arm, ArmDescription, Sample, StopKind
+from drivers.arm import AT_CLOSING, Arm, ArmDescription, Sample, StopKind
 from drivers.axis_status import AxisStatus
 from drivers.clock import Clock, RealClock
 from ident_service.config.can_bus import WIRE_INTERFACE
@@ -73,6 +73,7 @@ from ident_service.preflight.passive_checks import (
 )
 from ident_service.preflight.session import (
     BROKEN_REMEDY,
+    CLOSING_REMEDY,
     EMULATED_REMEDY,
     FARTHEST,
     NO_CABLE,
@@ -214,6 +215,8 @@ class _Preflight:
             self._broken(error)
         finally:
             self.arm.close()  # once more, for an arm that failed while it was opened
+            if left := self.arm.unconfirmed():
+                self._left_behind(f"{AT_CLOSING} {'; '.join(left)}")
 
     def all_checks(self) -> list[Check]:
         """Return every check; those that were not made name the one that failed."""
@@ -440,6 +443,15 @@ class _Preflight:
             code = next(left, CODES[-1])
             remedy = "Do this, then check again." if isinstance(error, ActionNeeded) else BROKEN_REMEDY
             self._passed(failed(code, str(error), remedy))
+
+    def _left_behind(self, words: str) -> None:
+        """Record which drives have not confirmed that they are off: with what failed last, else as failed by itself."""
+        bad = [check for check in self.checks.values() if check.verdict is Verdict.FAILED]
+        if bad:
+            self._passed(replace(bad[-1], reason=f"{bad[-1].reason}; {words}"))
+        else:
+            last = self.checks.get(CODES[-1])
+            self._passed(failed(CODES[-1], words, CLOSING_REMEDY, () if last is None else last.measures))
 
     def _passed(self, check: Check, *, of_place: bool = False) -> bool:
         if of_place and check.verdict is Verdict.FAILED and self.away:

@@ -46,6 +46,9 @@ _LINK = "Check power, cables and bus of the axes named, and the drives' own faul
 ANSWERS_REMEDY = "Check power, cables and bus termination of the axes that do not answer."
 UNREACHABLE_REMEDY = "Check power, cables, and that no other program uses the arm."
 BROKEN_REMEDY = "Check power, cables, bus and the drives' own fault codes."
+CLOSING_REMEDY = (
+    "Take the drives' power away before anybody goes near, then check power, cables and bus of these drives."
+)
 NO_CABLE = frozenset({_LINK, ANSWERS_REMEDY, UNREACHABLE_REMEDY, BROKEN_REMEDY})
 """Remedies that do not apply where drives are a program on this computer."""
 EMULATED_REMEDY = (

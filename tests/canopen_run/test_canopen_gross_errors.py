@@ -8,13 +8,16 @@ from typing import Any
 
 import pytest
 from canopen_run_bench import canopen, described, write
+from helpers.emulated_arms import Tapped
 
 from drivers.canopen.driver import CanopenArm
 from ident_service.config.arm import ArmConfig
 from ident_service.config.load import load_arm
 from ident_service.model.arm_model import arm_model
+from ident_service.motion.command_channel import InterruptibleArm
 from ident_service.motion.ticket import Check, Verdict
 from ident_service.preflight.preflight import preflight
+from ident_service.preflight.session import CLOSING_REMEDY
 from sim_backend.emulator.faults import parse_fault
 from sim_backend.emulator.lock_step import LockStepArm
 
@@ -60,6 +63,30 @@ def test_a_sound_wam_passes_with_every_watchdog_proven_twice() -> None:
     watchdogs = checks["watchdog"].measures
     assert len(watchdogs) == 2 * 7 + 1
     assert "j2 and j3: drive 3" in [one.joint for one in watchdogs]
+
+
+def test_a_drive_that_does_not_confirm_that_it_is_off_allows_no_motion(tmp_path: Path) -> None:
+    config = level(tmp_path)
+    behind, taps, closings = LockStepArm(config), list[Tapped](), list[bool]()
+
+    def links(_: ArmConfig) -> list[Tapped]:
+        taps.append(Tapped(behind.link(0)))
+        return taps[-1:]
+
+    class Arm(CanopenArm):
+        def close(self) -> None:
+            closings.append(True)
+            if len(closings) == 2:  # the first is between the two tests of the watchdog
+                taps[-1].misses = lambda frame: frame.identifier == 0x582
+            super().close()
+
+    arm = InterruptibleArm(Arm(config, links), lambda: False)
+    ticket = preflight(arm, arm_model(config), None, confirm=lambda question: config.name, look_seconds=0.2)
+    assert ticket.verdict is Verdict.FAILED
+    (bad,) = (check for check in ticket.checks if check.verdict is Verdict.FAILED)
+    assert bad.reason.startswith("when the arm was closed: elbow: drive 2: node 2: ")
+    assert (bad.code, bad.remedy) == ("watchdog", CLOSING_REMEDY)
+    assert len(bad.measures) > 2
 
 
 @pytest.mark.parametrize("motor", [1, 2, 4, 5, 7])

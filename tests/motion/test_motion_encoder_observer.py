@@ -87,6 +87,27 @@ def test_a_joint_that_slid_is_held_by_less_on_its_way_and_by_as_much_back(direct
         assert (cycles_until(owed, way * direction * between) is not None) == found, (apart, way)
 
 
+@pytest.mark.parametrize("direction", [-1.0, 1.0])
+def test_the_end_of_braking_is_no_push(direction: float) -> None:
+    way, friction = direction * unit(1), FRICTION[1]
+    for braking, most in ((-0.5, 1.5), (-1.5, 2.5), (-9.0, STANDING), (0.5, SLIDING)):
+        for excess, found in ((-0.05, False), (0.05, True)):
+            owed = observer()
+            slid(owed, direction, 1, braking * friction * way)
+            assert (cycles_until(owed, (braking + most + excess) * friction * way) is not None) == found
+
+
+def test_friction_fed_forward_against_the_motion_brakes() -> None:
+    way, friction = unit(1), FRICTION[1]
+    for excess, found in ((-0.05, False), (0.05, True)):
+        owed = observer()
+        for _ in range(2):
+            owed.update(way, NONE, NONE, HOME, -friction * way)
+        push = (SLIDING + excess) * friction * way
+        seen = [bool(owed.update(STILL, push, push / INERTIA, HOME).any()) for _ in range(3000)]
+        assert any(seen) == found
+
+
 def test_a_joint_that_steps_to_and_fro_does_not_slide() -> None:
     owed = observer()
     for side in (1.0, -1.0, 1.0, -1.0):

@@ -9,13 +9,17 @@ import pytest
 from branches import endings
 from campaign_bench import Subject, play, subject
 from guard_bench import PERIOD
-from motion_bench import TRUTH, bench_config
+from motion_bench import TRUTH, Story, WatchedArm, bench_config
 
 from ident_service.config.arm import ArmConfig
+from ident_service.config.load import load_arm, shipped_arms
 from ident_service.excitation.described_motion import excitation
 from ident_service.model.arm_model import arm_model
+from ident_service.motion.command_channel import StopCondition
+from ident_service.motion.run import run
 from ident_service.motion.safety_monitor import VELOCITY_OFF
 from ident_service.motion.state_machine import State
+from sim_backend.arm import from_config
 from sim_backend.faults import Fault, FaultKind
 
 Array = np.ndarray
@@ -150,3 +154,22 @@ def test_the_large_arm_sticks_at_a_crawl_and_is_not_taken_for_frozen() -> None:
 @pytest.mark.campaign
 def test_the_large_arm_sticks_at_a_crawl_and_is_not_taken_for_frozen_in_a_whole_run() -> None:
     sticks_and_is_not_taken_for_frozen(subject("wam"), 0.05, 0.02)
+
+
+# Cycles in which the elbow comes to rest within one cycle and stays there, while it is braked.
+@pytest.mark.parametrize("cycle", [98, 162, 184, 348, 354, 434, 508, 548])
+def test_a_stop_of_a_slow_loop_is_a_stop(cycle: int) -> None:
+    stiffness = {"kp": 100.0, "kd": 16.0, "following_error": 0.4}
+    motion = {"kind": "seeded", "seed": 1, "base_frequency": 0.2, "harmonics": 5, "periods": 2}
+    document = load_arm(shipped_arms()["planar2"]).model_dump(mode="json", by_alias=True)
+    document["control"]["rate"] = 50.0
+    document["driver"] |= {"watchdog": 0.5, "watchdog_reason": "longer than the cycles", "deadline": 2.0}
+    document["motions"] = {"identification": motion}
+    for joint in document["joints"].values():
+        joint |= stiffness
+    model = arm_model(ArmConfig.model_validate(document))
+    arm, story = WatchedArm(from_config(model.config)), Story()
+    arm.open()
+    stop = StopCondition(lambda: arm.cycle > cycle)
+    report = run(arm, model, excitation(model, "identification"), story, stop, hold_seconds=0.1)
+    assert report.state is State.STOPPED

@@ -27,6 +27,7 @@ from ident_service.motion.run import run
 from ident_service.motion.ticket import Verdict
 from ident_service.preflight.preflight import preflight
 from sim_backend.canopen_device.drive import CanopenDrive
+from sim_backend.emulator.faults import DriveFault
 from sim_backend.emulator.lock_step import LockStepArm
 
 SAID = "the host's CAN controller on bench is error-passive, expected error-active"
@@ -146,10 +147,48 @@ def test_a_drive_that_is_error_passive_is_told_anew_of_an_enabled_arm_until_it_i
         for _ in range(2):  # whoever enables it again is told again
             arm.enable()
             events = [event for _ in range(5) for event in arm.exchange(np.zeros(2)).events]
-            found = [(event.code, event.axis, event.words) for event in events]
+            found = [(event.code, event.axis, event.words) for event in events if "8120h" in event.words]
             words = "node 2: 8120h CAN controller in error passive, and not over yet"
             assert found == ([(AxisEventCode.BUS_DEGRADED, 1, words)] if tells else [])
             arm.stop(StopKind.TORQUE_OFF)
+
+
+@pytest.mark.parametrize("over", [None, drive_says(0x0000, 0x00)])
+@pytest.mark.parametrize("when", ["while it is idle", "while it is enabled"])
+def test_an_emergency_of_a_drive_that_goes_on_is_told_anew_of_an_enabled_arm_until_it_is_over(
+    when: str, over: Frame | None
+) -> None:
+    config = bench_canopen_config()
+    taps = [Tapped(LockStepArm(config).link(0))]
+    frames = [drive_says(0x4310, 0x09), *([] if over is None else [over])]
+    with CanopenArm(config, lambda _: taps) as arm:
+        taps[0].disturb(frames, drives_hear=False)
+        if when == "while it is idle":
+            assert AxisEventCode.EMERGENCY_MESSAGE in [event.code for event in arm.exchange(None).events]
+        arm.enable()
+        events = [event for _ in range(5) for event in arm.exchange(np.zeros(2)).events]
+        found = [(event.code, event.axis, event.words) for event in events]
+        words = "node 2: 4310h drive too hot (error register: generic, temperature), and not over yet"
+        assert found == ([] if over else [(AxisEventCode.EMERGENCY_MESSAGE, 1, words)])
+
+
+def test_an_emergency_of_a_fault_that_was_reset_is_over() -> None:
+    """Also of a drive that does not say so."""
+    config = bench_canopen_config()
+    behind = LockStepArm(config)
+    taps = [Tapped(behind.link(0))]
+    with CanopenArm(config, lambda _: taps) as arm:
+        arm.enable()
+        taps[0].misses = lambda frame: frame.identifier == 0x082 and frame.data[:2] == b"\0\0"
+        behind.inject(DriveFault("emergency", 1, duration=20e-3, size=0x4310))
+        for _ in range(50):
+            arm.exchange(np.zeros(2))
+        arm.stop(StopKind.TORQUE_OFF)
+        told = [drive.emergency for drive in arm._open().drives]
+        assert told[1] is not None
+        arm.reset()
+        arm.enable()
+        assert [event for _ in range(5) for event in arm.exchange(np.zeros(2)).events] == []
 
 
 @pytest.mark.parametrize("when", ["before it was opened", "while it was idle"])

@@ -88,3 +88,10 @@ def test_a_stop_that_is_requested_while_a_person_thinks_keeps_the_drives_off() -
     assert "enable" not in flight.arm.calls
     assert check_of(ticket, "gravity").reason == "a stop was requested"
     assert ticket.verdict is Verdict.FAILED
+
+
+def test_an_arm_that_somebody_may_stop_is_the_arm_in_all_else() -> None:
+    """A method that is not passed on would answer for no arm at all."""
+    before_or_after = {"look", "zero", "log_frames", "logged", "still_wanted"}  # asked of the arm itself
+    public = {name for name in vars(Arm) if not name.startswith("_")}
+    assert public - before_or_after <= set(vars(InterruptibleArm))
