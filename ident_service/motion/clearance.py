@@ -164,7 +164,7 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
 
 
 def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """Describe the stop out of a motion that would touch something; None where none does."""
+    """Describe the stop out of a motion that comes nearest to anything; None where no stop touches, by capsules."""
     nearest = stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
