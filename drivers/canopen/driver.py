@@ -401,7 +401,7 @@ class CanopenArm(Arm):
                 raise
             self._buses = buses
             buses.call()
-            self._brake_enabled(buses)
+            self._stop_enabled_drives(buses)
             self._find_zero(buses)
             self._identities = tuple(self._configured(buses))
             buses.begin()
@@ -611,7 +611,7 @@ class CanopenArm(Arm):
         self._counts = [drive.position for drive in self._buses.drives] if there else [0] * len(self._limits)  # type: ignore[union-attr]
         self._acting = read_only(np.zeros(len(self._limits)))
 
-    def _brake_enabled(self, buses: Buses) -> None:
+    def _stop_enabled_drives(self, buses: Buses) -> None:
         """Quick-stop drives that a host has left enabled: none is to be configured while its last torque acts.
 
         Raises:

@@ -153,7 +153,7 @@ class SequentialLeastSquares:
         return bounded(Equations(tuple(blocks), 0, (), tuple(labels)))
 
     @one_blas_thread()
-    def doubt(self) -> ParameterUncertainty | None:
+    def uncertainty(self) -> ParameterUncertainty | None:
         """Return the parameter uncertainty so far; None before there are more rows than parameters."""
         information = self._information
         if int(information.rows.sum()) <= self.base.size:

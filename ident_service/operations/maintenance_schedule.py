@@ -264,7 +264,7 @@ def pending(db: Database, arm: str | None = None) -> list[Row]:
     return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (? IS NULL OR arm = ?) ORDER BY id", arm, arm)
 
 
-def comparable_dues(db: Database, state: Path, arm: str | None = None) -> list[dict[str, Any]]:
+def pending_with_accepted(db: Database, state: Path, arm: str | None = None) -> list[dict[str, Any]]:
     """Return what is due, each with whether its arm has an accepted set to compare with."""
     return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in pending(db, arm)]
 

@@ -36,7 +36,7 @@ def unidentified(parameters: ParameterFile) -> list[tuple[str, float]]:
     return [(table["expressions"][k], float(shares[k])) for k in sorted(found, key=lambda k: -shares[k])]
 
 
-def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
+def active_constraints_text(evidence: Evidence, parameters: ParameterFile) -> str:
     """Return the number of active conditions, in words; empty where there are none or no body has the parameters."""
     tight = active_constraints(parameters.content)
     if not tight:
@@ -104,7 +104,7 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
             name = shortened(custom["function"], _LONGEST)
             sentences.append(f"They also meet {name} says, a function that no certificate is about.")
         if tight:
-            sentences.append(f"{active_conditions(evidence, parameters)}: {tight}.")
+            sentences.append(f"{active_constraints_text(evidence, parameters)}: {tight}.")
         return [*sentences, how]
     sentences = [f"They are not physically feasible (margin {margin})."]
     sentences.append(_CERTIFIED if certified else "There is no certificate of that in exact arithmetic.")
@@ -191,7 +191,7 @@ def next_steps(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         )
     if still := [one.joint for one in poor if not one.in_motion]:
         steps.append(f"use it where joints move, not for the torque near standstill of {', '.join(still)}")
-    if active_conditions(evidence, parameters):
+    if active_constraints_text(evidence, parameters):
         steps.append("find out why constraints are active: signs, units, friction, drive inertia")
     if "unidentified" in parameters.content["base_parameters"].get("verdicts", []):
         steps.append(
