@@ -157,7 +157,7 @@ def read_source(path: Path, convention: str | None = None) -> Source:
         raise UsageError(f"{path}:{line}: not UTF-8 text; save the file in that encoding") from None
     suffix = path.suffix.lower()
     if suffix in (".csv", ".yaml", ".yml"):
-        table, limits = (_csv_table if suffix == ".csv" else _yaml_table)(path, text, convention)
+        table, limits = _csv_table(path, text, convention) if suffix == ".csv" else _yaml_table(path, convention)
         return Source(path, "dh", text, table, limits=limits)
     if suffix == ".xacro":
         raise UsageError(f"{path}: a xacro file has to be expanded first: xacro {path.name} > {path.stem}.urdf")
@@ -233,7 +233,7 @@ def _cell(name: str, cell: str, scale: float) -> Any:
         return cell  # `pi/2`, `90 deg`, or a mistake that is told where it is checked
 
 
-def _yaml_table(path: Path, text: str, convention: str | None) -> tuple[DHTable, dict[str, FileLimits]]:
+def _yaml_table(path: Path, convention: str | None) -> tuple[DHTable, dict[str, FileLimits]]:
     """Read a DH table from YAML: `convention`, and under `joints` a row by joint name."""
     tree = read_without_base(path)
     value = tree.value if isinstance(tree.value, dict) else {}
