@@ -34,7 +34,7 @@ from ident_service.config.yaml_source import read_without_base
 from ident_service.errors import ConfigError, ModelError, Problem, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.limited_process import answer_within, run_limited_process
-from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
+from ident_service.model.mechanism import read_mechanism, require_parser_limits, require_urdf
 from ident_service.model.plain_mjcf import build_from_mjcf
 from ident_service.model.solids import Capsule as Pill
 from ident_service.model.solids import corners as corners_of
@@ -165,10 +165,10 @@ def read_source(path: Path, convention: str | None = None) -> Source:
         raise UsageError(f"{path}: give a URDF (.urdf), an MJCF (.xml) or a DH table (.csv, .yaml)")
     file = TextFile(name=path.name, text=text)
     if suffix == ".mjcf" or (suffix == ".xml" and re.search(r"<\s*mujoco\b", text)):
-        count_mechanism(file, "mjcf")
+        require_parser_limits(file, "mjcf")
         outline = mjcf_outline(path)
         return Source(path, "mjcf", text, outline=outline, limits=outline.limits)
-    count_mechanism(file, "urdf")
+    require_parser_limits(file, "urdf")
     require_urdf(file)
     outline = urdf_outline(text, path.parent)
     return Source(path, "urdf", text, outline=outline, limits=outline.limits)
@@ -298,7 +298,7 @@ def _table(
 
 
 def urdf_outline(text: str, folder: Path) -> Outline:
-    """Read the outline of a URDF whose elements were counted.
+    """Read the outline of a URDF that has passed `require_parser_limits`.
 
     Args:
         text: of the file.
