@@ -125,7 +125,7 @@ def stops_touching(
             nearest = collision.distances(postures).min(axis=0)
             pair = int(nearest.argmin())
             if nearest[pair] <= 0.0:
-                return _touches("way", time, collision.pairs[pair], float(nearest[pair]))
+                return _touches("trajectory", time, collision.pairs[pair], float(nearest[pair]))
             yield
     return None
 
