@@ -65,15 +65,15 @@ class PlantStatistics:
         """Record that a client has connected."""
         self._clients, self._client_pid = self._clients + 1, pid
         self.heard()
-        self.become(PlantState.SERVING)
+        self.enter(PlantState.SERVING)
 
     def settle(self) -> None:
         """Record that the client is gone."""
         self._client_pid = 0
-        self.become(PlantState.AT_REST if self._machine.supported else PlantState.SETTLING)
+        self.enter(PlantState.AT_REST if self._machine.supported else PlantState.SETTLING)
 
-    def become(self, state: PlantState, *, quiet: int = 0) -> None:
-        """Enter a state; `quiet` periods of the silence were spent at rest."""
+    def enter(self, state: PlantState, *, quiet: int = 0) -> None:
+        """Enter a state, and count the last `quiet` periods, in which the arm rested, as silent no more."""
         self.state = state
         self.silent_ticks -= quiet
         self.write()
@@ -81,7 +81,7 @@ class PlantStatistics:
     def end(self) -> None:
         """Record that the process ends."""
         resting = self.state is PlantState.AT_REST or self._machine.supported
-        self.become(PlantState.ENDED_AT_REST if resting else PlantState.ENDED_MOVING)
+        self.enter(PlantState.ENDED_AT_REST if resting else PlantState.ENDED_MOVING)
 
     def heard(self) -> None:
         """Record that a frame has come; silence is counted from here."""
@@ -340,11 +340,11 @@ class PlantProcess:
             return
         self._abandoned += 1
         if self._error is not None:
-            self._story.become(PlantState.RAN_AWAY)
+            self._story.enter(PlantState.RAN_AWAY)
         elif machine.supported or self._quiet * self._period >= REST_TIME:
-            self._story.become(PlantState.AT_REST, quiet=self._quiet)
+            self._story.enter(PlantState.AT_REST, quiet=self._quiet)
         elif self._abandoned * self._period >= PATIENCE:
-            self._story.become(PlantState.STILL_MOVING)
+            self._story.enter(PlantState.STILL_MOVING)
 
     def _simulate_until_rest(self) -> None:
         """Let an abandoned arm come to rest, as fast as it can be computed."""

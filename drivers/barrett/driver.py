@@ -265,7 +265,7 @@ class BarrettArm(Arm):
             port = self._open_port()
             found = setup.found_on(port, self._driver, wakes=not self._looks)
             self._found = found
-            self._checks = setup.checks(found, self._driver)
+            self._checks = setup.checks(found)
             self._require_reachable(found)
             if not self._looks:
                 for frame in setup.lowering(found):
@@ -578,7 +578,7 @@ class BarrettArm(Arm):
 
     def _require_reachable(self, found: setup.FoundArm) -> None:
         if lost := setup.unreachable(found):
-            wrong = [str(one) for one in setup.checks(found, self._driver) if not one.good]
+            wrong = [str(one) for one in setup.checks(found) if not one.good]
             nodes = ", ".join(map(str, lost))
             raise DriverError(f"no group frame reaches pucks {nodes}: {'; '.join(wrong)}")
 

@@ -262,13 +262,8 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
     return arm
 
 
-def checks(arm: FoundArm, driver: BarrettDriver) -> tuple[SetupCheck, ...]:
-    """Compare what the pucks report of themselves with the description.
-
-    Args:
-        arm: what they say.
-        driver: the section `driver`.
-    """
+def checks(arm: FoundArm) -> tuple[SetupCheck, ...]:
+    """Compare what the pucks report of themselves with the description."""
     versions = sorted({one.properties.version for one in arm.pucks})
     expected = str(versions[-1]) if len(versions) > 1 else ""
     found = []

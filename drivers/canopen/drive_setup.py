@@ -272,9 +272,9 @@ class DriveConfiguration:
         They protect nothing: drives in torque mode give torque beyond the position limits.
         """
         todo = [Write(od.SYNC_PERIOD, self.period_us)]
-        return todo if self.positions else [*todo, *self.walls(), *self.interpolation()]
+        return todo if self.positions else [*todo, *self.position_limits(), *self.interpolation()]
 
-    def walls(self) -> list[Write]:
+    def position_limits(self) -> list[Write]:
         """Return the downloads of the position limits."""
         if self.motor.positions is None:
             return []
@@ -413,11 +413,11 @@ def configure(objects: Objects, setup: DriveConfiguration) -> OperationMode:
     objects.ensure(setup.profile.heartbeat(setup.drive.node))
     # Supervision of the host comes last: from then on the host must be present.
     spare = (od.ERROR_BEHAVIOUR, *(() if setup.drive.watchdog == "heartbeat" else (od.HEARTBEAT_CONSUMER,)))
-    for write in setup.profile.watched(setup.drive.node):
+    for write in setup.profile.host_supervision(setup.drive.node):
         (objects.write_if_present if write.entry in spare else objects.ensure)(write)
     for write in setup.watchdog():
         objects.ensure(write)
-    for write in setup.walls() + setup.interpolation() if setup.positions else ():
+    for write in setup.position_limits() + setup.interpolation() if setup.positions else ():
         objects.write_if_present(write)  # here they count: a drive moves by them
     for write in setup.hints():
         with suppress(SdoRefused, WriteNotVerified):

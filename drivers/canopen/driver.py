@@ -1,18 +1,17 @@
 """Drive an arm of CANopen drives in cyclic synchronous torque mode.
 
-A transmit queue that is full for a moment, or one bus of two that has failed, must not lose the stop of any drive. The
-drives' own deadline for torque frames comes before the last try, so that nobody waits for this. Closing goes on with it
-for a second.
+A transmit queue that is full for a moment, or one bus of two that has failed, must not lose the stop of any drive: it
+is sent again for 75 ms, and for a second by `close`. Nobody waits for the last try, because the drives' own deadline
+for torque frames comes before it.
 
 A drive's torque follows its command within a millisecond or two, and many drives average what they report over some
 more. So a measured torque is compared with all that the drive was told within the last `WINDOW`. Only what lies outside
 of that, in two reports in a row, is a difference.
 
-A sample is stamped when SYNC was sent, at which the torque that was handed over began to act and all positions were
-taken.
+A sample has the time at which SYNC was sent: all positions were taken, and the commanded torque began to act, at it.
 
 Torque frames begin with `enable` and then never cease while cycles come, with zero torque once the arm is stopped: a
-drive that missed them would rightly report it. `close` takes the drives back to what they were when they were powered.
+drive that missed them would rightly report it. `close` restores the drives' power-up settings.
 """
 
 from __future__ import annotations
@@ -123,7 +122,7 @@ class StopCommand:
     def counts(self, zero: Sequence[int]) -> Sequence[int] | None:
         """Return the torques to send: zero, or None for no torque frames before all drives were told to stop.
 
-        By zero torque alone an arm would fall, whose drives or brakes are to hold it.
+        Drives that get zero torque, but not yet the stop, would let an arm fall that they or their brakes are to hold.
 
         Args:
             zero: torque of every drive [per mille of rated torque].
@@ -131,7 +130,7 @@ class StopCommand:
         return None if self._untold else zero
 
     def wait_until_off(self, buses: Buses, zero: Sequence[int] | None, period_ns: int) -> None:
-        """Cycle until the drives report that they are off, or have had their time; a lost command is sent again.
+        """Cycle until the drives report that they are off, for a second at most; a lost command is sent again.
 
         Args:
             buses: open.
@@ -226,8 +225,7 @@ def axis_events(events: Iterable[Event], codec: BusCodec, joint_of: Mapping[int,
     """Translate the events of one bus.
 
     Args:
-        events: as the codec tells them. States of drives, errors that were reset and a return to normal are not among
-            the results.
+        events: from the codec. Those of drive states, reset errors and returns to normal are left out.
         codec: of the bus.
         joint_of: first joint that each node moves.
     """
@@ -257,7 +255,7 @@ class Reports:
         self._missed = MissedReports()
 
     def forget_missing(self) -> None:
-        """Tell of reports that are still missing anew: what was told of an idle arm nobody may have acted upon."""
+        """Report missing reports once more: nobody may have acted on what was said while the arm was idle."""
         self._missed = MissedReports()
 
     def new(self, codecs: Iterable[BusCodec], cycle: int, now_ns: int) -> list[AxisEvent]:
@@ -336,7 +334,7 @@ class CanopenArm(Arm):
         self._drives_of = self._coordinates.motors_of
         names, drives = list(config.joints), enumerate(config.driver.drives)
         self._names = [f"{' and '.join(names[j] for j in self._joints_of[k])}: drive {one.node}" for k, one in drives]
-        # Until the buses are open and bring theirs.
+        # The clock until the buses are open, which have their own.
         in_step = all(bus.interface == "lock_step" for bus in config.driver.buses)
         self.clock: Clock = VirtualClock() if in_step else RealClock()
         self._buses: Buses | None = None
@@ -401,7 +399,7 @@ class CanopenArm(Arm):
                 raise
             self._buses = buses
             buses.call()
-            self._brake_enabled(buses)
+            self._stop_enabled_drives(buses)
             self._find_zero(buses)
             self._identities = tuple(self._configured(buses))
             buses.begin()
@@ -444,7 +442,7 @@ class CanopenArm(Arm):
 
         Raises:
             DriverError: not open, the host's controller is error-passive or bus-off, a drive has a fault, has restarted
-                since the arm was opened, or does not follow in time; only what held the arm still does.
+                since the arm was opened, or does not follow in time. Only drives that held the arm before still do.
         """
         buses = self._open()
         held = hold(buses.drives)
@@ -576,7 +574,8 @@ class CanopenArm(Arm):
         """Disable the supervision of the host in drives that are off; the others shall miss the host. Never raises."""
         zero = self._counts if self._streaming else None
         self._stop.wait_until_off(buses, zero, self._period_ns)
-        buses.enabled = False  # or answers to its questions would be taken for those to these
+        # Silent drives are asked for nothing any more: an answer would be taken for one to the requests below.
+        buses.enabled = False
         there: dict[int, Objects] = {}  # by bus
         for number, drive in enumerate(self._driver.drives[: self._begun]):
             with suppress(Exception):
@@ -597,7 +596,7 @@ class CanopenArm(Arm):
             with suppress(Exception):
                 buses.command_drive(number, NmtCommand.ENTER_PRE_OPERATIONAL)
         for objects in there.values():
-            with suppress(Exception):  # its answer comes behind all commands, which closing a link could cut off
+            with suppress(Exception):  # the answer comes after all commands, which closing a link could cut off
                 objects.read(od.DEVICE_TYPE)
 
     def _open(self) -> Buses:
@@ -611,7 +610,7 @@ class CanopenArm(Arm):
         self._counts = [drive.position for drive in self._buses.drives] if there else [0] * len(self._limits)  # type: ignore[union-attr]
         self._acting = read_only(np.zeros(len(self._limits)))
 
-    def _brake_enabled(self, buses: Buses) -> None:
+    def _stop_enabled_drives(self, buses: Buses) -> None:
         """Quick-stop drives that a host has left enabled: none is to be configured while its last torque acts.
 
         Raises:

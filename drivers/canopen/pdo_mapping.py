@@ -242,8 +242,8 @@ class BusProfile:
         """Return the SYNCs from one status report to the next, of drives without a timer for it (1801h:05)."""
         return min(max(1, round(self.status_inhibit * self.rate)), _MOST_SYNCS)
 
-    def watched(self, node: int) -> list[Write]:
-        """Return the downloads that make a drive supervise its host by heartbeat and guarding, not by torque frames."""
+    def host_supervision(self, node: int) -> list[Write]:
+        """Return the downloads that make a drive supervise its host by heartbeat and, where guarded, by guarding."""
         own = self.heartbeat_wait if self.watchdog(node) == "heartbeat" else None  # of the others it is a second one
         wait = self.host << 16 | _whole(own or self.heartbeat_timeout, 1e-3)
         todo = [Write(od.HEARTBEAT_CONSUMER, wait)]

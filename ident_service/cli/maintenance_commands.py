@@ -147,20 +147,20 @@ def _enabled(arguments: argparse.Namespace) -> Answer:
 
 
 def _maintenance(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import add_event, comparable_dues
+    from ident_service.operations.maintenance_schedule import add_event, pending_with_accepted
 
     with registry(arguments) as (db, state):
         name = _known(db, state, arguments)
         row = add_event(db, name, arguments.what, arguments.note, terminal_user(arguments), time.time())
-        due = comparable_dues(db, state, name)
+        due = pending_with_accepted(db, state, name)
     return told(arguments, {**row, "due": due})
 
 
 def _due(arguments: argparse.Namespace) -> Answer:
-    from ident_service.operations.maintenance_schedule import comparable_dues
+    from ident_service.operations.maintenance_schedule import pending_with_accepted
 
     with registry(arguments) as (db, state):
-        return told(arguments, {"due": comparable_dues(db, state, arguments.arm)})
+        return told(arguments, {"due": pending_with_accepted(db, state, arguments.arm)})
 
 
 def _dismiss(arguments: argparse.Namespace) -> Answer:

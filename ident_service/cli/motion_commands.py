@@ -278,7 +278,7 @@ def dry_run(arguments: argparse.Namespace, *, zero: bool = False) -> Answer:
 
 
 def add_can_log(sub: Parser) -> None:
-    """Add the option `--can-log` to a verb that moves an arm."""
+    """Add the flag `--can-log`, which takes no value, to a verb that moves an arm."""
     sub.add_argument("--can-log", action="store_true", help="log every CAN frame to can.log, beside the recording")
 
 
@@ -670,7 +670,7 @@ def _stopped(arguments: argparse.Namespace, state: Path) -> Answer:
         write_audit_entry(arguments, "stop", "all arms", reached=reached)
         return DONE, stop_text(None, reached), {"arms": reached, "asked": "stop"}
     name, path = _control(arguments)
-    pid = ControlFile.stop_all(path)
+    pid = ControlFile.stop_motions(path)
     give_to_owner(state, path)
     reached = [] if pid is None else [name]
     write_audit_entry(arguments, "stop", name, reached=reached)

@@ -383,6 +383,3 @@ _FOLLOWS: dict[str, Follows] = {
     "backup": lambda ended: ["restore", str(ended.given.file), "--state", "restored"],
     "restore": _of("serve"),
 }
-
-WITHOUT = frozenset({"serve", "emulate", "completion", "schema", "tokens add"})
-"""Verbs after which no line follows: their output is for a program, or they end when everything does."""

@@ -124,7 +124,7 @@ def _move_held_arm_home(arguments: argparse.Namespace, config: ArmConfig) -> Ans
         tell(arguments, f"{config.name}: keep out of its reach; process {pid} moves it home, slowly. Ctrl-C stops.")
         while (stage := controls.homing) in (Homing.ASKED, Homing.GOING) and in_use(path):
             if not stopped and asked():
-                controls.ask_stop()
+                controls.request_stop()
                 stopped = True
             controls.renew_home()
             time.sleep(0.1 * LEASE_SECONDS)

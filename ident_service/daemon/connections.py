@@ -264,9 +264,9 @@ class ReadingTurns:
     Addresses take turns, and so do the connections of one address: a flood from one delays no other.
     """
 
-    def __init__(self, now: Callable[[], float] = time.thread_time) -> None:
-        """Begin without connections; `now` is the clock of the event loop's thread [s]."""
-        self._now, self._spent, self._requests, self._scheduled = now, 0.0, 0, False
+    def __init__(self) -> None:
+        """Begin without connections."""
+        self._spent, self._requests, self._scheduled = 0.0, 0, False
         self._pieces = 0
         self._waiting: dict[str, deque[FairReader]] = {}  # by address, the one whose turn it is first
 
@@ -281,11 +281,11 @@ class ReadingTurns:
 
     def read(self, reader: FairReader) -> None:
         """Read one piece of a request now."""
-        began = self._now()
+        began = time.thread_time()
         try:
             self._requests += reader.read_piece()
         finally:
-            self._spent += self._now() - began
+            self._spent += time.thread_time() - began
             self._pieces += 1
             self._schedule()
 

@@ -205,7 +205,7 @@ class LiveRun:
         while self._waiting:
             samples = self._waiting.popleft()
             growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
-        if growing.step() and (doubt := growing.doubt()) is not None:
+        if growing.step() and (doubt := growing.uncertainty()) is not None:
             document = _uncertainty_document(doubt, growing.base.expressions, growing.base.units)
             with self._lock:
                 self._publish("doubt", document)

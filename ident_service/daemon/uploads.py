@@ -406,13 +406,13 @@ def delete_upload(state: Path, upload: str) -> None:
     shutil.rmtree(state / UPLOADS / upload, ignore_errors=True)
 
 
-def delete_stale_uploads(state: Path, now: float | None = None) -> list[str]:
+def delete_stale_uploads(state: Path) -> list[str]:
     """Delete uploads of which nothing has arrived for a day.
 
     Returns:
         Their ids.
     """
-    now, place, gone = time.time() if now is None else now, state / UPLOADS, []
+    now, place, gone = time.time(), state / UPLOADS, []
     for folder in sorted(place.iterdir()) if place.is_dir() else ():
         with suppress(OSError):
             last = max(path.stat().st_mtime for path in (folder, *folder.iterdir()))

@@ -139,15 +139,13 @@ def constrained_intervals(
     base: BaseParameters,
     conditions: FeasibleSet,
     prior: Prior | None = None,
-    *,
-    replicates: int | None = None,
-    seed: int = 0,
 ) -> Array:
     """Return 95 % intervals of a constrained estimate from a parametric bootstrap in the feasible set.
 
     Unconstrained estimates are drawn around the constrained one with the covariance of the unconstrained, and each is
-    constrained again. There are few replicates, for a fraction of a second, so each side of an interval is Student's t
-    times the deviation of the replicates on that side: a side that a condition cuts off has none.
+    constrained again. There are 40 replicates, or 20 where base parameters are many, so that it takes a fraction of a
+    second. Each side of an interval is therefore Student's t times the deviation of the replicates on that side: a side
+    that a condition cuts off has none.
 
     Args:
         fit: unconstrained least squares.
@@ -156,8 +154,6 @@ def constrained_intervals(
         base: grouping of the parameters.
         conditions: the feasible set.
         prior: that the estimate was drawn to.
-        replicates: how many; 40, or 20 for more than 40 base parameters, when None.
-        seed: of the draws.
 
     Returns:
         Lower and upper end, shape (base, 2); infinite for what is not seen.
@@ -172,8 +168,8 @@ def constrained_intervals(
     scale = np.sqrt(np.where(np.diag(known) > 0.0, np.diag(known), 1.0))
     values, V = np.linalg.eigh(known / np.outer(scale, scale))
     root = scale[:, None] * V * np.sqrt(np.maximum(values, 0.0))
-    count = replicates or (40 if base.size <= _MANY else 20)
-    rng = np.random.default_rng(seed)
+    count = 40 if base.size <= _MANY else 20
+    rng = np.random.default_rng(0)
     found = np.empty((count, base.size))
     for number in range(count):
         other = beta + root @ rng.normal(size=base.size)

@@ -252,7 +252,7 @@ def _question_of_unit(recordings: Sequence[Recording], model: ArmModel, still: S
 
 
 def cut_into_stretches(recordings: Sequence[Recording], model: ArmModel) -> tuple[Stretches, ...]:
-    """Cut recordings into the stretches of time that blocks are made of.
+    """Divide each recording into the stretches of time that blocks are made of; see `repeats.stretches`.
 
     Raises:
         RecordingError: a recording cannot be read.

@@ -317,10 +317,7 @@ def _best_of_each_kind(readings: Sequence[Reading], errors: Iterable[Array], bef
 
 
 def weights_of_joints(as_read: TorqueError) -> Array:
-    """Return weights by the joints' errors as recordings are read: a joint that is wrong counts less; shape (joints,).
-
-    Their geometric mean is 1.
-    """
+    """Return the reciprocals of the joints' rms errors, scaled to a geometric mean of 1; shape (joints,)."""
     rms = as_read.joint_rms
     weights = 1.0 / np.maximum(rms, 1e-9 * max(float(rms.max(initial=0.0)), np.finfo(float).tiny))
     return np.asarray(weights / np.exp(np.mean(np.log(weights))))

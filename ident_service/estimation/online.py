@@ -2,9 +2,9 @@
 
 New samples wait until they make a window long enough for the zero-phase filter; the window's equations are merged into
 the factor (`model/information.py`) and all but its end is forgotten. Work and memory of a step are bounded, whatever
-the length of the run. Deviations are those of eq. 81, which takes residuals for white: they show how the uncertainty
-shrinks; the result's own come from blocks and are larger. What is decided while the arm moves is decided
-by the larger of both, for which the information of each block is kept, too.
+the length of the run. Deviations by eq. 81, which takes residuals for white, show how the uncertainty shrinks. Those of
+the result come from blocks and are larger. Decisions while the arm moves use the larger of both; for them the
+information of each block is kept, too.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class ParameterUncertainty:
     Attributes:
         seconds: of motion that went in [s].
         beta: least squares, each joint's equations divided by its residual [SI], shape (base,).
-        deviations: eq. 81 [SI], or what blocks say where that is more and they are kept; infinite where nothing is
-            known yet, shape (base,).
+        deviations: by eq. 81, or by the blocks where those are kept and say more [SI], shape (base,); infinite where
+            nothing is known yet.
         negligible: sizes below which parameters are as good as zero on the motion so far [SI], shape (base,).
         verdicts: a word per base parameter.
-        blocks: of different motion that were kept.
+        blocks: how many were kept, repetitions of the same motion counted once.
         until_ns: stamp of the last sample that went in.
     """
 
@@ -153,7 +153,7 @@ class SequentialLeastSquares:
         return bounded(Equations(tuple(blocks), 0, (), tuple(labels)))
 
     @one_blas_thread()
-    def doubt(self) -> ParameterUncertainty | None:
+    def uncertainty(self) -> ParameterUncertainty | None:
         """Return the parameter uncertainty so far; None before there are more rows than parameters."""
         information = self._information
         if int(information.rows.sum()) <= self.base.size:

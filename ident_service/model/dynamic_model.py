@@ -1,6 +1,6 @@
 """Represent an identified arm as a pinocchio model with friction, and read one back from a file.
 
-Pinocchio's algorithms know armature and leave friction alone, though a model can carry it as numbers.
+Pinocchio's algorithms use armature and ignore friction, though its models can hold both.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class DynamicModel:
         arm: the mechanism and its configuration.
         delta: link parameters, shape (arm.layout.size,).
         presliding: distance over which each drive's dry friction reverses [rad or m], shape (joints,). Where one is not
-            zero, friction has a memory: carry a `direction` along with `turned`, or leave it out and have friction that
-            turns round at once, which the parameters were not fitted with.
+            zero, friction has a memory: update `direction` by `turned` after every step and pass it on. Without it
+            friction reverses at once, which is not how the parameters were fitted.
     """
 
     model: pin.Model
@@ -67,7 +67,7 @@ class DynamicModel:
         self._shared = chain.coupling.T @ (inertia[:, None] * chain.coupling) - np.diag(drives.armature)
 
     def turned(self, direction: Array, step: Array) -> Array:
-        """Return the direction of dry friction after a step (Dahl 1968); exact where no drive reverses within it.
+        """Return the direction of dry friction after a step (Dahl 1968); exact where no drive reverses in the step.
 
         Args:
             direction: before it, per drive, between -1 and 1, shape (..., joints); the signs of the first motion, where

@@ -95,7 +95,7 @@ def read_mechanism(file: TextFile, kind: Kind, kinematics: Kinematics | None = N
 
 @lru_cache(maxsize=8)
 def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
-    count_mechanism(file, kind)
+    require_parser_limits(file, kind)
     if kind == "urdf":
         require_urdf(file)
         from ident_service.model.mechanism_process import urdf_document
@@ -109,7 +109,7 @@ def _read(file: TextFile, kind: Kind, part: str | None, own: bool) -> Mechanism:
     return _mechanism(document)
 
 
-def count_mechanism(file: TextFile, kind: Kind) -> None:
+def require_parser_limits(file: TextFile, kind: Kind) -> None:
     """Refuse a file that could break its parser, by its size, elements and links.
 
     Raises:
@@ -132,7 +132,7 @@ def count_mechanism(file: TextFile, kind: Kind) -> None:
 
 
 def require_urdf(file: TextFile) -> None:
-    """Refuse a URDF that its parser would refuse, in words and with lines; its elements were counted.
+    """Refuse a URDF that its parser would refuse, in words and with lines; `require_parser_limits` comes first.
 
     The parser, urdfdom, tells a terminal about its own source code, and its caller nothing.
 
@@ -183,7 +183,7 @@ def _no_direction(what: str, said: str) -> str:
 
 
 def _require_mjcf_axes(file: TextFile) -> None:
-    """Refuse axes of an MJCF that are no direction, those of its default classes too; its elements were counted.
+    """Refuse axes of an MJCF that are no direction, those of its default classes too.
 
     Raises:
         ModelError: each with its line.

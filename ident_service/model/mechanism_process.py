@@ -210,7 +210,7 @@ _UNSUPPORTED = ("JointModelPlanar",)
 
 
 def urdf_document(file: TextFile, part: str | None) -> dict[str, Any]:
-    """Read the arm in a URDF whose links were counted; `part` is JSON of a `Part`, all of it when None."""
+    """Read the arm in a URDF that keeps the parser's limits; `part` is JSON of a `Part`, all of it when None."""
     return _document("URDF", lambda: pin.buildModelFromXML(file.text), part or "{}", lambda: mimics(file))
 
 

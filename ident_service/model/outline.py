@@ -34,7 +34,7 @@ from ident_service.config.yaml_source import read_without_base
 from ident_service.errors import ConfigError, ModelError, Problem, UsageError
 from ident_service.model.chain import WORLD, Array, Chain
 from ident_service.model.limited_process import answer_within, run_limited_process
-from ident_service.model.mechanism import count_mechanism, read_mechanism, require_urdf
+from ident_service.model.mechanism import read_mechanism, require_parser_limits, require_urdf
 from ident_service.model.plain_mjcf import build_from_mjcf
 from ident_service.model.solids import Capsule as Pill
 from ident_service.model.solids import corners as corners_of
@@ -157,7 +157,7 @@ def read_source(path: Path, convention: str | None = None) -> Source:
         raise UsageError(f"{path}:{line}: not UTF-8 text; save the file in that encoding") from None
     suffix = path.suffix.lower()
     if suffix in (".csv", ".yaml", ".yml"):
-        table, limits = (_csv_table if suffix == ".csv" else _yaml_table)(path, text, convention)
+        table, limits = _csv_table(path, text, convention) if suffix == ".csv" else _yaml_table(path, convention)
         return Source(path, "dh", text, table, limits=limits)
     if suffix == ".xacro":
         raise UsageError(f"{path}: a xacro file has to be expanded first: xacro {path.name} > {path.stem}.urdf")
@@ -165,10 +165,10 @@ def read_source(path: Path, convention: str | None = None) -> Source:
         raise UsageError(f"{path}: give a URDF (.urdf), an MJCF (.xml) or a DH table (.csv, .yaml)")
     file = TextFile(name=path.name, text=text)
     if suffix == ".mjcf" or (suffix == ".xml" and re.search(r"<\s*mujoco\b", text)):
-        count_mechanism(file, "mjcf")
+        require_parser_limits(file, "mjcf")
         outline = mjcf_outline(path)
         return Source(path, "mjcf", text, outline=outline, limits=outline.limits)
-    count_mechanism(file, "urdf")
+    require_parser_limits(file, "urdf")
     require_urdf(file)
     outline = urdf_outline(text, path.parent)
     return Source(path, "urdf", text, outline=outline, limits=outline.limits)
@@ -233,7 +233,7 @@ def _cell(name: str, cell: str, scale: float) -> Any:
         return cell  # `pi/2`, `90 deg`, or a mistake that is told where it is checked
 
 
-def _yaml_table(path: Path, text: str, convention: str | None) -> tuple[DHTable, dict[str, FileLimits]]:
+def _yaml_table(path: Path, convention: str | None) -> tuple[DHTable, dict[str, FileLimits]]:
     """Read a DH table from YAML: `convention`, and under `joints` a row by joint name."""
     tree = read_without_base(path)
     value = tree.value if isinstance(tree.value, dict) else {}
@@ -298,7 +298,7 @@ def _table(
 
 
 def urdf_outline(text: str, folder: Path) -> Outline:
-    """Read the outline of a URDF whose elements were counted.
+    """Read the outline of a URDF that has passed `require_parser_limits`.
 
     Args:
         text: of the file.

@@ -4,8 +4,8 @@ Pinocchio 4.1 scales the range of a slide where angles are degrees, shifts range
 MuJoCo's, takes ranges that do not limit, adds a body's `childclass` to the class that an element names, takes
 `axisangle` for an axis of length 1, reads `eulerseq` in capitals as if it were in small letters, and leaves out
 elements in a `<frame>`, bodies without a name and all bodies of the world but the first. So classes, degrees, frames
-and names are written out before it reads the file. A body that has the mass of a mesh has no mass that is known: meshes
-are not read with a description. What changes masses as a whole is refused. MuJoCo's XML reference is what this follows.
+and names are written out before it reads the file, by MuJoCo's XML reference. A body that has the mass of a mesh has an
+unknown mass: meshes are not read with a description. Settings that change all masses are refused.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _UNWRITTEN: Final = ("replicate", "attach", "composite", "flexcomp")  # elements
 
 
 def build_from_mjcf(path: Path, folder: Path, build: Callable[[str], Any], meshes: Path | None = None) -> Any:
-    """Return what `build` makes of the path of the file, rewritten.
+    """Rewrite an MJCF into a folder and return what `build` makes of the new file.
 
     Args:
-        path: of an MJCF whose elements were counted.
+        path: of an MJCF that has passed `require_parser_limits`.
         folder: where the rewritten file goes. Its owner removes it: what reads the file may break off.
         build: called with the path of that file.
         meshes: folder that the file's own names of meshes begin in; none are read when None.
@@ -112,7 +112,7 @@ def mjcf_gravity(text: str) -> tuple[float, float, float]:
 
 
 def _merge_sections(root: ET.Element) -> None:
-    """Make one of sections that stand in a file several times, as MuJoCo does; a default keeps its own class."""
+    """Merge sections of the same tag, as MuJoCo does; sections of defaults stay apart, each with its class."""
     first: dict[str, ET.Element] = {}
     for section in list(root):
         if section.tag == "default" or section is first.setdefault(section.tag, section):
@@ -123,7 +123,7 @@ def _merge_sections(root: ET.Element) -> None:
 
 
 def _require_own_masses(compiler: ET.Element) -> None:
-    """Refuse what changes masses or places as a whole."""
+    """Refuse settings of the compiler that change the masses or places of all bodies."""
     for key, unchanged in _UNCHANGED.items():
         values = _numbers(compiler.get(key, ""))
         if values and tuple(values) != unchanged and not (key == "settotalmass" and values[0] <= 0.0):

@@ -1,4 +1,4 @@
-"""Read XML whose elements were counted, names with undeclared prefixes as they are."""
+"""Read XML that has passed `require_parser_limits`, names with undeclared prefixes as they are."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ident_service.errors import ModelError
 
 
 def parse_xml(text: str) -> ET.Element:
-    """Return the elements of a file that was counted, names with undeclared prefixes as they are.
+    """Return the root of a file that has passed `require_parser_limits`; undeclared prefixes stay in names.
 
     Tools of simulators add attributes such as `drake:acceleration`, and often do not declare their prefixes.
 

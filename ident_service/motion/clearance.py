@@ -125,7 +125,7 @@ def stops_touching(
             nearest = collision.distances(postures).min(axis=0)
             pair = int(nearest.argmin())
             if nearest[pair] <= 0.0:
-                return _touches("way", time, collision.pairs[pair], float(nearest[pair]))
+                return _touches("trajectory", time, collision.pairs[pair], float(nearest[pair]))
             yield
     return None
 
@@ -164,7 +164,7 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
 
 
 def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
-    """Describe the stop out of a motion that would touch something; None where none does."""
+    """Describe the stop out of a motion that comes nearest to anything; None where no stop touches, by capsules."""
     nearest = stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None

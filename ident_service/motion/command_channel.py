@@ -2,8 +2,8 @@
 
 An arm without brakes that has been stopped is held, and waits for a person to say that it is supported.
 
-The loop reads this once per cycle, so it must answer at once: a word of shared memory, an attribute, never a lock.
-Stop needs no lease. Hold-to-run is nothing but a short lease.
+The loop reads its commands once per cycle, so reading must not wait: a word of shared memory, an attribute, never a
+lock. Stop needs no lease. Hold-to-run is nothing but a short lease.
 
 | offset | type | what |
 |---|---|---|
@@ -15,26 +15,24 @@ Stop needs no lease. Hold-to-run is nothing but a short lease.
 | 18 | uint8 | finish: not 0 when the run shall end early, in order; never taken back |
 | 19 | uint8 | waiting: not 0 while the arm is held until a person confirms that it is supported; of the loop |
 | 20 | uint8 | supported: not 0 when that was confirmed; counts while the arm waits for it |
-| 21 | uint8 | homing: 1 when a person asked that the held arm be led home, then the loop's answer (`controls.Homing`) |
+| 21 | uint8 | homing: 1 when a person asked that the held arm be led home, then the loop's answer (`Homing`) |
 | 24 | int64 | when the lease was renewed last [ns of the machine's monotonic clock] |
 | 32 | int64 | how long it lasts [ns]; 0 for none |
 | 40 | int64 | when a stop was asked for last, whether or not the arm moved then [ns of the same]; 0 for never |
 | 48 | int64 | when the lease of the path home was renewed last [ns of the same] |
 
-A motion takes seconds to begin, in which no loop can be reached yet. So a stop leaves its time behind, and a motion
-that was asked for before it takes the controls with the stop in them.
+A motion takes seconds to begin, in which no loop can be reached yet. So a stop writes its time into the file, and a
+motion that was asked for before that time begins stopped.
 
-Every word is written by one side at a time and read whole. The loop reads memory, so reading costs it nothing and no
-other process can make it wait. The process that moves the arm holds an exclusive lock on the file, which vanishes with
-the process: a second one is refused, and a file without a lock belongs to no process.
+Every word is written by one side at a time and read whole. The process that moves the arm holds an exclusive lock on
+the file, which vanishes with the process: a second one is refused, and a file without a lock belongs to no process.
 
-The pipe ends with the process at its other end, however that dies, and within a cycle; so does the motion, in real and
-in virtual time. The lease is for one that lives but hangs. It is measured on the machine's clock, because that is where
-a process hangs, and counts in real time only: in lock step the arm's time waits for nobody but the plant and the
-recorder, seconds of it pass while the machine stalls for none, and a stall would be taken for a silence. No real arm
-moves in lock step.
+The requester of a motion holds a pipe open to its process. The pipe is closed when the requester dies, however that
+happens, and the motion ends within a cycle, in real and in virtual time. The lease is for a requester that lives but
+hangs. It is measured on the machine's clock and counts in real time only. In lock step the arm's time waits while the
+machine stalls, and a stall would be taken for a requester that hangs. No real arm moves in lock step.
 
-Preflight moves an arm by a few centimetres, and ends whatever goes wrong with torque off; so does a stop in it.
+Preflight moves an arm by a few centimetres. Whatever goes wrong in it, and a stop too, ends with torque off.
 """
 
 from __future__ import annotations
@@ -55,7 +53,7 @@ from drivers.axis_status import AxisStatus
 from drivers.can.bus_load import Budget
 from ident_service.errors import DriverError, UsageError
 
-LEASE_SECONDS = 2.0  # ARCHITECTURE.md: renewed every 0.5 s
+LEASE_SECONDS = 2.0  # renewed every 0.5 s
 HOLD_TO_RUN_SECONDS = 0.25
 
 
@@ -88,7 +86,7 @@ class Controls(Protocol):
     def supported(self) -> bool:
         """Return whether a person has confirmed, since the arm began to wait for it, that it is supported or home."""
 
-    def wait_for_support(self) -> None:
+    def announce_hold(self) -> None:
         """Announce that the arm is held until a person confirms that it is supported; called once for each hold."""
 
     @property
@@ -118,7 +116,7 @@ class StopCondition:
         """Return whether the stop function asks for a stop."""
         return self._stop_requested()
 
-    def wait_for_support(self) -> None:
+    def announce_hold(self) -> None:
         """Do nothing: nobody can say that the arm is supported."""
 
     def tell_homing(self, stage: Homing) -> None:
@@ -187,7 +185,7 @@ class ControlFile:
         stopped = taken._words[_STOPPED // 8]
         # One that seems yet to come is from before the machine was started.
         if requested_ns is not None and requested_ns <= stopped <= now_ns():
-            taken.ask_stop()
+            taken.request_stop()
         return taken
 
     @classmethod
@@ -210,8 +208,8 @@ class ControlFile:
         raise UsageError(f"the arm is not moving ({path} is left from a run that has ended)")
 
     @classmethod
-    def stop_all(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
-        """Bring an arm to a controlled stop, and let no motion begin that has been asked for already.
+    def stop_motions(cls, path: Path, now_ns: Callable[[], int] = time.monotonic_ns) -> int | None:
+        """Stop the motion of an arm under control, and every motion that was asked for but has not begun.
 
         Args:
             path: of the file; made where it is missing.
@@ -235,7 +233,7 @@ class ControlFile:
             refusal = error
         try:
             with cls.reach(path, now_ns) as controls:
-                controls.ask_stop()
+                controls.request_stop()
                 return controls.pid
         except UsageError:
             if refusal is not None:
@@ -252,7 +250,7 @@ class ControlFile:
         """Return whether the arm is to be brought to a controlled stop."""
         return self._memory[_STOP] != 0
 
-    def ask_stop(self) -> None:
+    def request_stop(self) -> None:
         """Bring the arm to a controlled stop; needs no lease and cannot be taken back."""
         self._memory[_STOP] = 1
 
@@ -271,7 +269,7 @@ class ControlFile:
         return self._memory[_FINISH] != 0
 
     def request_finish(self) -> None:
-        """Let the run end early, in order; cannot be taken back. A pause stays one until that is taken back."""
+        """Let the run end early, in order; cannot be taken back. A paused arm stays paused until it may go on."""
         self._memory[_FINISH] = 1
 
     @property
@@ -279,7 +277,7 @@ class ControlFile:
         """Return whether the arm is held until a person confirms that it is supported or home."""
         return self._memory[_WAITING] != 0
 
-    def wait_for_support(self) -> None:
+    def announce_hold(self) -> None:
         """Announce that the arm is held until a person confirms that it is supported; for the process that moves it."""
         self._memory[_SUPPORTED] = 0
         self._memory[_WAITING] = 1
@@ -337,8 +335,8 @@ class ControlFile:
         """Renew the lease of the requester of the motion."""
         self._words[_RENEWED // 8] = self._now_ns()
 
-    def lease_ok(self, now_ns: int) -> bool:
-        """Return whether the lease was renewed in time, by the machine's clock instead of the loop's."""
+    def lease_is_valid(self) -> bool:
+        """Return whether the lease of the requester of the motion was renewed in time; True for a run without one."""
         renewed, length = self._words[_RENEWED // 8], self._words[_LENGTH // 8]
         return length == 0 or self._now_ns() - renewed <= length
 
@@ -448,9 +446,9 @@ class SupervisedCommands:
         """Return whether a person has confirmed that the waiting arm is supported or home."""
         return self._controls.supported
 
-    def wait_for_support(self) -> None:
+    def announce_hold(self) -> None:
         """Announce that the arm is held until a person confirms that it is supported."""
-        self._controls.wait_for_support()
+        self._controls.announce_hold()
 
     @property
     def homing(self) -> Homing:
@@ -473,7 +471,7 @@ class SupervisedCommands:
         """
         if self._controls.homing is Homing.GOING:
             return self._lock_step or self._controls.home_lease_is_valid()
-        return not self.cut and (self._lock_step or self._controls.lease_ok(now_ns))
+        return not self.cut and (self._lock_step or self._controls.lease_is_valid())
 
 
 class InterruptibleArm(Arm):

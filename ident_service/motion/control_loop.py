@@ -240,7 +240,7 @@ class Loop:
             self._reset_rest_count()
         if self._rested >= REST_CYCLES:
             if state is State.PAUSING:
-                self.course.stood()
+                self.course.enter_paused()
                 self._reset_rest_count()
                 return False
             self.states.enter(State.STOPPED)
@@ -263,7 +263,7 @@ class Loop:
             self._waiting, self._anchor = True, Anchor(self.limits, self.control.position)
             if self._read_hold_commands(lambda: self.controls.homing is Homing.GOING, stamp_ns):
                 self._report_homing(Homing.ENDED, stamp_ns)
-            self._read_hold_commands(self.controls.wait_for_support, stamp_ns)
+            self._read_hold_commands(self.controls.announce_hold, stamp_ns)
             self.tell(Severity.WARNING, stamp_ns, WAITS)
         elif self._read_hold_commands(lambda: self.controls.supported, stamp_ns):
             self.tell(Severity.WARNING, stamp_ns, LOWERS)

@@ -116,7 +116,7 @@ def _ended(request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     try:
         place = Path(request["arm_folder"]) / CONTROLS
         with ControlFile.take(place, request["lease"], requested_ns=request["requested_ns"]) as controls:
-            signal.signal(signal.SIGTERM, lambda *_: controls.ask_stop())
+            signal.signal(signal.SIGTERM, lambda *_: controls.request_stop())
             send_line({"pid": os.getpid()})
             return 0, {"report": _run_with_fault_store(request, controls)}
     except ArmFault as fault:

@@ -253,8 +253,8 @@ class TrajectorySequencer:
         self._states.enter(State.PAUSING)
         self._begin_ns, self._way, self._paused, self._back = stamp_ns, paused, paused, None
 
-    def stood(self) -> None:
-        """Enter PAUSED, when the arm has come to rest, and begin to search for a trajectory back to the motion."""
+    def enter_paused(self) -> None:
+        """Enter PAUSED, for an arm that has come to rest; `search_return` then searches for a trajectory back."""
         self._states.enter(State.PAUSED)
         if self._paused is not None:
             self._search = self._plan_out_of_pause(self._paused)

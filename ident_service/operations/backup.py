@@ -56,7 +56,7 @@ _STEP = 2**20
 REPLACED: Final = "replaced-"
 _ELSEWHERE = frozenset({LOCK, URL_FILE, TOKEN_FILE, FILE, f"{FILE}-wal", f"{FILE}-shm"})
 _OF_THE_MOMENT = frozenset({CONTROLS, "ticket.json"})  # of an arm
-_HALF = (".mcap", ".mcap.partial")  # of a run that the registry does not know
+_RECORDINGS = (".mcap", ".mcap.partial")  # also of runs that the registry does not know
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Backup:
         bytes: of them.
         created: when it was made [s since 1970 in UTC].
         recordings: whether recordings are in it.
-        replaced: folder with what stood in the state folder before; None where nothing did.
+        replaced: folder with the old content of the state folder; None where it was empty.
     """
 
     file: str
@@ -118,9 +118,8 @@ def back_up(state: Path, file: Path, *, recordings: bool = True) -> Backup:
                 os.fsync(stream.fileno())
         partial.replace(file)
     except sqlite3.Error as error:
-        if isinstance(
-            shortage(file, error), DiskFull
-        ):  # the copy is beside the file; nothing is written to the registry
+        # The full disk is that of the copy, beside the file: nothing is written to the registry.
+        if isinstance(shortage(file, error), DiskFull):
             raise _full(file) from None
         raise registry_error(state / FILE, error) from None
     except OSError as error:
@@ -144,11 +143,11 @@ def restore(file: Path, state: Path, who: str, *, replace: bool = False) -> Back
         file: the backup.
         state: the state folder.
         who: does it, for the audit trail.
-        replace: whether what stands there goes into a folder beside the new state; otherwise nothing may stand there.
+        replace: whether the old content is moved into a folder inside `state`; otherwise `state` must be empty.
 
     Raises:
         UsageError: not a backup, or not whole; a daemon serves the folder, or it is not empty.
-        MotionRefused: an arm is being moved by it.
+        MotionRefused: an arm of the state folder is being moved.
     """
     if not file.is_file():
         raise UsageError(f"{file}: no such file")
@@ -210,7 +209,7 @@ def _add_files(tar: tarfile.TarFile, state: Path, snapshot: Path, *, recordings:
         with closing(sqlite3.connect(snapshot)) as registry:
             left = frozenset(f"runs/{run}/{name}" for run, name in registry.execute("SELECT run, name FROM recordings"))
     for name, path in (FILE, snapshot), *_documents(state):
-        if not recordings and (name in left or (name.startswith("runs/") and name.endswith(_HALF))):
+        if not recordings and (name in left or (name.startswith("runs/") and name.endswith(_RECORDINGS))):
             continue
         try:
             fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)

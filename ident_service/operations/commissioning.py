@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.arm import Arm
-from drivers.clock import Clock, utc_offset_of_recording_ns
+from drivers.clock import utc_offset_of_recording_ns
 from ident_service.config.arm import ArmConfig
 from ident_service.config.motion_limits import motion_limits
 from ident_service.config.simulation import SimulatedDriver
@@ -233,7 +233,6 @@ def simulate(
     set_name: SetName | None = None,
     described: ArmConfig | None = None,
     custom: CustomFunction | None = None,
-    clock: Clock | None = None,
     tell: Tell = lambda _: None,
     step: Step = lambda words, share: None,
     stop_requested: Callable[[], bool] = lambda: False,
@@ -247,7 +246,6 @@ def simulate(
         set_name: feasible set, the configuration's when None.
         described: the configuration as it was read, where it was changed since; `config` when None.
         custom: the function that its `constraints.custom` names.
-        clock: the loop's, what the driver section asks for when None.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.
         stop_requested: asked every cycle, and between the steps of identification.
@@ -274,7 +272,7 @@ def simulate(
         for planned, path in zip(motions, paths, strict=True):
             tell(f"{planned.name} motion: {planned.duration:g} s at {config.control.rate:g} Hz")
             observed = []
-            arm = make_arm(config, clock)
+            arm = make_arm(config)
             if isinstance(arm, SimulatedArm | RemoteArm):
                 arm.observer = observed.append
             driven = sum(one.duration for one in motions[: len(reports)])

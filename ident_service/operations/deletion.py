@@ -51,7 +51,7 @@ def delete_run(db: Database, state: Path, run: str, who: str, *, anyway: bool = 
     """
     row = known_run(db, run)
     found = _of_run(db, row)
-    _require_idle(db, f"the run {run}", _jobs_about(db, row["arm"], run))
+    _require_idle(f"the run {run}", _jobs_about(db, row["arm"], run))
     _require_no_dependents(f"the run {run}", found, anyway=anyway)
     forget_run(db, state, run, who)
     return found
@@ -61,7 +61,7 @@ def delete_motion(db: Database, state: Path, motion: str, who: str, *, anyway: b
     """Delete a motion, and the schedules that would run it; runs keep their copy of it. Arguments as `delete_run`."""
     row = known_motion(db, motion)
     found = [Dependent("schedule", str(one), "deleted") for one in _schedules_of(db, row)]
-    _require_idle(db, f"the motion {motion}", _jobs_about(db, row["arm"], motion))
+    _require_idle(f"the motion {motion}", _jobs_about(db, row["arm"], motion))
     _require_no_dependents(f"the motion {motion}", found, anyway=anyway)
     _delete_motion(db, state, row, who)
     return found
@@ -81,7 +81,7 @@ def delete_arm(db: Database, state: Path, arm: str, who: str, *, anyway: bool = 
         raise UsageError(f"{arm} comes with this software; it cannot be deleted")
     live = db.rows(f"SELECT id FROM jobs WHERE arm = ? AND state IN {LIVE}", arm)  # noqa: S608 - ours
     live += db.rows("SELECT id FROM reidentifications WHERE arm = ? AND state = 'running'", arm)
-    _require_idle(db, f"the arm {arm}", [one["id"] for one in live])
+    _require_idle(f"the arm {arm}", [one["id"] for one in live])
     if faults := fault_file(state, arm).latched():
         raise InUse(f"the arm {arm} has unacknowledged faults: {', '.join(faults)}")
     runs = db.rows("SELECT * FROM runs WHERE arm = ? ORDER BY id", arm)
@@ -166,7 +166,7 @@ def _jobs_about(db: Database, arm: str, name: str) -> list[str]:
     return found + [one["id"] for one in db.rows(again, name)]
 
 
-def _require_idle(db: Database, what: str, busy: list[str]) -> None:
+def _require_idle(what: str, busy: list[str]) -> None:
     if busy:
         raise InUse(f"{what} is used by {', '.join(busy[:10])}; wait for the end, or cancel it")
 

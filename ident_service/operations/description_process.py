@@ -149,11 +149,11 @@ def _require_own_meshes(source: Path) -> None:
         ModelError: not a URDF, or larger than one is.
     """
     from ident_service.model.drawn_meshes import SAFE_MESHES
-    from ident_service.model.mechanism import count_mechanism
+    from ident_service.model.mechanism import require_parser_limits
     from ident_service.model.xml_elements import parse_xml
 
     text = source.read_text(encoding="utf-8")
-    count_mechanism(TextFile(name=source.name, text=text), "urdf")
+    require_parser_limits(TextFile(name=source.name, text=text), "urdf")
     robot = parse_xml(text)
     for mesh in robot.iter("mesh"):
         name = re.split(r"[/\\]", mesh.get("filename", ""))[-1]

@@ -235,8 +235,8 @@ def _by_cron(db: Database, row: Row, now: float) -> None:
         _falls_due(db, row, f"cron {row['cron']}", now, late=now - coming > LATE)
         db.write("UPDATE schedules SET last = ?, next = ? WHERE id = ?", now, cron.after(now), row["id"])
         return
-    # If the clock was put back, a past time is not due again; but a clock that was wrong by more than a day
-    # must not silence the schedule until it is right.
+    # If the clock was put back, a past time is not due again. But a clock that was more than a day ahead must not
+    # silence the schedule until that time comes.
     last = row["last"] or 0.0
     right = cron.after(max(now, last) if last - now <= _DAY else now)
     if right < coming:
@@ -264,8 +264,8 @@ def pending(db: Database, arm: str | None = None) -> list[Row]:
     return db.rows("SELECT * FROM dues WHERE closed IS NULL AND (? IS NULL OR arm = ?) ORDER BY id", arm, arm)
 
 
-def comparable_dues(db: Database, state: Path, arm: str | None = None) -> list[dict[str, Any]]:
-    """Return what is due, each with whether its arm has an accepted set to compare with."""
+def pending_with_accepted(db: Database, state: Path, arm: str | None = None) -> list[dict[str, Any]]:
+    """Return what is due, as `pending`; `accepted` says whether the arm has a set to compare with."""
     return [{**row, "accepted": bool(acceptances(state, row["arm"]))} for row in pending(db, arm)]
 
 
@@ -273,7 +273,8 @@ def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
     """Close a due entry that is not to be done, on a person's decision.
 
     Raises:
-        UsageError: no reason, or it is not due.
+        UsageError: no reason, or too long a one.
+        UnknownId: no such entry is due.
     """
     why = why.strip()
     if not why or len(why) > LONGEST_NOTE:
@@ -287,7 +288,7 @@ def dismiss(db: Database, number: int, why: str, by: str, now: float) -> None:
 
 
 def close_dues(db: Database, arm: str, before: float, how: str, by: str, now: float) -> None:
-    """Close an arm's entries that were due until `before` [s since 1970 in UTC], since they are done."""
+    """Close an arm's entries that were due by `before` [s since 1970 in UTC], because a re-identification did them."""
     db.write(
         "UPDATE dues SET closed = ?, closed_by = ?, how = ? WHERE arm = ? AND at <= ? AND closed IS NULL",
         *(now, by, how, arm, before),

@@ -175,7 +175,7 @@ def supervise_motion_process(
                     raise
         except BaseException:
             process.stdin.close()  # ends the motion process's input: the motion has no owner any more
-            watch.ask_stop()
+            watch.request_stop()
             while process.poll() is None and not watch.hear(time.monotonic() + _LAST_WORDS):
                 if not watch.holding:
                     process.kill()  # it hangs, and has sent nothing to the drives for as long
@@ -218,7 +218,7 @@ class _Watch:
             if self._controls is not None:
                 self._controls.renew()
                 if not self._asked and self._stop_requested():
-                    self.ask_stop()
+                    self.request_stop()
                 if not self._finishing and self._finish_requested():
                     self._finishing = True
                     self._controls.request_finish()
@@ -237,18 +237,18 @@ class _Watch:
         if self._controls is None:
             return False  # the motion process has not taken the arm yet
         with _ignoring_interrupts():
-            self.ask_stop()
+            self.request_stop()
             self._tell(f"interrupted: the arm is being stopped under control; waiting {_LAST_WORDS:g} s at most")
             ended = self.hear(time.monotonic() + _LAST_WORDS)
             while self.holding and not ended:
                 ended = self.hear(time.monotonic() + _LAST_WORDS)
             return ended and self.ending.reported
 
-    def ask_stop(self) -> None:
+    def request_stop(self) -> None:
         """Ask for a controlled stop, if a process has the arm."""
         if self._controls is not None:
             self._asked = True
-            self._controls.ask_stop()
+            self._controls.request_stop()
 
     def close(self) -> None:
         """Close the control file."""

@@ -19,7 +19,7 @@ def stop_arms(state: Path, arm: str | None) -> list[str]:
         state: the state folder.
         arm: its name; None for all that ever moved.
     """
-    return _reach(state, arm, ControlFile.stop_all)
+    return _reach(state, arm, ControlFile.stop_motions)
 
 
 Asked = Literal["pause", "resume", "finish", "supported"]

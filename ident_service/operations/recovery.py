@@ -122,13 +122,12 @@ def recover(config: ArmConfig, state: Path, arm: Arm | None = None, called: str 
     return Recovery(config.name, faults, None, seen, unreachable, zero_lost, reset, tripped, tuple(out), steps, usable)
 
 
-def release_held_drives(config: ArmConfig, state: Path, arm: Arm | None = None) -> tuple[str, ...]:
+def release_held_drives(config: ArmConfig, state: Path) -> tuple[str, ...]:
     """Switch off drives that hold an arm in quick stop, once a person has confirmed that it is supported.
 
     Args:
         config: of the arm.
         state: the state folder.
-        arm: not open; the configured one when None.
 
     Returns:
         Names of the axes that were held.
@@ -137,7 +136,7 @@ def release_held_drives(config: ArmConfig, state: Path, arm: Arm | None = None) 
         UsageError: the drives do not hold it.
         DriverError: the arm cannot be had, or another process has it.
     """
-    arm = make_arm(config) if arm is None else arm
+    arm = make_arm(config)
     with ControlFile.take(control_path(state, config.name), None), arm:
         for _ in range(_SEEN):
             status = arm.exchange(None).status

@@ -1,8 +1,7 @@
-"""Bring run folders from other machines, and let recordings go when the disk fills.
+"""Import run folders from other machines, and prune recordings.
 
-Only what the manifest names is copied, by plain names, into a folder of a plain name: nothing in it can lead elsewhere.
-
-Parameters, reports, tickets and manifests stay, and so does the row of a recording that was let go, with its hash.
+An import copies only what the manifest names. File and folder names must be plain, so that no path leads elsewhere.
+Pruning leaves parameters, reports, tickets, manifests, and the row of each recording with its hash.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def import_run(db: Database, state: Path, folder: Path, who: str) -> Row:
 
     Raises:
         UsageError: no such folder, a name that no run can have, or another run of that name is there.
-        ParameterError: torn, changed or foreign; nothing is kept of it then.
+        ParameterError: the folder is truncated, changed or foreign; nothing is kept of it then.
     """
     name = folder.resolve().name
     if not _NAME.fullmatch(name):
@@ -98,7 +97,7 @@ def prunable_recordings(db: Database, state: Path, newest: int) -> list[Prunable
     """Return the recordings that `prune` would delete.
 
     Kept are those of accepted runs, those of other runs that an accepted set was identified from or judged on, those of
-    each arm's `newest` runs, and those that a job which waits or runs has or reads.
+    each arm's `newest` runs, and those that a waiting or running job makes or reads.
 
     Raises:
         UsageError: a number below 0.
@@ -124,7 +123,7 @@ def prunable_recordings(db: Database, state: Path, newest: int) -> list[Prunable
 
 
 def _busy(db: Database) -> set[str]:
-    """Ids of the runs that a job which waits or runs makes, or reads recordings of."""
+    """Return the ids of runs that a waiting or running job makes, or reads recordings of."""
     found = set[str]()
     for job in db.rows("SELECT run, request FROM jobs WHERE state IN ('queued', 'running')"):
         found.add(str(job["run"]))

@@ -60,7 +60,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
             growing.add(Block(samples.stamp_ns, samples.position, samples.torque))
         elif tail.ended or _parent_is_gone():
             return None
-        if not growing.step() or tail.exciting_ns is None or (doubt := growing.doubt()) is None:
+        if not growing.step() or tail.exciting_ns is None or (doubt := growing.uncertainty()) is None:
             continue
         seconds = (doubt.until_ns - tail.exciting_ns) * 1e-9
         worst = worst_share(doubt, places)
@@ -89,7 +89,7 @@ def missed(folder: Path, target: Target, period: float) -> list[dict[str, Any]]:
         growing.add(block)
         while growing.step():
             pass
-    places, doubt = target.places(growing.base, model.config.name), growing.doubt()
+    places, doubt = target.places(growing.base, model.config.name), growing.uncertainty()
     if doubt is None or doubt.blocks < LEAST_BLOCKS:
         known = np.full(len(places), np.inf)
     else:

@@ -14,8 +14,8 @@ def load_model(path: str | Path, arm: str | Path | None = None) -> DynamicModel:
 
     The result has `model` (a `pinocchio.Model` with gravity, armature, damping, dry friction and limits),
     `friction(dq)` and `inverse_dynamics(q, dq, ddq)`, all in SI units with arrays of shape (joints,). Where its
-    `presliding` is not zero, friction has a memory, which both take as `direction` from `turned`; without, it turns
-    round at once, and so it does in pinocchio's own algorithms.
+    `presliding` is not zero, friction has a memory, which both take as `direction` from `turned`. Without it friction
+    reverses at once, as in pinocchio's own algorithms.
 
     Args:
         path: a folder of results, every file of which must be what its manifest names, or a `parameters.json`.

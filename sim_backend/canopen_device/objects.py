@@ -155,7 +155,7 @@ class Objects:
         return self.packed(key)
 
     def packed(self, key: int) -> bytes:
-        """Return the bytes of an entry; of what its type does not hold, the lower ones, as drives have them."""
+        """Return an entry's bytes, little-endian; a number too large for it loses its upper ones, as in drives."""
         value = self.values[key]
         if isinstance(value, bytes):
             return value

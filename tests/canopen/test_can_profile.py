@@ -29,7 +29,7 @@ def writes(one: BusProfile, node: int) -> list[Write]:
     """Everything that a drive would be told that has nothing of it."""
     pdos = [write for pdo in one.pdos(node) for write in pdo.writes()]
     off = [pdo.off for pdo in one.silenced(node)]
-    return [*one.identifiers(node), *off, *pdos, one.heartbeat(node), *one.watched(node)]
+    return [*one.identifiers(node), *off, *pdos, one.heartbeat(node), *one.host_supervision(node)]
 
 
 def test_the_wam_has_two_shared_torque_frames() -> None:

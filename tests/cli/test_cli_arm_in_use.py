@@ -67,7 +67,7 @@ def test_an_arm_whose_description_is_a_daemons_is_stopped_by_its_name(ident: Ide
 
 def test_that_an_arm_is_supported_takes_its_typed_name(ident: Ident, state: Path) -> None:
     with ControlFile.take(control_path(state, "planar2"), None) as holder:
-        holder.wait_for_support()
+        holder.announce_hold()
         for words in ((), ("--confirm", "planar"), ("--json",)):
             ended = ident("supported", "planar2", *words)
             assert (ended.code, holder.supported) == (2, False)
@@ -92,8 +92,8 @@ def test_drives_that_hold_an_arm_are_not_released_without_its_name(
 @pytest.mark.parametrize(("answer", "code"), [(Homing.ENDED, 0), (Homing.REFUSED, 1)])
 def test_home_leads_an_arm_that_another_process_holds(ident: Ident, state: Path, answer: Homing, code: int) -> None:
     with ControlFile.take(control_path(state, "planar2"), None) as holder:
-        holder.wait_for_support()
-        holder.ask_stop()
+        holder.announce_hold()
+        holder.request_stop()
         stops = []
 
         def hold() -> None:

@@ -95,7 +95,7 @@ def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon:
 
 def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, state: Path) -> None:
     with ControlFile.take(control_path(state, ARM), None) as holder:
-        holder.wait_for_support()
+        holder.announce_hold()
         assert daemon.post(f"/api/v1/arms/{ARM}/supported").status_code == 422
         refused = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": "another"})
         assert (refused.status_code, holder.supported) == (409, False)
@@ -120,7 +120,7 @@ def test_a_job_whose_arm_is_held_shows_no_progress(state: Path, held: bool) -> N
     row = {**numbers, **words, "request": {}, "words": []}
     with ControlFile.take(control_path(state, ARM), None) as holder:
         if held:
-            holder.wait_for_support()
+            holder.announce_hold()
         answer = job_answer_document(cast(Service, SimpleNamespace(state=state, engine=engine)), row)
     assert answer.held == held
     assert answer.progress is not None

@@ -109,7 +109,7 @@ def test_the_documented_example(setting: Setting, tmp_path: Path, capsys: pytest
     assert known["sha256"] == hashlib.sha256((tmp_path / "known_bodies.py").read_bytes()).hexdigest()
     without = known["relative_error_percent_without"]
     assert known["relative_error_percent"] >= without * (1.0 - 1e-6) > 0.0  # as exactly as two solvers agree
-    assert "They also meet known_bodies:payload_and_wrist" in (out / "report.html").read_text()
+    assert "They also meet what known_bodies:payload_and_wrist" in (out / "report.html").read_text()
     assert document["feasibility"]["feasible"]
     assert document["feasibility"]["certificate"]["kind"] == "witness"
 

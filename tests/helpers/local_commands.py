@@ -31,7 +31,7 @@ class LocalCommands:
         self._length_ns = None if lease_seconds is None else round(lease_seconds * 1e9)
         self._renewed_ns: int | None = None
 
-    def wait_for_support(self) -> None:
+    def announce_hold(self) -> None:
         """Wait for the switch `supported`; one that was set before does not count."""
         self.supported, self.waiting = False, True
 

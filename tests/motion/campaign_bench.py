@@ -222,8 +222,8 @@ class Script(LocalCommands):
         self.supported = cycle >= self._held_since + self._hold  # counts where the arm waits for it
         return True
 
-    def wait_for_support(self) -> None:
-        super().wait_for_support()
+    def announce_hold(self) -> None:
+        super().announce_hold()
         self._held_since = self._arm.cycle - 1
 
 

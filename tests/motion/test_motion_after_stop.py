@@ -61,8 +61,8 @@ class Person(LocalCommands):
         self.supported = self._confirm is not None and self._arm.cycle > self._since + self._confirm
         return True
 
-    def wait_for_support(self) -> None:
-        super().wait_for_support()
+    def announce_hold(self) -> None:
+        super().announce_hold()
         self._since = self._arm.cycle
 
 
@@ -388,8 +388,8 @@ def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(
         with pytest.raises(UsageError, match="not held"):
             person.request_home()
         os.close(theirs)
-        lifeline.wait_for_support()
-        controls.ask_stop()
+        lifeline.announce_hold()
+        controls.request_stop()
         now += 10**10
         assert not lifeline.lease_ok(now)
         person.request_home()
@@ -402,7 +402,7 @@ def test_whoever_leads_an_arm_home_keeps_its_lease_and_takes_no_other_stop_back(
         assert not lifeline.lease_ok(now)
         person.renew_home()
         assert lifeline.lease_ok(now)
-        assert ControlFile.stop_all(tmp_path / "controls", lambda: now) is not None
+        assert ControlFile.stop_motions(tmp_path / "controls", lambda: now) is not None
         assert lifeline.stop
         person.close()
     os.close(ours)

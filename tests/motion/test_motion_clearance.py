@@ -136,7 +136,7 @@ def test_a_stop_out_of_a_trajectory_that_would_touch_is_reported() -> None:
     assert collision.distances(np.zeros((1, 2))).min() > 0.1
     told = run_to_end(stops_touching(collision, Standing(moving), LIMITS))
     assert told is not None
-    assert told.startswith("a stop out of the way at 0.00 s would touch: elbow - obstacle ball, -0.")
+    assert told.startswith("a stop out of the trajectory at 0.00 s would touch: elbow - obstacle ball, -0.")
     assert run_to_end(stops_touching(collision, Standing(rest(np.zeros(2))), LIMITS)) is None
 
 
@@ -148,7 +148,7 @@ def test_a_run_is_refused_for_a_stop_out_of_its_approach_too() -> None:
     path = bench_excitation().path
     require_clear(model, path, [Standing(rest(low))], LIMITS)
     flying = replace(rest(low), velocity=np.array([2.0, 0.0]))
-    with pytest.raises(MotionRefused, match=r"a stop out of the way at 0\.00 s would touch: elbow - "):
+    with pytest.raises(MotionRefused, match=r"a stop out of the trajectory at 0\.00 s would touch: elbow - "):
         require_clear(model, path, [Standing(flying)], LIMITS)
 
 

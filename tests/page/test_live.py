@@ -201,7 +201,7 @@ def growing_run(
         part = slice(start, start + 400)
         growing.add(Block(stamp[part], q[part], held[part]))
         if growing.step():
-            doubt = growing.doubt()
+            doubt = growing.uncertainty()
             assert doubt is not None
             told.append(doubt.deviations)
     return growing, beta, told
@@ -209,7 +209,7 @@ def growing_run(
 
 def test_doubt_shrinks_as_the_arm_moves_and_is_honest() -> None:
     growing, beta, told = growing_run(40.0, 0.2)
-    doubt = growing.doubt()
+    doubt = growing.uncertainty()
     assert doubt is not None
     assert len(told) >= 5
     assert doubt.seconds > 30.0
@@ -224,7 +224,7 @@ def test_doubt_shrinks_as_the_arm_moves_and_is_honest() -> None:
 
 
 def test_deviations_from_blocks_are_those_that_blocks_of_the_whole_give() -> None:
-    plain, careful = growing_run(40.0, 0.2)[0].doubt(), growing_run(40.0, 0.2, in_blocks=True)[0].doubt()
+    plain, careful = growing_run(40.0, 0.2)[0].uncertainty(), growing_run(40.0, 0.2, in_blocks=True)[0].uncertainty()
     assert plain is not None
     assert careful is not None
     np.testing.assert_allclose(careful.beta, plain.beta, rtol=1e-9)
@@ -255,11 +255,11 @@ def test_what_is_remembered_stays_bounded() -> None:
 def test_nothing_is_known_before_the_arm_has_moved() -> None:
     growing = SequentialLeastSquares(arm_model(load_arm(shipped_arms()["planar2"])))
     assert not growing.step()
-    assert growing.doubt() is None
+    assert growing.uncertainty() is None
     stamp = np.arange(0, 10_000_000_000, 2_000_000)
     growing.add(Block(stamp, np.zeros((len(stamp), 2)), np.zeros((len(stamp), 2))))
     growing.step()
-    doubt = growing.doubt()
+    doubt = growing.uncertainty()
     assert doubt is None or not np.isfinite(doubt.deviations).any()
 
 

@@ -34,7 +34,7 @@ def test_what_one_side_asks_the_other_reads(tmp_path: Path) -> None:
         person.request_pause(True)
         person.request_pause(False)
         assert (loop.pause, loop.finish) == (False, True)
-        person.ask_stop()
+        person.request_stop()
         assert loop.stop
         assert person.pid == loop.pid
 
@@ -45,7 +45,7 @@ def test_support_is_confirmed_only_where_the_arm_waits_for_it(tmp_path: Path) ->
         with pytest.raises(UsageError, match="not held"):
             person.confirm_support()
         assert not loop.supported
-        loop.wait_for_support()
+        loop.announce_hold()
         assert (person.waiting, loop.supported) == (True, False)
         person.confirm_support()
         assert loop.supported
@@ -64,19 +64,19 @@ def test_a_lease_lapses_unless_it_is_renewed(tmp_path: Path) -> None:
         ControlFile.reach(loop_path(tmp_path), time) as parent,
     ):
         time.now += 1_900_000_000
-        assert loop.lease_ok(0)
+        assert loop.lease_is_valid()
         parent.renew()
         time.now += 1_900_000_000
-        assert loop.lease_ok(0)
+        assert loop.lease_is_valid()
         time.now += 200_000_000
-        assert not loop.lease_ok(0)
+        assert not loop.lease_is_valid()
 
 
 def test_a_run_without_a_lease_has_none_to_lose(tmp_path: Path) -> None:
     time = Time()
     with ControlFile.take(loop_path(tmp_path), None, time) as loop:
         time.now += 10**15
-        assert loop.lease_ok(0)
+        assert loop.lease_is_valid()
 
 
 def test_a_second_one_who_wants_to_move_the_arm_is_refused_by_name(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
     code = (
         "import sys, os, signal; from pathlib import Path\n"
         "from ident_service.motion.command_channel import ControlFile\n"
-        "ControlFile.take(Path(sys.argv[1]), None).ask_stop(); os.kill(os.getpid(), signal.SIGKILL)"
+        "ControlFile.take(Path(sys.argv[1]), None).request_stop(); os.kill(os.getpid(), signal.SIGKILL)"
     )
     subprocess.run([sys.executable, "-c", code, str(loop_path(tmp_path))], check=False)
     with ControlFile.take(loop_path(tmp_path), None) as again:
@@ -108,18 +108,18 @@ def test_a_killed_process_leaves_no_lock(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("asked", "stops"), [(-1, True), (0, True), (1, False), (None, False)])
 def test_a_stop_reaches_a_motion_that_was_requested_before_it(tmp_path: Path, asked: int | None, stops: bool) -> None:
     time = Time()
-    assert ControlFile.stop_all(loop_path(tmp_path), time) is None
+    assert ControlFile.stop_motions(loop_path(tmp_path), time) is None
     requested_ns = None if asked is None else time.now + asked
     time.now += 2_000_000_000
     with ControlFile.take(loop_path(tmp_path), 2.0, time, requested_ns) as loop:
         assert loop.stop == stops
         assert not loop.pause
-        assert loop.lease_ok(0)
+        assert loop.lease_is_valid()
 
 
 def test_a_stop_before_the_machine_was_started_anew_is_none(tmp_path: Path) -> None:
     time = Time()
-    ControlFile.stop_all(loop_path(tmp_path), time)
+    ControlFile.stop_motions(loop_path(tmp_path), time)
     time.now -= 3_000_000_000
     with ControlFile.take(loop_path(tmp_path), None, time, requested_ns=time.now - 1) as loop:
         assert not loop.stop
@@ -130,7 +130,7 @@ def test_a_stop_reaches_who_moves_the_arm_and_who_waits_for_it(tmp_path: Path) -
     requested_ns = time.now
     with ControlFile.take(loop_path(tmp_path), None, time) as loop:
         time.now += 1
-        assert ControlFile.stop_all(loop_path(tmp_path), time) == loop.pid
+        assert ControlFile.stop_motions(loop_path(tmp_path), time) == loop.pid
         assert loop.stop
     time.now += 1
     with ControlFile.take(loop_path(tmp_path), None, time, requested_ns) as waited:
@@ -142,7 +142,7 @@ def test_a_stop_reaches_who_moves_the_arm_and_who_waits_for_it(tmp_path: Path) -
 def test_a_stop_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     (tmp_path / "arm").write_text("", encoding="utf-8")
     with pytest.raises(UsageError, match="cannot be written"):
-        ControlFile.stop_all(loop_path(tmp_path))
+        ControlFile.stop_motions(loop_path(tmp_path))
 
 
 def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Path) -> None:
@@ -154,7 +154,7 @@ def test_a_stop_that_comes_while_the_controls_are_taken_is_not_lost(tmp_path: Pa
         read = time.now
         time.now += 1
         if looks[0] == 1:  # the clock has been read, and the controls are not written yet
-            ControlFile.stop_all(loop_path(tmp_path), time)
+            ControlFile.stop_motions(loop_path(tmp_path), time)
         return read
 
     with ControlFile.take(loop_path(tmp_path), None, now, requested_ns) as loop:
@@ -181,7 +181,7 @@ def test_a_lease_that_is_renewed_without_pause_never_looks_lapsed(tmp_path: Path
             try:
                 assert parent.stdout is not None
                 assert parent.stdout.readline() == "renewing\n"
-                lapsed = sum(not loop.lease_ok(0) for _ in range(100_000))
+                lapsed = sum(not loop.lease_is_valid() for _ in range(100_000))
             finally:
                 parent.kill()
     assert lapsed == 0

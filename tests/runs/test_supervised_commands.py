@@ -81,9 +81,9 @@ def test_stop_and_pause_are_those_of_the_control_file(controls: ControlFile) -> 
     controls.request_finish()
     assert (lifeline.stop, lifeline.pause, lifeline.finish) == (False, False, True)
     controls.request_pause(True)
-    controls.ask_stop()
+    controls.request_stop()
     assert (lifeline.stop, lifeline.pause) == (True, True)
-    lifeline.wait_for_support()
+    lifeline.announce_hold()
     assert controls.waiting
     assert not lifeline.supported
     controls.confirm_support()

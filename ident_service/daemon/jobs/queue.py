@@ -277,7 +277,7 @@ class LiveJobs:
             if live.end_reason:
                 _send_stop(live)
 
-    def conclude(self, live: LiveJob, child: JobProcess) -> None:
+    def conclude(self, child: JobProcess) -> None:
         """Close the input of a process that has ended."""
         with self._lock:
             child.close()
@@ -664,7 +664,7 @@ class Engine:
 
     def _conclude(self, live: LiveJob, child: JobProcess) -> None:
         """Enter what an ended job has made, then the job's end."""
-        self.live.conclude(live, child)
+        self.live.conclude(child)
         ended = outcome(process_output(self.state / JOBS / live.job), child.exit_code, live.end_reason)
         live.exit_code = ended.exit_code
         while True:

@@ -218,7 +218,7 @@ def add_maintenance(service: Serving, who: Operator, arm: ArmName, body: Event) 
 @router.get("/due")
 def list_due(service: Serving, _: Viewer, arm: ArmName | None = None) -> list[DueAnswer]:
     """List what is due, the earliest first; a re-identification of the arm that comes to a verdict ends it."""
-    return [DueAnswer(**row) for row in planned.comparable_dues(service.db, service.state, arm)]
+    return [DueAnswer(**row) for row in planned.pending_with_accepted(service.db, service.state, arm)]
 
 
 @router.post("/due/{number}/dismiss", status_code=204)

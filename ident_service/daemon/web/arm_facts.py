@@ -117,7 +117,7 @@ def joint_facts(config: ArmConfig) -> list[dict[str, Any]]:
 def _joints(config: ArmConfig) -> tuple[tuple[str, ...], tuple[bool, ...]]:
     """Return the joints' names and whether they turn; the daemon loads no parser of pinocchio for them."""
     from ident_service.model.chain import chain_from_dh
-    from ident_service.model.mechanism import count_mechanism, read_mechanism
+    from ident_service.model.mechanism import read_mechanism, require_parser_limits
     from ident_service.model.xml_elements import parse_xml
 
     kinematics = config.kinematics
@@ -125,7 +125,7 @@ def _joints(config: ArmConfig) -> tuple[tuple[str, ...], tuple[bool, ...]]:
         chain = chain_from_dh(kinematics.dh, config.gravity)
         return chain.names, chain.revolute
     if kinematics.urdf is not None:
-        count_mechanism(kinematics.urdf, "urdf")
+        require_parser_limits(kinematics.urdf, "urdf")
         kinds = {joint.get("name"): joint.get("type") for joint in parse_xml(kinematics.urdf.text).iter("joint")}
         return tuple(config.joints), tuple(kinds.get(name) != "prismatic" for name in config.joints)
     if kinematics.mjcf is not None:

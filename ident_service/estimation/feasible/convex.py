@@ -4,10 +4,10 @@ The problem is that of `nearest.py` and `priors.py`: the same blocks with the sa
 bound of each link's tr(P) = m + tr(L)/2, the same residual and prior. The formulation is another one: the variable is
 delta itself in reference scales (`feasible_set.py`), and cvxpy makes the cones.
 
-With a penalty p(delta), what is minimised is |R_1 beta - rho_1|^2 / sigma^2 + p (+ the prior's term): p is measured in
-residual variances, as -2 log of a prior density would be. cvxpy is loaded when a problem is posed, not before.
+With a penalty p(delta), |R_1 beta - rho_1|^2 / sigma^2 + p (+ the prior's term) is minimised: p is measured in residual
+variances, as -2 log of a prior density would be. cvxpy is loaded when a problem is posed, not before.
 
-A second opinion compares optima, not link values: of these, many are behind the same base parameters.
+A second opinion compares optima and not link parameters, many of which have the same base parameters.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from ident_service.estimation.feasible.nearest import FeasibleEstimate
 from ident_service.estimation.feasible.priors import Prior, residual_deviation
 from ident_service.estimation.least_squares import LeastSquares, unit_columns
 from ident_service.model.base_parameters import BaseParameters
+from ident_service.model.chain import Array
 
 if TYPE_CHECKING:
     import cvxpy as cp
-from ident_service.model.chain import Array
 
 SOLVER = "clarabel"
 _NAME = "constrained least squares in cvxpy"
@@ -118,7 +118,7 @@ def convex_least_squares(
         base: grouping of the parameters.
         conditions: the feasible set.
         prior: what the estimate is drawn to.
-        custom: further knowledge.
+        custom: the user's constraints and penalty.
         solver: any that `available_solvers` names.
         bound: of each link's tr(P) [kg]; those of `formulation.py` in turn when None, none with a prior.
         inside: whether the parameters must have a positive margin; a solver of first order may miss the inset of 1e-6.
@@ -211,13 +211,13 @@ class _Posed:
         self._blocks = [self._block(*pair) for pair in zip(conditions.blocks, inside.tolist(), strict=True)]
         E, e = conditions.equality_rows()
         self._equalities = [(E * self._scales) @ self._x + e == 0.0] if len(e) else []
-        self._known: Sequence[cp.Constraint] = ()
+        self._custom_constraints: Sequence[cp.Constraint] = ()
         self._penalty: cp.Expression | None = None
         if custom is not None:
             beta = base.K @ delta
             link = {name: delta[index] for index, name in enumerate(base.names)}
             grouped = {text: beta[index] for index, text in enumerate(base.expressions)}
-            self._known, self._penalty = custom.constraints(link, grouped)
+            self._custom_constraints, self._penalty = custom.constraints(link, grouped)
         self._objective = cp.Minimize(self._cost())
         self._iterations, self._seconds = 0, 0.0
 
@@ -267,7 +267,7 @@ class _Posed:
         """Solve and return cvxpy's status, or a solver's own words where it fails."""
         import cvxpy as cp
 
-        constraints = [*self._blocks, *self._equalities, *self._known]
+        constraints = [*self._blocks, *self._equalities, *self._custom_constraints]
         if np.isfinite(bound):
             constraints.append((traces(self._conditions) * self._scales / bound) @ self._x <= 1.0)
         problem = cp.Problem(self._objective, constraints)
@@ -302,7 +302,9 @@ class _Posed:
         """Return the names of the active constraints, custom ones too, by multiplier as `active_constraints` does."""
         named = [(block.name, one) for block, one in zip(self._conditions.blocks, self._blocks, strict=True)]
         if self._custom is not None:
-            named += [(f"{self._custom.name}, constraint {k}", one) for k, one in enumerate(self._known, 1)]
+            named += [
+                (f"{self._custom.name}, constraint {k}", one) for k, one in enumerate(self._custom_constraints, 1)
+            ]
         weights = {name: _multiplier(one) for name, one in named}
         floor = max(MULTIPLIER, 1e-3 * max(weights.values(), default=0.0))
         return tuple(sorted((name for name in weights if weights[name] > floor), key=lambda name: -weights[name]))
@@ -371,7 +373,7 @@ def second_opinion(
         conditions: the feasible set.
         deviations: standard deviations of the base parameters, shape (base,).
         prior: what both are drawn to.
-        custom: further knowledge in both.
+        custom: the user's constraints and penalty, in both.
         solver: without `custom`, that of the second solution; with it, that of the first, and the second is another.
 
     Raises:

@@ -184,7 +184,7 @@ def unsupported_terms(
 
 
 def presliding_left_out(model: ArmModel, delta: Array) -> tuple[str, ...]:
-    """Return the drives' pre-sliding, in words, which a format without friction state does not carry.
+    """Describe in one sentence the pre-sliding that a format without friction state leaves out; empty without any.
 
     Args:
         model: the arm.

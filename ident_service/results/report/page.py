@@ -30,7 +30,7 @@ from ident_service.results.report.figures import (
     relative_deviations,
 )
 from ident_service.results.report.rendering import WORST, Cell, Table, asset, render, vendored
-from ident_service.results.report.verdict import next_steps, simulated, verdict
+from ident_service.results.report.verdict import next_steps, simulation_notice, verdict
 from ident_service.results.summary import WHAT_THEN, noise_and_model, rows_and_filter
 
 _NOTHING = Cell("\u2014")
@@ -283,7 +283,7 @@ def report_html(evidence: Evidence, parameters: ParameterFile, config: ArmConfig
         styles=(vendored("uPlot.min.css"),),
         title=f"Identification of {config.name}",
         subtitle=_subtitle(parameters, config),
-        simulated=simulated(evidence, config),
+        simulated=simulation_notice(evidence, config),
         assessment=found,
         joints=assessment_table(found),
         joint_rule=joint_rule(),

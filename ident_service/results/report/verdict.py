@@ -36,8 +36,8 @@ def unidentified(parameters: ParameterFile) -> list[tuple[str, float]]:
     return [(table["expressions"][k], float(shares[k])) for k in sorted(found, key=lambda k: -shares[k])]
 
 
-def active_conditions(evidence: Evidence, parameters: ParameterFile) -> str:
-    """Return the number of active conditions, in words; empty where there are none or no body has the parameters."""
+def active_constraints_text(evidence: Evidence, parameters: ParameterFile) -> str:
+    """Return how many constraints are active, in words; empty where none is or the parameters are infeasible."""
     tight = active_constraints(parameters.content)
     if not tight:
         return ""
@@ -55,12 +55,12 @@ def listed(names: Sequence[str]) -> str:
 
 SIMULATED = "The arm is simulated: this is no commissioning of a real arm."
 PERHAPS_SIMULATED = "The description is of a simulated arm; its recordings do not say which arm they are of."
-# The page repeats a file, which anybody may have written; only the verifier, with the arm, can tell.
+# Anybody may have written the file that the page repeats: only the verifier, with the arm, can tell.
 _CERTIFIED = "parameters.json has a certificate of that: `ident verify --arm` checks it in exact arithmetic."
 
 
-def simulated(evidence: Evidence, config: ArmConfig) -> str:
-    """Return that the recordings are of a simulated arm, or may be; empty where they are of a real one."""
+def simulation_notice(evidence: Evidence, config: ArmConfig) -> str:
+    """Return the notice that recordings are of a simulated arm, or may be; empty where they are of a real one."""
     drivers = {one.driver for one in evidence.recordings}
     if "simulated" in drivers:
         return SIMULATED
@@ -79,7 +79,7 @@ def verdict(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         *_feasibility(evidence, parameters),
         _prediction(evidence, parameters),
         _knowledge(parameters),
-        *_condition(parameters),
+        *_condition_number(parameters),
     ]
 
 
@@ -102,9 +102,9 @@ def _feasibility(evidence: Evidence, parameters: ParameterFile) -> list[str]:
             sentences.append("They lie too close to the boundary for a certificate in exact arithmetic.")
         if (custom := parameters.content.get("custom")) is not None:
             name = shortened(custom["function"], _LONGEST)
-            sentences.append(f"They also meet {name} says, a function that no certificate is about.")
+            sentences.append(f"They also meet what {name} says, a function that no certificate is about.")
         if tight:
-            sentences.append(f"{active_conditions(evidence, parameters)}: {tight}.")
+            sentences.append(f"{active_constraints_text(evidence, parameters)}: {tight}.")
         return [*sentences, how]
     sentences = [f"They are not physically feasible (margin {margin})."]
     sentences.append(_CERTIFIED if certified else "There is no certificate of that in exact arithmetic.")
@@ -157,7 +157,7 @@ def _knowledge(parameters: ParameterFile) -> str:
     return f"{words}, the most uncertain first (\u03c3 over the larger of size and reference): {shown}{more}."
 
 
-def _condition(parameters: ParameterFile) -> list[str]:
+def _condition_number(parameters: ParameterFile) -> list[str]:
     """Return a sentence on the regressor's condition number where it matters."""
     fit, verdicts = parameters.content.get("fit"), parameters.content["base_parameters"].get("verdicts", [])
     # A large number by itself is no limitation: it depends on units, and parameters may be identified in spite of it.
@@ -191,7 +191,7 @@ def next_steps(evidence: Evidence, parameters: ParameterFile) -> list[str]:
         )
     if still := [one.joint for one in poor if not one.in_motion]:
         steps.append(f"use it where joints move, not for the torque near standstill of {', '.join(still)}")
-    if active_conditions(evidence, parameters):
+    if active_constraints_text(evidence, parameters):
         steps.append("find out why constraints are active: signs, units, friction, drive inertia")
     if "unidentified" in parameters.content["base_parameters"].get("verdicts", []):
         steps.append(
