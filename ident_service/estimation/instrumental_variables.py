@@ -59,8 +59,8 @@ class InstrumentalEstimate:
 
     Attributes:
         beta: base parameters in SI units, not constrained, shape (base,).
-        covariance: from leaving out one block at a time, shape (base, base).
-        standard_deviations: its diagonal's square root, shape (base,).
+        covariance: covariance from leaving out one block at a time, shape (base, base).
+        standard_deviations: square roots of the covariance's diagonal, shape (base,).
         feasible_beta: the nearest feasible ones in the metric of the equations, shape (base,).
         delta: feasible link parameters that belong to them, shape (parameters,).
         rounds: how often the motion was simulated.
@@ -95,7 +95,7 @@ def instrumental_variables(
     """Refine an estimate by instrumental variables from simulated motions.
 
     Args:
-        recordings: what `fit` was fitted to.
+        recordings: recordings that `fit` was fitted to.
         model: the arm.
         base: grouping of the parameters.
         conditions: the feasible set, which every simulated arm is in.
@@ -259,10 +259,10 @@ def simulated(recording: Recording, model: ArmModel, delta: Array, cutoff: float
     """Return the recording as the arm would have made it without noise.
 
     Args:
-        recording: whose positions the simulated arm follows, and whose stamps and torques are kept.
+        recording: recording whose positions the simulated arm follows, and whose stamps and torques are kept.
         model: the arm; its configuration says what to trim.
-        delta: its parameters, shape (parameters,).
-        cutoff: of the low-pass on the positions that it follows [Hz].
+        delta: link parameters of the arm, shape (parameters,).
+        cutoff: cut-off of the low-pass on the positions [Hz].
 
     Raises:
         ModelError: a link has no positive mass, the loop runs away, or a cut-off above half the rate.

@@ -144,8 +144,8 @@ class _Smooth:
         time: [s] since the recording's first sample, shape (samples,).
         position, velocity, acceleration: [rad or m and derivatives], shape (samples, joints).
         torque: [N m or N], shape (samples, joints).
-        start: of the samples that count, none of which is in another window.
-        stop: of them.
+        start: index of the first sample that counts; no sample counts in two windows.
+        stop: end of the samples that count.
         opens: whether a stretch without gaps begins with it.
         closes: whether one ends with it.
     """
@@ -196,7 +196,7 @@ class _Smoother:
 
     Attributes:
         margin: samples on either side of a window that its ends reach.
-        key: what its results depend on beside the recording.
+        key: key of everything beside the recording that the results depend on.
     """
 
     def __init__(self, recording: Recording, options: Identification, period: float) -> None:
@@ -343,7 +343,7 @@ def averaged(
     """Average a recording over its periods, in memory for one period.
 
     Args:
-        recording: of a periodic motion; whatever is not (approach, return) trimmed by `fmt`.
+        recording: recording of a periodic motion; whatever is not periodic (approach, return) is trimmed by `fmt`.
         options: cut-off and rows near reversal.
         period: of the motion [s].
         coupling: drive coordinates per joint coordinates; the identity when None.
