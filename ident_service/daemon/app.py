@@ -78,7 +78,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
 
     Args:
         settings: how it runs.
-        connections: of the listener that it is served by; None where something else counts them.
+        connections: connections of the listener that serves the application; None where something else counts them.
 
     Raises:
         UsageError: the state folder cannot be used.

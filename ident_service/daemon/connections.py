@@ -220,8 +220,8 @@ class Listener(socket.socket):
         """Create the listening socket; it is not bound yet.
 
         Args:
-            family: of addresses.
-            book: counts.
+            family: address family, such as `socket.AF_INET`.
+            book: counter of the connections.
         """
         super().__init__(family, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
         self._book, self._accepted, self._gone = book, 0, 0
