@@ -43,7 +43,7 @@ class Nearest:
     Attributes:
         distance: [m]; infinite where there is nothing to touch.
         pair: names of the two bodies, or None.
-        time: at which the distance is smallest [s].
+        time: time on the motion of the smallest distance [s].
     """
 
     distance: float
@@ -58,8 +58,8 @@ class ClearanceChecker:
         """Prepare the collision model of an arm.
 
         Args:
-            model: with its geometry and surroundings; without any, every way is clear.
-            limits: of the arm, that its stops keep.
+            model: model with its geometry and surroundings; without any, every trajectory is clear.
+            limits: limits of the arm, which its stops keep.
 
         Raises:
             MotionRefused: a pair of bodies that is never free.
@@ -74,8 +74,8 @@ class ClearanceChecker:
         Where the arm stands nearer to something than the clearance, as after a stop, half of that distance is kept.
 
         Args:
-            reference: from rest.
-            limits: that it keeps.
+            reference: trajectory that begins at rest.
+            limits: limits that the trajectory keeps.
 
         Raises:
             MotionRefused: from any of the steps, naming what comes how near to what, and when.
@@ -175,9 +175,9 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
     """Refuse a run that would come too near to anything.
 
     Args:
-        model: of the arm, with its geometry and surroundings; without any, nothing is checked.
+        model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
         path: the motion.
-        trajectories: to it and back from it.
+        trajectories: trajectories to the motion and back from it.
         limits: of the arm.
 
     Raises:
@@ -199,9 +199,9 @@ def require_clear_trajectories(
     """Refuse trajectories that come too near to anything, or out of which a stop would touch something.
 
     Args:
-        model: of the arm, with its geometry and surroundings; without any, nothing is checked.
-        trajectories: each with its name in a refusal.
-        limits: of the arm; none of them is faster.
+        model: model of the arm, with its geometry and surroundings; without any, nothing is checked.
+        trajectories: trajectories, each with its name in a refusal.
+        limits: limits of the arm; no trajectory is faster.
 
     Raises:
         MotionRefused: naming what comes how near to what, and when.
@@ -266,9 +266,9 @@ def relaxed_limits(position: Vector, limits: MotionLimits, share: float = SAG) -
     """Return limits for a trajectory that begins outside: just wide enough to include the start.
 
     Args:
-        position: where the arm stands [rad or m], shape (joints,).
+        position: present position of the arm [rad or m], shape (joints,).
         limits: of the arm.
-        share: of the following error, that is added where a joint stands outside.
+        share: share of the following error that is added where a joint stands outside.
 
     Returns:
         The limits themselves in all joints that stand inside.

@@ -81,8 +81,8 @@ def longest_stall(described: float | None, period: float, watchdogs: Iterable[Wa
     Args:
         described: `control.longest_stall` of the arm's description [s].
         period: of the loop [s].
-        watchdogs: of the drives. Half of the shortest time is the most: what comes late must not come too late.
-            Nor is it more than nearly the gap that is called silence.
+        watchdogs: watchdogs of the drives. Half of the shortest time is the most: what comes late must not come too
+            late. Nor is it more than nearly the gap that is called silence.
     """
     times = [one.seconds for one in watchdogs if one.seconds is not None]
     asked = max(LONGEST_STALL, period) if described is None else described
@@ -130,7 +130,7 @@ class Deadlines:
     """Watch the timing of one loop from its first cycle on.
 
     Attributes:
-        lateness_ns: of the last cycle, against the typical one of those before it [ns].
+        lateness_ns: lateness of the last cycle against the typical one of those before it [ns].
         elapsed: time between the last two samples, at most [s], see `Elapsed`.
         known: whether `elapsed` is the true time between them.
         lost: cycles that were late or never came, so far.
@@ -147,10 +147,10 @@ class Deadlines:
         """Start before the first cycle.
 
         Args:
-            findings: makes the faults.
+            findings: counter that makes the faults.
             period: of the loop [s].
             scheduled_stamps: whether stamps are those of a schedule (`ArmDescription`).
-            longest_stall: that is survived [s].
+            longest_stall: longest stall that a motion survives [s].
         """
         self.lateness_ns = self.lost = 0
         self.elapsed = period
