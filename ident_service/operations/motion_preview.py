@@ -47,19 +47,19 @@ class Preview:
         model: of the arm.
         excitation: the motion.
         limits: of the arm.
-        proof: verified bounds of its demands at every instant.
-        objections: every limit that is not kept, in words; empty for a motion that may run.
+        proof: verified bounds of the motion's demands at every instant.
+        objections: limits that are not kept, in words; empty for a motion that may run.
         stops: lowest and highest positions that a stop from anywhere on the motion reaches, each of shape (joints,).
-        stop_clearance: the smallest distance on stops out of the motion.
+        stop_clearance: smallest distance on stops out of the motion.
         following: following error of the simulated arm, or its forecast where the reference leaves limits and
             nothing was simulated [rad or m], shape (joints,).
-        approach: how long the way from home to its beginning takes [s], and back from its end.
-        base: the parameters.
-        noise: of the torques, as far as known.
-        deviations: to be expected, shape (base,).
+        approach: duration of the way from home to its beginning [s], and of that back from its end.
+        base: grouping of the parameters.
+        noise: noise of the torques, as far as known.
+        deviations: expected standard deviations of the base parameters [SI], shape (base,).
         negligible: sizes below which parameters are as good as zero on this motion, shape (base,).
-        condition_number: of the stacked regressor.
-        warnings: what nobody can prove or forbid, in words.
+        condition_number: condition number of the stacked regressor.
+        warnings: warnings of what nobody can prove or forbid, in words.
     """
 
     model: ArmModel
@@ -86,8 +86,8 @@ def preview(
 
     Args:
         model: of the arm, with prior parameters.
-        excitation: made for it.
-        noise: of the torques; the description's when None.
+        excitation: motion that was made for this arm.
+        noise: noise of the torques; the description's when None.
         added: information from earlier recordings, whitened by `noise`, shape (base, base).
 
     Raises:
