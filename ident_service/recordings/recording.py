@@ -82,8 +82,9 @@ class Recording(Protocol):
 
     Attributes:
         path: the file.
-        sha256: of the file's bytes.
-        joint_names: in the order of the block's columns; empty where the file names none (CSV `q1..qN`).
+        sha256: hash of the file's bytes.
+        joint_names: names of the joints, in the order of the block's columns; empty where the file names none (CSV
+            `q1..qN`).
         joints: number of joints.
         torque_held: True when the torque of a sample acts from its stamp until the next stamp (our own recordings:
             a zero-order hold), False when it was sampled at its stamp.
