@@ -63,7 +63,7 @@ class CanBusServer:
         Args:
             name: channel that ends connect to: a name, or the path of a socket file.
             bitrate: pace to keep [bit/s]; 0: none.
-            data_bitrate: of the data of CAN FD's frames [bit/s]; None: the wire has none, but for `fd`.
+            data_bitrate: bit rate of the data of CAN FD's frames [bit/s]; None: the wire has none, but for `fd`.
             fd: whether frames may be CAN FD's although there is no pace.
             duration_ns: how long a frame occupies the wire, instead of its bits at these rates.
 

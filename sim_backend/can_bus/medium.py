@@ -45,7 +45,7 @@ class ErrorCounters:
 
     Attributes:
         sending, receiving: the counters, each at most 256.
-        state: of the controller.
+        state: state of the controller.
     """
 
     def __init__(self) -> None:
@@ -121,8 +121,8 @@ class BusEndpoint:
 
     Attributes:
         label: name of the controller, for people and for injecting errors.
-        pid: its process.
-        counters: its error counters.
+        pid: id of its process.
+        counters: error counters of its controller.
         inbox: frames that it received and that are not taken yet, each with whether it was its own.
         fd: whether its controller knows CAN FD; one that does not destroys such frames of others.
         lost: frames that found its inbox full.
@@ -140,8 +140,8 @@ class BusEndpoint:
         """Create a port that is not on any wire yet.
 
         Args:
-            label: for people.
-            pid: of the process behind it.
+            label: name for people.
+            pid: id of the process behind it.
             own: whether it hears its own frames.
             filters: identifier and mask, any of which lets a standard frame pass; none lets all frames pass.
             fd: whether its controller knows CAN FD.
@@ -185,7 +185,7 @@ class Medium:
     """Emulate the wire and its ports.
 
     Attributes:
-        ports: in the order in which they came.
+        ports: ports in the order in which they came.
         sent: frames that all ports received.
         destroyed: frames that no port received.
         collisions: frames that met one with the same arbitration field from another port: two nodes with one number.
