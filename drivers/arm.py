@@ -136,8 +136,8 @@ class Watchdog:
     Attributes:
         drive: name of the drive, for people.
         kind: the signal it watches: `rpdo_timer` and the like.
-        seconds: how long that may stay away before the drive acts [s]; None where unknown.
-        of_torque: whether it is the torque frames, so that a cycle without torque withholds it.
+        seconds: time for which that signal may stay away before the drive acts [s]; None where unknown.
+        of_torque: whether that signal is the torque frames, so that a cycle without torque withholds it.
         report_delay: longest delay with which its reaction shows while its signal is withheld [s]; None where that is
             `ArmDescription.report_delay`.
     """

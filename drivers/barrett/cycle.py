@@ -196,7 +196,7 @@ class PuckCodec:
 
         Args:
             now_ns: time of the requests [ns of the link's clock].
-            asks: whether they were at all.
+            asks: whether positions were asked for at all.
         """
         self._open, self._now_ns, self._missing = True, now_ns, len(self.pucks)
         self.safety.status_age += 1

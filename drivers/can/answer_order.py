@@ -25,7 +25,7 @@ class AnswerOrder:
     """Count the requests that one node has not answered.
 
     Attributes:
-        behind: how many, the latest included.
+        behind: number of requests that wait for an answer, the latest included.
         uncertain: whether the last answer may be of an older request, and `settle` is to be called.
     """
 

@@ -208,7 +208,7 @@ class Line:
         name: name of the sort of frames.
         cob_ids: identifiers, one frame each.
         length: bytes of one.
-        per_second: how often each is sent, at most.
+        per_second: largest number of each per second.
         cyclic: whether each is sent once a cycle.
         each: time of one on the wire, intermission included [s]; the mean over `cob_ids`.
     """
@@ -326,7 +326,7 @@ def line_of(
         name: name of the sort of frames.
         identifiers: identifiers, one for each frame.
         length: bytes of one.
-        per_second: how often each is sent, at most.
+        per_second: largest number of each per second.
         bus: bus that the frames are on.
         mean: function that returns the mean bits of a frame by its identifier, at the nominal and at the data bit rate.
         cyclic: whether each is sent once a cycle.

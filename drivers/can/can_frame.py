@@ -119,8 +119,8 @@ def pack_frames(frames: Iterable[tuple[Frame, bool]]) -> bytes:
     A frame is a header of 16 bytes (stamp [ns], the kernel's identifier word, length, flags) and its data.
 
     Args:
-        frames: at most `MAX_PACKET_FRAMES` that can exist on a bus, each with whether the recipient of the packet sent
-            it.
+        frames: frames that can exist on a bus, at most `MAX_PACKET_FRAMES`, each with whether the recipient of the
+            packet sent it.
     """
     parts = []
     for (identifier, data, remote, error, extended, stamp_ns, fd), own in frames:

@@ -128,7 +128,7 @@ class SessionLog:
     Attributes:
         path: of the file.
         lost: frames that were dropped because the writing process was behind or gone.
-        report: how it ended, None until it has.
+        report: report of the end of the log, None until it has ended.
     """
 
     def __init__(self, path: Path | str, clock: Clock) -> None:

@@ -157,11 +157,11 @@ class Capabilities:
     Attributes:
         family: drive family that it belongs to.
         found: entries that the drive has.
-        torque: how torques are streamed, or positions (`driver.streams`); None for no way.
+        torque: way in which torques, or positions, are streamed (`driver.streams`); None for no way.
         count: a count of the target [N m]; None where nothing tells it.
         limit: torque limit in the drive; None for none.
         speed: entry of the largest speed; None where the drive has none, or nobody knows its unit.
-        speed_size: how many of its unit a turn per minute is.
+        speed_size: number of its units in a turn per minute.
         watchdogs: kinds of watchdogs that it has, the most trusted first.
         more_trusted: name of a watchdog that is more trusted than the described one, in words; empty where none is.
         event: whether it has an event timer for status reports; else they come with every n-th SYNC.

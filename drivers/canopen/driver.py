@@ -85,7 +85,7 @@ class StopCommand:
     """Hold the last stop command, and the drives that it could not be sent to yet; no method raises.
 
     Attributes:
-        braking: whether it is a quick stop.
+        braking: whether the stop is a quick stop.
     """
 
     def __init__(self) -> None:

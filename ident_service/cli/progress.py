@@ -40,7 +40,7 @@ class Mark:
     Attributes:
         at: time of the mark [s].
         words: description of the work in progress.
-        share: how much of all is done, from 0 to 1; None where that is not known.
+        share: share of all work that is done, from 0 to 1; None where that is not known.
         left: time to the end [s] where it is known.
     """
 
@@ -108,8 +108,8 @@ class ProgressBar:
         """Tell what is being done; never waits.
 
         Args:
-            words: for a person.
-            share: how much of all is done, from 0 to 1.
+            words: description of the step for a person.
+            share: share of all work that is done, from 0 to 1.
             left: time to the end [s].
         """
         self._mark = mark = Mark(time.monotonic(), words, share, left)

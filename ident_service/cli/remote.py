@@ -167,7 +167,7 @@ def job_verb(make: Callable[[IdentClient, argparse.Namespace], dict[str, Any]], 
 
     Args:
         make: the job of the words; its kind is the verb if it does not say another.
-        ended: turns the job's answer into the verb's; as it is if None.
+        ended: function that turns the job's answer into the verb's; the job's own answer when None.
     """
 
     def verb(client: IdentClient, arguments: argparse.Namespace) -> Answer:
@@ -356,7 +356,7 @@ def follow(
         job: the job in the daemon's answer.
         over: function that is called in each turn; once it returns True, the lease is renewed no more, and the job is
             cancelled.
-        moves: whether it has a lease.
+        moves: whether the job has a lease.
         ours: whether this command began the job; another one is left alone, and no longer waited for.
         every: s between turns; the job itself is looked at less often.
 

@@ -43,7 +43,7 @@ class DataSheetEntry:
         low: least value, None where the file says none.
         high: greatest value, likewise.
         text: value in the file's own words, None where it says none; that of a DCF before the default.
-        configured: whether that is a value which a DCF gives to this drive, not the default of its kind.
+        configured: whether the value is one which a DCF gives to this drive, not the default of its kind.
     """
 
     kind: int

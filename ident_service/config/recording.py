@@ -228,7 +228,7 @@ def motor_disagreements(
 
     Args:
         what: the motors' name, and their key in the section `driver`.
-        motors: how many there are.
+        motors: number of motors.
         lost_cycles: `driver.lost_cycles`.
         transmission: the arm's.
         joints: names of the arm's joints; none where the file does not name them.

@@ -57,7 +57,7 @@ class FaultRule:
     Attributes:
         does: effect of the fault, in words.
         size: meaning of its size, with the unit; None where it has none.
-        of_joint: whether it may be one joint's.
+        of_joint: whether the fault may be one joint's.
         stays: whether it stays when no duration is given, instead of striking for one cycle.
     """
 

@@ -77,7 +77,7 @@ def create_app(settings: Settings, connections: Connections | None = None) -> Fa
     """Create the service as an ASGI application; its database is opened now, its queue runs during its lifespan.
 
     Args:
-        settings: how it runs.
+        settings: settings of the service.
         connections: connections of the listener that serves the application; None where something else counts them.
 
     Raises:

@@ -73,7 +73,7 @@ class Connections:
         """Begin without connections.
 
         Args:
-            most: how many there may be; half as many of one address.
+            most: largest number of connections; half as many of one address.
             now: clock of the deadlines [s].
         """
         self._most, self._most_of_one, self._now = most, max(most // 2, 1), now

@@ -140,7 +140,7 @@ class Test:
         statistic: T^2, the squared length of the difference in deviations.
         directions: r, number of independent directions of the difference.
         degrees: nu of the covariances; infinite where they are known.
-        p: how often a larger statistic comes about when nothing has changed.
+        p: probability of a larger statistic by chance when nothing has changed.
         left_out: number of directions in which nothing could be tested.
     """
 

@@ -150,7 +150,7 @@ def equations(
 
     Args:
         recordings: to read, one or several.
-        model: its configuration says how to smooth.
+        model: model whose configuration says how to smooth.
         base: grouping of the parameters.
         row_weights: function that returns the factors of the rows, shape (samples, joints); with it, rows near
             standstill are among the blocks.
@@ -179,7 +179,7 @@ def equations_of(
 
     Args:
         recordings: to read.
-        model: its configuration says how to cut them into blocks.
+        model: model whose configuration says how to cut the recordings into blocks.
         felt: per joint, which columns it feels, increasing.
         rows_of: function that yields a recording's rows in consecutive chunks.
         row_weights: function that returns the factors of the rows, as for `equations`.

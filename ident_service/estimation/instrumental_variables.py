@@ -63,7 +63,7 @@ class InstrumentalEstimate:
         standard_deviations: square roots of the covariance's diagonal, shape (base,).
         feasible_beta: the nearest feasible ones in the metric of the equations, shape (base,).
         delta: feasible link parameters that belong to them, shape (parameters,).
-        rounds: how often the motion was simulated.
+        rounds: number of times that the motion was simulated.
         change: largest change of a parameter in this round, in its standard deviations; of the rounds that there are,
             the one that changed least. Above `SETTLED` it has not settled.
         strength: correlation of each instrument with its regressor column, shape (base,); below about 0.9 much of

@@ -65,7 +65,7 @@ class Reading:
     Attributes:
         which: columns that it is about.
         joints: one whose sign is negated, two that are exchanged, or all.
-        all_negated: whether it is about all, with the other sign.
+        all_negated: whether all columns are meant, with the other sign.
         factor: factor of the columns of one joint, or of all; torques are divided where both are read.
         late: time by which the torque of one joint is stamped too late [s].
         zero: angle added to the position of one joint [rad].

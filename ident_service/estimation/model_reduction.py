@@ -90,7 +90,8 @@ def essential_parameters(
     Args:
         equations: equations that `fit` solves.
         fit: ordinary or weighted least squares of all base parameters; its weights stay.
-        level: how often chance alone may call a model worse that is not, between 0 and 1.
+        level: level of the test: probability, between 0 and 1, that chance alone makes it call a model worse that is
+            not.
         covariance: covariance of `fit` from blocks, shape (base, base); computed when None.
 
     Raises:

@@ -45,7 +45,7 @@ class ParameterUncertainty:
             (base,); infinite where nothing is known yet.
         negligible: sizes below which parameters are as good as zero on the motion so far [SI], shape (base,).
         verdicts: a word per base parameter.
-        blocks: how many were kept, repetitions of the same motion counted once.
+        blocks: number of blocks that were kept, repetitions of the same motion counted once.
         until_ns: stamp of the last sample that went in.
     """
 

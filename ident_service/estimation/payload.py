@@ -107,7 +107,7 @@ class Body:
         delta: ten parameters of the body in the last link's frame (eq. 13), positive mass, and the offsets, shape
             (names,); those that no motion shows are as a ball of this mass has them.
         b: change of the arm by the body, in base parameters of the payload: negative if taken off, shape (payload,).
-        p: how often an estimate lies farther away by chance.
+        p: probability that an estimate lies farther away by chance.
         torque_share: per joint, of its torque, by which it predicts otherwise than the estimate, shape (joints,).
         explains: whether it lies near enough, in deviations or in torque.
         margin: smallest eigenvalue of its pseudo-inertia.
@@ -174,7 +174,7 @@ def identify_payload(arm: KnownArm, recorded: Equations, *, refit_offsets: bool 
     """Identify the payload of an arm from a recording with it.
 
     Args:
-        arm: as it was identified, with another load or none.
+        arm: the arm as it was identified, with another load or none.
         recorded: equations of the second recording in the arm's base parameters, from `fit.gather`.
         refit_offsets: whether the offset of every joint may differ too, as after a restart that zeroed the torques.
 

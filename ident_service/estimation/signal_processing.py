@@ -147,7 +147,7 @@ class _Smooth:
         start: index of the first sample that counts; no sample counts in two windows.
         stop: end of the samples that count.
         opens: whether a stretch without gaps begins with it.
-        closes: whether one ends with it.
+        closes: whether a stretch without gaps ends with it.
     """
 
     time: Array
@@ -324,7 +324,7 @@ class Averaged:
 
     Attributes:
         motion: one period.
-        periods: how many were averaged.
+        periods: number of periods that were averaged.
         torque_noise: standard deviation of one torque sample between periods [N m or N], shape (joints,).
     """
 

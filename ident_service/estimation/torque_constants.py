@@ -104,7 +104,7 @@ def identify_torque_constants(
     """Identify the torque constants of an arm's motors jointly with its base parameters.
 
     Args:
-        recordings: with the payloads that they carry (`CachedRecording.payload`), one at least.
+        recordings: recordings with the payloads that they carry (`CachedRecording.payload`), one at least.
         model: the arm, the shape of its friction and the delay as numbers.
         base: grouping of its parameters.
         conditions: the set that parameters must lie in; None for none.

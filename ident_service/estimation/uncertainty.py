@@ -74,7 +74,7 @@ def uncertainty(equations: Equations, fit: LeastSquares) -> Uncertainty:
     """Estimate covariance, standard deviations and degrees of freedom from blocks.
 
     Args:
-        equations: in blocks.
+        equations: equations in blocks.
         fit: least squares that solves the equations.
     """
     clusters = equations.clusters
@@ -107,7 +107,7 @@ def inflated_covariance(equations: Equations, fit: LeastSquares, doubt: Uncertai
     from the blocks alone; its size is of all directions together. For tests that find the size of each themselves.
 
     Args:
-        equations: in blocks.
+        equations: equations in blocks.
         fit: least squares that solves the equations.
         doubt: uncertainty of that fit.
     """

@@ -76,7 +76,7 @@ def stretches(path: Path, longest: float | None = None) -> TimeIntervals:
 
     Args:
         path: the motion.
-        longest: their greatest length [s]; by default a small part of the fastest oscillation.
+        longest: greatest length of the stretches [s]; by default a small part of the fastest oscillation.
     """
     edges = []
     for begin, end in path.distinct:

@@ -179,7 +179,7 @@ class Problem:
         label: of the piece, see `Part`.
         kind: `recording` for what is wrong with it, `storage` where it could not be read, `worker` where it ended
             every process that tried, `version` where a worker has another version of this package.
-        message: in words.
+        message: reason in words.
     """
 
     url: str

@@ -332,7 +332,7 @@ def reduce_fleet(
 
     Args:
         client: of the scheduler.
-        request: what to reduce.
+        request: request with the arm, the store and the options.
         listed: list of the recordings.
         tell: called with a line at each step.
         step: called with what is being done and how much of all is done, from 0 to 1.

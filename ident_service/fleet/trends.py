@@ -67,7 +67,7 @@ class Change:
     Attributes:
         arm: name.
         group: kind and number of joint or link.
-        drift: whether it is a line over all the time, not a step at a date.
+        drift: whether the change is a line over all the time, not a step at a date.
         at: index of the first recording after it, in time; of a drift, of the first one in its second half.
         before: time of the last recording before [s since 1970]; of a drift, of the first one.
         after: time of the first recording after; of a drift, of the last one.
@@ -78,7 +78,7 @@ class Change:
         joint: index of the joint whose torque changes most for its size, from 0.
         torque_share: change of that joint's predicted torque, as a share of its torque.
         residual_share: the same change as a share of that joint's residual.
-        changed: whether it is significant and matters.
+        changed: whether the change is significant and matters.
     """
 
     arm: str

@@ -351,7 +351,7 @@ def share_touching(model: ArmModel, within: float, postures: int, seed: int) -> 
     Args:
         model: model of an arm, also of one whose bodies always touch.
         within: nearer than this counts as touching [m].
-        postures: how many are drawn, within the position limits.
+        postures: number of postures drawn, within the position limits.
         seed: of the draw.
 
     Raises:

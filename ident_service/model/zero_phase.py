@@ -136,7 +136,7 @@ def spline_shifted(values: Array, steps: float) -> Array:
 
     Args:
         values: shape (samples, columns), at least one sample.
-        steps: how much further on, in samples; negative for back.
+        steps: number of samples further on at which the spline is read; negative for back.
 
     Returns:
         Shape of `values`.

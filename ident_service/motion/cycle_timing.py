@@ -25,7 +25,7 @@ class Histogram:
     """Count times in fixed bins.
 
     Attributes:
-        count: how many.
+        count: number of entries.
         worst_ns: the longest [ns].
     """
 
@@ -111,8 +111,9 @@ class Elapsed:
         """Return the time since the last call's stamp [s], half a period to `LONGEST_GAP` periods; a period at first.
 
         Args:
-            stamp_ns: of a sample [ns].
-            doubt_ns: how much earlier it may have been taken [ns]; the time from one that was is the longest possible.
+            stamp_ns: stamp of a sample [ns].
+            doubt_ns: how much earlier than its stamp the sample may have been taken [ns]; the time from one that was is
+                the longest possible.
         """
         gap_ns = self._period_ns if self._before_ns is None else stamp_ns - self._before_ns
         self._unknown = 0 if doubt_ns == self._doubt_ns == 0 else self._unknown + 1

@@ -154,7 +154,7 @@ def measure_wake_up(
 
     Args:
         rate: rate of the slots [Hz].
-        seconds: how long.
+        seconds: duration of the measurement [s].
         settings: of the arm's description.
         clock: the machine's when None.
         stop_requested: called in each slot; True ends the measurement, and what was measured until then counts.

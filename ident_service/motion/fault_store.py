@@ -72,7 +72,7 @@ class _Mark:
     Attributes:
         begun: the fault of a motion whose process is gone without a word.
         faults: faults for which there was no other room.
-        ended: whether these are all, and the arm was without torque.
+        ended: whether these faults are all, and the arm was without torque.
         free: offset of the first blank [bytes].
         size: of the file [bytes].
     """

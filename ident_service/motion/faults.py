@@ -192,7 +192,7 @@ class FaultCounter:
 
     Attributes:
         cycle: number of the present cycle, advanced by the caller.
-        warnings: how often each warning was found.
+        warnings: number of times that each warning was found, by code.
     """
 
     def __init__(self) -> None:

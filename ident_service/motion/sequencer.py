@@ -122,10 +122,10 @@ class Resumed:
     """Represent a trajectory back onto a motion, and the motion from there on.
 
     Attributes:
-        duration: of both [s].
+        duration: duration of the way back and the rest of the motion [s].
         back: length of the way back [s].
         joined: time of the motion at which the way back ends [s].
-        motion: the one it joins.
+        motion: the motion that it joins.
     """
 
     def __init__(self, back: RuckigReference, motion: Reference, joined: float) -> None:
@@ -160,7 +160,7 @@ class TrajectorySequencer:
         complete: whether the last way has been followed to its end.
         finished_at: time on the excitation at which a run was finished early [s]; None for any other.
         not_finished: reason why a run that was to be finished early goes on; empty for any other.
-        led: whether the arm was led home out of a stop: what was to be done is not done by that.
+        led: whether the arm was led home out of a stop, by which a run is not complete.
     """
 
     def __init__(

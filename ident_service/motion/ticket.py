@@ -99,7 +99,7 @@ class Check:
 
     Attributes:
         code: one of `CODES`.
-        verdict: how it ended.
+        verdict: outcome of the check.
         measures: the measured numbers and their limits.
         reason: failure, or why the check was not made; empty when all is well.
         remedy: one sentence that says what to do; empty when there is nothing to do.

@@ -39,7 +39,7 @@ class Acceptance:
 
     Attributes:
         arm: name.
-        number: from 1; the highest is the current one.
+        number: number of the acceptance, from 1; the highest is the current one.
         run: id of the run, or the name of its folder, that the parameters stem from.
         origin: number of the acceptance whose set it is: its own, or the one that was rolled back to.
         parameters_sha256: hash of its `parameters.json`.

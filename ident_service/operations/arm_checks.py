@@ -192,7 +192,7 @@ class ScaleCheck:
         joint: name of the joint.
         typed: turn that a person typed [rad or m].
         measured: turn that the drives measured, likewise.
-        good: whether they agree.
+        good: whether the two agree.
         words: result in words, for people.
     """
 

@@ -65,7 +65,7 @@ class Backup:
 
     Attributes:
         file: path of the backup.
-        files: how many it holds.
+        files: number of files in it.
         bytes: size of these files together [bytes].
         created: time of the backup [s since 1970 in UTC].
         recordings: whether recordings are in it.

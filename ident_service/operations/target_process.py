@@ -43,7 +43,7 @@ def watch(folder: Path, target: Target, least: float) -> dict[str, Any] | None:
     Args:
         folder: of the run.
         target: accuracy target.
-        least: seconds of the motion itself, before which nothing counts: its period, zero where it has none.
+        least: time of the motion before which nothing counts [s]: its period, zero where it has none.
 
     Raises:
         IdentError: the recording or the description cannot be read.

@@ -82,7 +82,7 @@ def record_idle(
 
     Args:
         arm: open.
-        cycles: how many.
+        cycles: number of cycles.
         period: of its description [s].
         work: function that is called in every cycle, so that the rate is measured under the load of a run.
 
@@ -113,7 +113,7 @@ def identities_check(
         limits: limits of the description; the driver must not clip below them, or what was proven of torques is not
             true.
         looked: idle recording of the arm.
-        setup: what the drives report of their set-up.
+        setup: reports of the drives on their set-up.
     """
     code, names = "identities", model.chain.names
     if described.joint_names != names:

@@ -111,7 +111,7 @@ def remedy_of(fault: ArmFault) -> str | None:
     """Return one sentence that says what to do about a fault.
 
     Args:
-        fault: that ended the loop.
+        fault: fault that ended the loop.
 
     Returns:
         None where the fault does not say what failed: the arm is not where it should be, too fast, or told too much.
@@ -164,7 +164,7 @@ def trace_of(rows: Rows, period: float) -> Trace:
     """Return cycles with their references, the earliest first, as a trace.
 
     Args:
-        rows: at least one; stamps rise.
+        rows: cycles, at least one, whose stamps rise.
         period: [s].
     """
     stamps = np.array([sample.stamp_ns for sample, _ in rows])
@@ -290,7 +290,7 @@ class Session:
 
         Args:
             reference: trajectory from the present setpoint on.
-            seconds: how long.
+            seconds: duration [s].
             learning: how fast the torque that dry friction takes is learned from the lag of moving joints, as a share
                 of `kp M` times that lag per second [1/s]. Without, small motions get lost in friction: what moves a
                 WAM's first joint takes 13 mrad of error.

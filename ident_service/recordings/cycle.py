@@ -24,8 +24,8 @@ class Cycle(NamedTuple):
         reference_position: position asked for [rad or m], shape (joints,).
         reference_velocity: velocity asked for [rad/s or m/s], shape (joints,).
         cycle: number of the cycle.
-        lateness_ns: how late it began [ns].
-        compute_ns: how long it computed [ns].
+        lateness_ns: lateness of the cycle's beginning [ns].
+        compute_ns: computing time of the cycle [ns].
         valid: mask of the axes that answered, shape (joints,).
         age: number of cycles since each axis answered, shape (joints,).
         lost: frames lost so far.

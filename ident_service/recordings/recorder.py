@@ -42,7 +42,7 @@ class RecorderProcess:
     """Manage a recorder process: entering starts the process and opens the file, leaving finishes both.
 
     Attributes:
-        report: how the recording ended, None until it has, or where the process died.
+        report: report of the recording's end; None until it has ended, or where the process died.
     """
 
     def __init__(

@@ -168,7 +168,7 @@ class RingMemory:
 
     Attributes:
         joints: number of joints in every record.
-        slots: how many there are.
+        slots: number of slots.
         slot_bytes: size of one slot [bytes].
         words: the memory as 64-bit words.
         content: the memory as bytes.

@@ -38,7 +38,7 @@ class JointAssessment:
             where there is none.
         torque: root mean square of the measured torque [N m or N], on the recording that decides.
         residual: root mean square of the residual [N m or N], on the recording that decides.
-        word: what the joint's predicted torque is good for.
+        word: verdict on the use of the joint's predicted torque.
     """
 
     place: int
@@ -73,7 +73,7 @@ class Assessment:
     """Verdict on an estimate.
 
     Attributes:
-        word: what its values are good for.
+        word: verdict on the use of its values.
         line: the verdict in one sentence.
         reasons: the three that matter most, those against it first.
         further: all others.

@@ -349,8 +349,8 @@ def range_around(*values: Array, least: float = 0.0, zero: bool = False, share: 
 
     Args:
         values: values, of any shapes.
-        least: how long the range is at least.
-        zero: whether it holds zero.
+        least: least length of the range.
+        zero: whether the range holds zero.
         share: share of the range that is left free at either end.
     """
     everything = np.concatenate([np.ravel(one)[np.isfinite(np.ravel(one))] for one in values])

@@ -142,7 +142,7 @@ class BusEndpoint:
         Args:
             label: name for people.
             pid: id of the process behind it.
-            own: whether it hears its own frames.
+            own: whether the port hears its own frames.
             filters: identifier and mask, any of which lets a standard frame pass; none lets all frames pass.
             fd: whether its controller knows CAN FD.
         """
@@ -197,8 +197,9 @@ class Medium:
         """Create a wire without ports.
 
         Args:
-            duration_ns: how long a frame occupies the wire; None: not at all, and all that waits contends at once.
-            error_ns: how long an error frame does.
+            duration_ns: function that returns the time for which a frame occupies the wire [ns]; None: no time, and all
+                that waits contends at once.
+            error_ns: time for which an error frame occupies the wire [ns].
             fd: whether the wire itself carries CAN FD.
         """
         self.ports: list[BusEndpoint] = []

@@ -65,7 +65,7 @@ class DriveFault:
         kind: a key of `DRIVE_FAULTS`.
         drive: index of the drive; None for all.
         at: beginning of the fault, from the moment it is counted from [s].
-        duration: how long [s]; None for one cycle or for good, as `DRIVE_FAULTS` says.
+        duration: duration of the fault [s]; None for one cycle or for good, as `DRIVE_FAULTS` says.
         size: quantity that `DRIVE_FAULTS` defines.
         offset: offset of a load, in the frame of the last link [m].
     """

@@ -308,7 +308,7 @@ def emulate(
     Args:
         config: of the arm.
         faults: to inject besides those of the configuration, as people write them; they count from the first SYNC.
-        seconds: how long; None until asked to stop.
+        seconds: duration [s]; None until asked to stop.
         tell: called with a line whenever a drive changes its state, a fault comes or goes, or the arm comes to rest.
         stop_requested: called all the time; True ends the emulation.
         commands: function that returns the next line of commands, None while there is none; never waits.

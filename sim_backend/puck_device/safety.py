@@ -47,7 +47,7 @@ class EmulatedSafetyPuck:
         number: node number.
         mode: MODE.
         lowered_by_host: whether the host has asked for IDLE since the arm was active.
-        ignores_heartbeat: whether it goes on although nobody talks to the pucks.
+        ignores_heartbeat: whether the puck goes on although nobody talks to the pucks.
     """
 
     def __init__(

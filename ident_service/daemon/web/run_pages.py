@@ -44,7 +44,7 @@ class IdentifiedSet:
     """Parameters that a run holds, as pages show them.
 
     Attributes:
-        word: what they are good for: `use`, `use with care` or `do not use`.
+        word: verdict on the use of the parameters: `use`, `use with care` or `do not use`.
         line: the verdict in one sentence, after that word.
         reasons: the most important ones.
         further: the others.
