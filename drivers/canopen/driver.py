@@ -62,13 +62,13 @@ from drivers.canopen.drive_setup import (
     quick_stop_option,
     watchdogs_of,
 )
-from drivers.canopen.homing import ZeroingArm
 from drivers.canopen.motor_units import coordinates, signed
 from drivers.canopen.pdo_codec import BusCodec, Drive, Emergency
 from drivers.canopen.pdo_mapping import Write, bus_profiles
 from drivers.canopen.sdo import Objects, SdoRefused
 from drivers.canopen.stored_zero import zeros_of
 from drivers.canopen.sync_cycle import REPEAT, Buses, EnableSequence, Resetting, hold
+from drivers.canopen.zeroing import ZeroingArm
 from drivers.clock import Clock, RealClock, VirtualClock
 from drivers.motor_units import Coordinates, unwrapped
 from ident_service.config.arm import ArmConfig
