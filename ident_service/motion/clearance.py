@@ -83,7 +83,7 @@ class ClearanceChecker:
         if not self._collision.pairs:
             return
         yield from self._proven(reference, limits)
-        touching = yield from stops_touching(self._collision, reference, self._limits)
+        touching = yield from trajectory_stop_contact(self._collision, reference, self._limits)
         if touching is not None:
             raise MotionRefused(touching)
 
@@ -112,10 +112,10 @@ class ClearanceChecker:
                 yield
 
 
-def stops_touching(
+def trajectory_stop_contact(
     collision: CollisionModel, reference: Reference, limits: MotionLimits
 ) -> Generator[None, None, str | None]:
-    """Describe a stop out of a trajectory that would touch something, or None; in slices, like `require_clear`."""
+    """Describe the first stop out of a trajectory that touches, by the bodies themselves, or None; in slices."""
     for time in np.arange(0.0, reference.duration, _BEGINS).tolist():
         stopping = stop(reference.at(time), limits)
         yield
@@ -145,7 +145,7 @@ def trajectory_clearance(
     return certified_along(collision, position, limits.velocity, reference.duration, least)
 
 
-def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
+def motion_stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest:
     """Return the smallest distance on stops out of a motion, bodies replaced by capsules around them."""
     capsules = CapsuleModel(model)
     nearest = Nearest(float("inf"), None, 0.0)
@@ -163,9 +163,9 @@ def stop_clearance(path: Path, limits: MotionLimits, model: ArmModel) -> Nearest
     return nearest
 
 
-def touching_stop(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
+def motion_stop_contact(path: Path, limits: MotionLimits, model: ArmModel) -> str | None:
     """Describe the stop out of a motion that comes nearest to anything; None where no stop touches, by capsules."""
-    nearest = stop_clearance(path, limits, model)
+    nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance > 0.0:
         return None
     return _touches("motion", nearest.time, nearest.pair, nearest.distance)
@@ -189,7 +189,7 @@ def require_clear(model: ArmModel, path: Path, trajectories: Sequence[Reference]
     least = model.config.workspace.clearance
     _require_proven("the motion", certified_clearance(collision, path, least), least)
     require_clear_trajectories(model, [("the path to or from the motion", one) for one in trajectories], limits)
-    if touching := touching_stop(path, limits, model):
+    if touching := motion_stop_contact(path, limits, model):
         raise MotionRefused(touching)
 
 
@@ -212,7 +212,7 @@ def require_clear_trajectories(
     least = model.config.workspace.clearance
     for what, reference in trajectories:
         _require_proven(what, trajectory_clearance(collision, reference, limits, least), least)
-        if touching := run_to_end(stops_touching(collision, reference, limits)):
+        if touching := run_to_end(trajectory_stop_contact(collision, reference, limits)):
             raise MotionRefused(touching)
 
 

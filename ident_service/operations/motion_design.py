@@ -27,7 +27,7 @@ from ident_service.model.base_parameters import BaseParameters
 from ident_service.model.chain import Array
 from ident_service.model.information import Information
 from ident_service.model.regressor import joint_regressor
-from ident_service.motion.clearance import touching_stop
+from ident_service.motion.clearance import motion_stop_contact
 from ident_service.operations.arm_pictures import postures
 from ident_service.operations.motion_preview import Preview, preview, preview_document, preview_text, recorded_noise
 from ident_service.operations.recordings import open_together
@@ -181,7 +181,7 @@ def design_files(
         noise=noise.deviation,
         added=added,
         earlier=earlier,
-        veto=lambda path: touching_stop(path, limits, model),
+        veto=lambda path: motion_stop_contact(path, limits, model),
         stable=lambda kp, kd: stability(model, replace(limits, kp=kp, kd=kd), delay_of(model.config)).stable,
         tell=tell,
         cancelled=cancelled,

@@ -29,7 +29,7 @@ from ident_service.model.collision import CollisionModel, scene
 from ident_service.model.expected_friction import expected_friction
 from ident_service.model.information import information_of, sparsity
 from ident_service.model.regressor import joint_regressor
-from ident_service.motion.clearance import Nearest, stop_clearance
+from ident_service.motion.clearance import Nearest, motion_stop_clearance
 from ident_service.motion.stop_trajectory import stop_extent
 from ident_service.motion.trajectory import Setpoint, plan_reduced_trajectory, rest
 from ident_service.results.parameter_file import finite_or_none, read_parameters
@@ -112,7 +112,7 @@ def preview(
                 f"{name}: a stop out of the motion reaches {lowest[k]:.3f}..{highest[k]:.3f}, "
                 f"outside {limits.lower[k]:g}..{limits.upper[k]:g}"
             )
-    nearest = stop_clearance(path, limits, model)
+    nearest = motion_stop_clearance(path, limits, model)
     if nearest.distance <= 0.0:
         found.append(f"a stop out of the motion at {nearest.time:.2f} s would touch: {nearest.pair}")
     home = rest(limits.home)

@@ -14,7 +14,7 @@ from ident_service.model.collision import CollisionModel
 from ident_service.model.kinematics import frame_origins
 from ident_service.model.pinocchio_models import InverseDynamics
 from ident_service.motion.after_stop import after_stop, falling_joints
-from ident_service.motion.clearance import stop_clearance, trajectory_clearance
+from ident_service.motion.clearance import motion_stop_clearance, trajectory_clearance
 from ident_service.motion.run import unhurried
 from ident_service.motion.run_plan import Destination, PointToPointPlan
 from ident_service.motion.stop_trajectory import require_stops_within_limits
@@ -115,7 +115,7 @@ def motion_proven_check(model: ArmModel, limits: MotionLimits, excitation: Excit
     try:
         proof = proof_of(excitation.path, model, limits, CollisionModel(model))
         found = violations(proof, model, limits)
-        nearest = stop_clearance(excitation.path, limits, model)
+        nearest = motion_stop_clearance(excitation.path, limits, model)
     except (ModelError, MotionRefused) as error:
         return failed(code, str(error), remedy)
     try:
