@@ -189,7 +189,7 @@ def _with_velocity(
 
     usual = with_chosen_cutoff(of("position"), recordings)
     there = all(
-        not one.torque_held and all(block.velocity is not None for block in one.blocks())
+        not one.torque_zero_order_hold and all(block.velocity is not None for block in one.blocks())
         for one in (*recordings, *validation)
     )
     if not there or options.period is not None:

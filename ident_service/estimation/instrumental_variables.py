@@ -239,7 +239,8 @@ class SimulatedRecording:
             stretches: stamps [ns], and positions [rad or m] of shape (samples, joints); whatever lies outside stays.
         """
         self.path, self.sha256, self.joint_names = measured.path, measured.sha256, measured.joint_names
-        self.joints, self.torque_held, self.torn = measured.joints, measured.torque_held, measured.torn
+        self.joints, self.torn = measured.joints, measured.torn
+        self.torque_zero_order_hold = measured.torque_zero_order_hold
         self._measured, self._stretches = measured, tuple(stretches)
 
     def blocks(self, samples: int = BLOCK_SAMPLES) -> Iterator[Block]:

@@ -175,7 +175,7 @@ class SequentialLeastSquares:
 class _Window:
     """Samples that implement the recording protocol; torques are held from stamp to stamp."""
 
-    torque_held, torn, sha256 = True, False, ""
+    torque_zero_order_hold, torn, sha256 = True, False, ""
     path = Path("the run so far")
 
     def __init__(self, block: Block, names: tuple[str, ...]) -> None:

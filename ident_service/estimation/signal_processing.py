@@ -208,7 +208,7 @@ class _Smoother:
                 f"sampled at {1.0 / period:.4g} Hz, too slow for a cut-off of {self._cutoff:g} Hz; "
                 "lower identification.smoothing.cutoff",
             )
-        self._smoothing, self._period, self._held = smoothing, period, recording.torque_held
+        self._smoothing, self._period, self._held = smoothing, period, recording.torque_zero_order_hold
         self._path = recording.path
         self._delay = 0.0 if isinstance(options.delay, str) else float(options.delay)
         slowest = 2.0 * np.pi * self._cutoff * np.sin(np.pi / (2 * smoothing.order))
@@ -391,7 +391,7 @@ def averaged(
             f"joint {joint + 1} differs by {spread_q[joint]:.3g} between periods of {period:g} s; "
             "trim approach and return with recording.trim, or correct identification.period",
         )
-    motion = _motion(mean_q, mean_tau, recording.torque_held, options, step, coupling)
+    motion = _motion(mean_q, mean_tau, recording.torque_zero_order_hold, options, step, coupling)
     return Averaged(motion, total, spread_tau)
 
 

@@ -54,7 +54,7 @@ class RangeRecording:
         self.sha256 = whole.sha256
         self.joint_names = whole.joint_names
         self.joints = whole.joints
-        self.torque_held = whole.torque_held
+        self.torque_zero_order_hold = whole.torque_zero_order_hold
         self.torn = whole.torn
         before, after = time_range(whole)
         self.start, self.end = max(start, before), min(end, after)
@@ -225,7 +225,7 @@ class JointSideRecording:
         self.sha256 = motors.sha256
         self.joint_names = motors.joint_names
         self.joints = motors.joints
-        self.torque_held = motors.torque_held
+        self.torque_zero_order_hold = motors.torque_zero_order_hold
         self.torn = motors.torn
         self._motors = motors
         self._positions, self._torques = positions, torques
@@ -279,7 +279,7 @@ class MeasuredRecording:
         self.sha256 = whole.sha256
         self.joint_names = whole.joint_names
         self.joints = whole.joints
-        self.torque_held = whole.torque_held
+        self.torque_zero_order_hold = whole.torque_zero_order_hold
         self.whole = whole
         self._stamps, self._torque = whole.measured(TOPIC)
         usable = np.isfinite(self._torque).all(axis=1)

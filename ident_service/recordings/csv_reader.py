@@ -198,11 +198,11 @@ class CsvRecording:
         sha256: hash of the file's bytes, as they are if it is compressed.
         joint_names: names of the joints that the file was opened with, else empty.
         joints: number of joints.
-        torque_held: False.
+        torque_zero_order_hold: False.
         torn: False; what does not fit raises.
     """
 
-    torque_held = False
+    torque_zero_order_hold = False
     torn = False
 
     def __init__(

@@ -459,7 +459,7 @@ class McapRecording:
         sha256: hash of the bytes that the file had when opened; bytes that a writer adds later are not read.
         joint_names: names of the joints, in the order of the block's columns.
         joints: number of joints.
-        torque_held: True for our own recordings.
+        torque_zero_order_hold: True for our own recordings.
         torn: whether the file ends, or is damaged, before its end mark.
         metadata: the record `ident`, empty for a bag.
         own: whether this package wrote it; topic, names and sides are then its own whatever the arm's bags are like.
@@ -503,7 +503,7 @@ class McapRecording:
         with self._open() if content is None else BytesIO(content) as stream:
             self._runs = self._verify(stream)
         self._offset_ns = self._utc_offset()
-        self.torque_held = self.metadata.get("torque_hold") == "zero_order"
+        self.torque_zero_order_hold = self.metadata.get("torque_hold") == "zero_order"
         self.own = bool(self.metadata)
         form = RecordingFormat() if self.own or bag is None else bag
         self._topic = form.topic if topic is None else topic

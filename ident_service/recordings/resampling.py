@@ -333,8 +333,8 @@ def uniform(
 
     A regular recording passes through bit for bit, cut at its gaps; so do the values of one whose stamps are of
     arrival, which get even stamps from each segment's first one on. Any other is resampled at `first + k period` in all
-    segments; of samples closer than a tenth of a period the first is used. `recording.torque_held` stays true of the
-    result.
+    segments; of samples closer than a tenth of a period the first is used. `recording.torque_zero_order_hold` stays
+    true of the result.
 
     Args:
         recording: to be read.
@@ -369,7 +369,7 @@ def uniform(
         if fmt.stamps == "arrival" and not stamps.regular:
             blocks = _evenly(blocks, stamps, segment)
         if stamps.resampled:
-            blocks = _resampled(blocks, stamps, segment, recording.torque_held)
+            blocks = _resampled(blocks, stamps, segment, recording.torque_zero_order_hold)
         yield from _with_ends(blocks)
 
 
