@@ -210,7 +210,7 @@ def found_on(port: PropertyPort, driver: BarrettDriver, *, wakes: bool = True) -
     """Ask every puck of an arm for what it reports of itself.
 
     Args:
-        port: open port to the bus.
+        port: port to the bus.
         driver: the section `driver`.
         wakes: whether pucks in their monitor are woken; otherwise nothing is sent but questions.
 
@@ -344,7 +344,7 @@ def zero(port: PropertyPort, arm: FoundArm, coordinates: Coordinates, home: Sequ
     """Define the present position of the arm as its home.
 
     Args:
-        port: open port to the bus.
+        port: port to the bus.
         arm: the pucks' answers; the safety puck must not be ACTIVE.
         coordinates: coordinates of the arm, with counts of 0 where the transmission has its zero.
         home: home position of the joints [rad or m].

@@ -145,7 +145,7 @@ class _Smooth:
         position, velocity, acceleration: [rad or m and derivatives], shape (samples, joints).
         torque: [N m or N], shape (samples, joints).
         start: index of the first sample that counts; no sample counts in two windows.
-        stop: end of the samples that count.
+        stop: index after the last sample that counts.
         opens: whether a stretch without gaps begins with it.
         closes: whether a stretch without gaps ends with it.
     """

@@ -69,7 +69,7 @@ class Leaves:
 
     Attributes:
         keys: keys of the factors, by the hashes of their recordings.
-        count: number of factors to fit before the rest, a third, judge; the first ones.
+        count: number of the first factors, which are fitted to; the others, a third, judge.
     """
 
     keys: tuple[str, ...]

@@ -214,7 +214,7 @@ def follow(
         arm: the arm, open and not enabled.
         model: model with the prior parameters that control needs.
         plan: the references to follow.
-        sink: sink of every sample.
+        sink: sink that takes every sample.
         controls: as for `run`.
         latch: as for `run`.
         hold_seconds: as for `run`; also for the end of a plan that is held.

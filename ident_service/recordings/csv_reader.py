@@ -195,7 +195,7 @@ class CsvRecording:
 
     Attributes:
         path: the file.
-        sha256: hash of the file's bytes, as they are if it is compressed.
+        sha256: hash of the file's bytes; of a compressed file, that of the compressed bytes.
         joint_names: names of the joints that the file was opened with, else empty.
         joints: number of joints.
         torque_zero_order_hold: False.

@@ -49,7 +49,7 @@ class PythonCanBuses:
         """Open all buses.
 
         Args:
-            buses: names of the buses, as the arm's description has them.
+            buses: buses of the arm's description.
 
         Raises:
             DriverError: an interface that cannot be had; none stays open then.
@@ -175,7 +175,7 @@ class HostedBuses:
         """Open all wires.
 
         Args:
-            buses: names of the buses, as the arm's description has them.
+            buses: buses of the arm's description.
 
         Raises:
             DriverError: a wire that another process runs, or that cannot be had; none stays then.

@@ -43,7 +43,7 @@ class IdentifiedArm:
         unconstrained: base parameters before they were held in the set [SI], to which `sigma` belongs, shape (base,);
             None where unknown.
         motion: motion that the arm was identified from; None where the file does not have it.
-        forbidden: reason why its values must not be used; empty where nothing says so.
+        forbidden: reasons why its values must not be used; empty where nothing says so.
     """
 
     model: ArmModel
