@@ -95,6 +95,8 @@ def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon:
 
 def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, state: Path) -> None:
     with ControlFile.take(control_path(state, ARM), None) as holder:
+        early = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": ARM})  # it moves
+        assert (early.json()["reached"], holder.supported) == (False, False)
         holder.announce_hold()
         assert daemon.post(f"/api/v1/arms/{ARM}/supported").status_code == 422
         refused = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": "another"})

@@ -109,6 +109,7 @@ function showJob(text) {
   byId("remaining").textContent =
     progress && progress.remaining !== null ? `about ${Math.ceil(progress.remaining)} s left` : "";
   byId("phase").textContent = progress ? progress.phase : "";
+  if (byId("support")) byId("support").hidden = !now.held;
   const pre = byId("log");
   if (pre.textContent !== log) {
     pre.closest("section").hidden = false;
