@@ -208,6 +208,31 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, place: Path, h
     assert not in_use(control_path(place, ARM))
 
 
+@pytest.mark.parametrize("where", ["here", "elsewhere"])
+def test_a_page_renews_no_lease_after_a_stop(browser: Browser, reached: Reached, place: Path, where: str) -> None:
+    ready(reached, held_text())
+    page = log_in(browser, reached)
+    answers = list[int]()
+    page.on("response", lambda answer: answers.append(answer.status) if answer.url.endswith("/lease") else None)
+    moving(page, reached, place)
+    assert set(answers) == {200}
+    if where == "here":
+        page.keyboard.press("Escape")
+    else:
+        reached.service.engine.stop(ARM, "somebody")
+    page.get_by_role("button", name="The arm is supported").wait_for()
+    page.wait_for_timeout(2000)  # seven renewals, of which two may have been on their way
+    assert answers.count(409) <= 2
+    assert page.get_by_text("needs no lease any more").is_visible()
+    assert not page.locator("#lease-note").is_visible()
+    page.reload()
+    assert page.locator("#job").get_attribute("data-lease") is None
+    page.get_by_label(f"Type {ARM}").fill(ARM)
+    page.get_by_role("button", name="The arm is supported").click()
+    assert ended(page) == "cancelled"
+    assert answers.count(409) <= 2
+
+
 def test_support_is_confirmed_where_the_arm_waits_for_it(browser: Browser, reached: Reached, place: Path) -> None:
     ready(reached, held_text())
     page = log_in(browser, reached)

@@ -282,10 +282,10 @@ class LiveJobs:
         with self._lock:
             child.close()
 
-    def ending(self, job: str) -> bool:
-        """Return whether a job is to end; a motion then ends when its arm rests."""
+    def end_reason(self, job: str) -> str:
+        """Return why a job is to end, empty while it is not; a motion then ends when its arm rests."""
         live = self._jobs.get(job)
-        return live is not None and bool(live.end_reason)
+        return "" if live is None else live.end_reason
 
     def unentered(self, job: str) -> tuple[str, int | None]:
         """Return how a job ended whose end cannot be entered yet, and why, with its exit code; else an empty text."""
@@ -531,7 +531,7 @@ class Engine:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
         found = progress(process_output(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
-        return Progress(found.phase, None, None) if self.live.ending(row["id"]) else found
+        return Progress(found.phase, None, None) if self.live.end_reason(row["id"]) else found
 
     def moving(self) -> list[str]:
         """Return the names of the arms that any process moves."""
