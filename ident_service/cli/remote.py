@@ -379,7 +379,7 @@ def follow(
             with suppress(UsageError):  # it has ended meanwhile, as the next look will tell
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
         elif moves and not cancelled:
-            renew(client, job["id"])
+            moves = renew(client, job["id"])
         time.sleep(every)
         if time.monotonic() - looked < _LOOK:
             continue
@@ -400,13 +400,15 @@ def follow(
     return job
 
 
-def renew(client: IdentClient, job: str) -> None:
-    """Renew the lease of a job; ignore that it has none any more, which is so when its motion ends."""
+def renew(client: IdentClient, job: str) -> bool:
+    """Renew the lease of a job; return False where it has none any more, which is so from when its motion is to end."""
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
     except IdentError as error:
         if "has no lease" not in str(error):
             raise
+        return False
+    return True
 
 
 def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:
