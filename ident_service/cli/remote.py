@@ -271,8 +271,8 @@ def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
         raise UsageError(
-            f"{name}: no process of the daemon's machine holds it; nothing has changed. If its drives hold it by "
-            f"themselves, `ident supported {name}` there releases them"
+            f"{name}: no process of the daemon's machine holds it after a stop; nothing has changed. If its drives "
+            f"hold it by themselves, `ident supported {name}` there releases them"
         )
     return DONE, asked_text(name, "supported"), answer
 

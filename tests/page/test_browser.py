@@ -243,6 +243,8 @@ def test_support_is_confirmed_where_the_arm_waits_for_it(browser: Browser, reach
     page.keyboard.press("Escape")
     expect(support).to_be_visible()
     assert held_arm(place, ARM)
+    for name in ("Pause", "Resume", "Finish now"):
+        assert not page.get_by_role("button", name=name).is_visible()
     page.get_by_label(f"Type {ARM}").fill(ARM)
     support.click()
     assert ended(page) == "cancelled"

@@ -120,6 +120,7 @@ function showJob(text) {
     progress && progress.remaining !== null ? `about ${Math.ceil(progress.remaining)} s left` : "";
   byId("phase").textContent = progress ? progress.phase : "";
   if (byId("support")) byId("support").hidden = !now.held;
+  if (byId("steer")) byId("steer").hidden = now.held;
   const pre = byId("log");
   if (pre.textContent !== log) {
     pre.closest("section").hidden = false;
