@@ -271,8 +271,8 @@ def _supported(client: IdentClient, arguments: argparse.Namespace) -> Answer:
     answer = client.post(f"/api/v1/arms/{word_of_address(arguments.arm)}/supported", {"confirm": name})
     if not answer["reached"]:
         raise UsageError(
-            f"{name}: no process of the daemon's machine holds it; nothing has changed. If its drives hold it by "
-            f"themselves, `ident supported {name}` there releases them"
+            f"{name}: no process of the daemon's machine holds it after a stop; nothing has changed. If its drives "
+            f"hold it by themselves, `ident supported {name}` there releases them"
         )
     return DONE, asked_text(name, "supported"), answer
 
@@ -380,7 +380,7 @@ def follow(
             with suppress(UsageError):  # it has ended meanwhile, as the next look will tell
                 client.post(f"/api/v1/jobs/{job['id']}/cancel")
         elif moves and not cancelled:
-            renew(client, job["id"])
+            moves = renew(client, job["id"])
         time.sleep(every)
         if time.monotonic() - looked < _LOOK:
             continue
@@ -401,13 +401,15 @@ def follow(
     return job
 
 
-def renew(client: IdentClient, job: str) -> None:
-    """Renew the lease of a job; ignore that it has none any more, which is so when its motion ends."""
+def renew(client: IdentClient, job: str) -> bool:
+    """Renew the lease of a job; return False where it has none any more, which is so from when its motion is to end."""
     try:
         client.post(f"/api/v1/jobs/{job}/lease")
     except IdentError as error:
         if "has no lease" not in str(error):
             raise
+        return False
+    return True
 
 
 def job_answer(client: IdentClient, job: dict[str, Any], code: int | None = None) -> Answer:

@@ -17,8 +17,10 @@ from daemon.conftest import Asked, checked_before, known_arm, patient_text, quic
 from daemon.verbs_bench import with_run
 
 from ident_service.daemon.dependencies import Service
+from ident_service.daemon.jobs.child_process import JobProcess
+from ident_service.daemon.jobs.commands import Command
 from ident_service.daemon.jobs.outcome import printed_samples
-from ident_service.daemon.jobs.queue import Progress, progress
+from ident_service.daemon.jobs.queue import LiveJob, LiveJobs, Progress, progress
 from ident_service.daemon.jobs.requests import Run
 from ident_service.daemon.live_stream import live_events
 from ident_service.daemon.routes.jobs import job_answer_document
@@ -95,6 +97,8 @@ def test_only_operators_finish_and_nobody_is_reached_where_nothing_moves(daemon:
 
 def test_a_held_arm_is_let_down_by_its_typed_name_only(daemon: Asked, arm: str, state: Path) -> None:
     with ControlFile.take(control_path(state, ARM), None) as holder:
+        early = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": ARM})  # it moves
+        assert (early.json()["reached"], holder.supported) == (False, False)
         holder.announce_hold()
         assert daemon.post(f"/api/v1/arms/{ARM}/supported").status_code == 422
         refused = daemon.post(f"/api/v1/arms/{ARM}/supported", {"confirm": "another"})
@@ -325,6 +329,42 @@ def test_one_motion_at_a_time_and_a_lease_while_it_waits(state: Path) -> None:
         assert (ended["state"], ended["started"]) == ("cancelled", None)
         assert "nothing has moved" in ended["detail"]
         daemon.follow(blocker["id"])
+
+
+def test_a_motion_that_waits_longer_than_its_confirmation_counts_is_refused(
+    daemon: Asked, patient: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its lease is renewed all the time: somebody's page is open, and nobody needs to look at the arm any more."""
+    running = daemon.begin({"kind": "run", "arm": patient}, confirmed=True)["id"]
+    daemon.follow(running, lease=True, until=lambda seen: seen["state"] == "running")
+    monkeypatch.setattr("ident_service.daemon.jobs.queue.CONFIRMED_SECONDS", 0.1)
+    waiting = daemon.begin({"kind": "check", "arm": patient}, confirmed=True)["id"]
+    ended = daemon.follow(waiting, lease=True)
+    assert (ended["state"], ended["started"]) == ("refused", None)
+    assert ended["detail"].startswith(f"it waited for {running} until its confirmation was older than 0.1 s; nothing")
+    assert "ask for the motion again" in ended["detail"]
+    # What has begun goes on.
+    assert daemon.get(f"/api/v1/jobs/{running}").json()["state"] == "running"
+    daemon.post("/api/v1/stop")
+    assert daemon.follow(running)["state"] == "cancelled"
+
+
+def test_what_nobody_confirmed_and_what_has_begun_may_take_longer() -> None:
+    clock = [0.0]
+    live = LiveJobs(1.0, lambda: clock[0])
+    order = Command(("run",), ARM, True, None, (f"arm {ARM}",), 2.0)
+    begun, asked, own = (LiveJob(name, order, "ann", name == "own", 0.0) for name in ("begun", "asked", "own"))
+    begun.child = cast(JobProcess, SimpleNamespace(say=lambda _: None))
+    for one in (begun, asked, own):
+        live.add(one)
+        live.enter(one)
+    for second in range(1, 62):
+        clock[0] = float(second)
+        live.renew("asked")
+        for one in (begun, asked, own):
+            live._keep_lease(one, 0.0)
+        assert bool(live.end_reason("asked")) == (second > 60)
+    assert (asked.end_state, begun.end_reason, own.end_reason) == ("refused", "", "")
 
 
 def test_the_services_own_lease_carries_a_run_that_nobody_watches(daemon: Asked, arm: str) -> None:

@@ -204,7 +204,7 @@ def test_an_arm_that_is_held_when_the_daemon_is_killed_is_reported_and_let_down_
         # Nothing holds it any more, and both commands say the same of it.
         capsys.readouterr()
         assert main(["supported", ARM, "--confirm", ARM, *words]) == 2
-        assert "no process of the daemon's machine holds it" in capsys.readouterr().err
+        assert "no process of the daemon's machine holds it after a stop" in capsys.readouterr().err
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) == 0
     assert main(["supported", ARM, "--confirm", ARM, "--state", str(state)]) == 2

@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from cli.hands import Hands
@@ -27,7 +27,7 @@ from ident_service.cli.arguments import LOCAL_ONLY, Parser
 from ident_service.cli.remote import follow, table
 from ident_service.cli.remote_watching import named_files
 from ident_service.client import IdentClient
-from ident_service.errors import ArmError, ConfigError, Problem, UnknownId, UsageError
+from ident_service.errors import ArmError, ConfigError, MotionRefused, Problem, UnknownId, UsageError
 from ident_service.registry.state_folder import fault_file
 
 RUN = "20260101T000000Z-quick"
@@ -283,6 +283,27 @@ def test_verbs_are_done_by_a_daemon(
         ended = client.get("/api/v1/jobs?most=1")[0]
         words = argparse.Namespace(json=True)
         assert follow(client, words, ended | {"state": "running"}, lambda: True, moves=False)["state"] == "done"
+
+
+def test_a_command_renews_no_lease_of_a_motion_that_is_ending() -> None:
+    asked = list[str]()
+    running = {"id": "j", "state": "running", "detail": "", "held": False, "progress": None}
+
+    class Daemon:
+        """One whose motion was stopped by somebody else, and is at rest after three looks."""
+
+        def post(self, path: str) -> None:
+            asked.append(path)
+            raise MotionRefused("the job j has no lease to renew: it is ending (ann has stopped it), which needs none")
+
+        def get(self, path: str) -> dict[str, Any]:
+            asked.append(path)
+            return running | {"state": "cancelled" if asked.count(path) == 3 else "running"}
+
+    words = argparse.Namespace(json=True)
+    ended = follow(cast(IdentClient, Daemon()), words, running, lambda: False, moves=True, every=0.02)
+    assert ended["state"] == "cancelled"
+    assert asked == ["/api/v1/jobs/j/lease", *["/api/v1/jobs/j"] * 3]
 
 
 @pytest.mark.parametrize(

@@ -154,7 +154,9 @@ def test_a_motion_outlives_a_registry_that_is_kept_and_hears_its_stop(state: Pat
                 time.sleep(0.2)
             assert daemon.get(path).json()["state"] == "running"
             assert daemon.post("/api/v1/stop").json()["jobs"] == [job]
-            assert daemon.post(f"{path}/lease").status_code == 409
+            refused = daemon.post(f"{path}/lease")
+            assert refused.status_code == 409
+            assert f"the job {job} has no lease to renew: it is ending (owner asked for a stop)" in refused.text
         ended = daemon.follow(job)
         assert ended["state"] == "cancelled"
         assert ended["detail"].startswith("owner asked for a stop")

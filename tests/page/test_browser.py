@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 from daemon.conftest import checked_before, patient_text, quick_text
 from daemon.served import LEASES
+from daemon.test_full_disk import held_text
 from page.conftest import Reached, log_in
 from playwright.sync_api import Browser, Page, expect
 
 from ident_service.motion.command_channel import in_use
+from ident_service.operations.moving_arms import held_arm
 from ident_service.registry import jobs as rows
 from ident_service.registry.arms import add_arm
 from ident_service.registry.database import audit_log
@@ -33,10 +35,10 @@ def known(reached: Reached, text: str) -> None:
     add_arm(reached.service.db, reached.service.state, text, {}, "test", replace=True)
 
 
-def ready(reached: Reached) -> None:
+def ready(reached: Reached, text: str | None = None) -> None:
     """The service knows an arm that may be moved, whose motion outlasts what is done meanwhile."""
-    known(reached, patient_text(ARM))
-    checked_before(reached.service.state, patient_text(ARM))
+    known(reached, text or patient_text(ARM))
+    checked_before(reached.service.state, text or patient_text(ARM))
 
 
 def arm_page(page: Page, reached: Reached) -> None:
@@ -203,6 +205,50 @@ def test_a_stop_in_the_middle(browser: Browser, reached: Reached, place: Path, h
     words = {"escape": "owner asked", "button": "owner asked", "without scripts": "looks asked", "leaving": "renewed"}
     assert words[how] in row["detail"]
     reached.service.engine.live.lease_factor = LEASES
+    assert not in_use(control_path(place, ARM))
+
+
+@pytest.mark.parametrize("where", ["here", "elsewhere"])
+def test_a_page_renews_no_lease_after_a_stop(browser: Browser, reached: Reached, place: Path, where: str) -> None:
+    ready(reached, held_text())
+    page = log_in(browser, reached)
+    answers = list[int]()
+    page.on("response", lambda answer: answers.append(answer.status) if answer.url.endswith("/lease") else None)
+    moving(page, reached, place)
+    assert set(answers) == {200}
+    if where == "here":
+        page.keyboard.press("Escape")
+    else:
+        reached.service.engine.stop(ARM, "somebody")
+    page.get_by_role("button", name="The arm is supported").wait_for()
+    page.wait_for_timeout(2000)  # seven renewals, of which two may have been on their way
+    assert answers.count(409) <= 2
+    assert page.get_by_text("needs no lease any more").is_visible()
+    assert not page.locator("#lease-note").is_visible()
+    page.reload()
+    assert page.locator("#job").get_attribute("data-lease") is None
+    page.get_by_label(f"Type {ARM}").fill(ARM)
+    page.get_by_role("button", name="The arm is supported").click()
+    assert ended(page) == "cancelled"
+    assert answers.count(409) <= 2
+
+
+def test_support_is_confirmed_where_the_arm_waits_for_it(browser: Browser, reached: Reached, place: Path) -> None:
+    ready(reached, held_text())
+    page = log_in(browser, reached)
+    moving(page, reached, place)
+    support = page.get_by_role("button", name="The arm is supported")
+    expect(page.get_by_role("button", name="Pause")).to_be_visible()
+    assert not support.is_visible()
+    page.keyboard.press("Escape")
+    expect(support).to_be_visible()
+    assert held_arm(place, ARM)
+    for name in ("Pause", "Resume", "Finish now"):
+        assert not page.get_by_role("button", name=name).is_visible()
+    page.get_by_label(f"Type {ARM}").fill(ARM)
+    support.click()
+    assert ended(page) == "cancelled"
+    expect(support).to_have_count(0)
     assert not in_use(control_path(place, ARM))
 
 

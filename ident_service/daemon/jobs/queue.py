@@ -9,6 +9,8 @@ tells afterwards what became of what ran.
 
 A motion's lease is renewed by whoever asked for it; each renewal goes on to the motion's process as one line. Silence
 of either asks for the controlled stop. A scheduled motion's lease is our own.
+
+What a person has confirmed begins within `CONFIRMED_SECONDS` or not at all, however faithfully its lease is renewed.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from ident_service.daemon.authentication import CHALLENGE_SECONDS
 from ident_service.daemon.jobs.child_process import RENEW, STOP, JobProcess, SubprocessJob, UnitChild
 from ident_service.daemon.jobs.commands import JOBS, READS_BUS, Command, command
 from ident_service.daemon.jobs.outcome import (
@@ -97,6 +100,7 @@ def _of(phase: str, elapsed: float, whole: float) -> Progress:
     return Progress(phase, max(fraction, 0.0), max(whole - elapsed, 0.0))
 
 
+CONFIRMED_SECONDS: Final = CHALLENGE_SECONDS  # that a motion may wait: a confirmation counts no longer than its page
 TICK: Final = 0.05  # s between checks of leases, and of running and waiting jobs
 
 
@@ -111,9 +115,11 @@ class LiveJob:
         own_lease: whether a motion's lease is the service's own.
         renewed: time of the lease's last renewal [s].
         requested_ns: time of the request on the machine's monotonic clock [ns], which stops at terminals use, too.
+        requested: time of the request on the leases' clock [s]; a motion was confirmed just before.
         entered: whether the registry knows it; before, it keeps its place and nothing else.
         child: process of the job, once it runs.
         end_reason: reason why it is to end; empty while it is not.
+        end_state: state of the job afterwards, if it has not begun.
         since: time when it was asked to end [s].
         terminated: whether a computation was sent SIGTERM.
         killed: whether it was ended by force.
@@ -128,9 +134,11 @@ class LiveJob:
     own_lease: bool
     renewed: float
     requested_ns: int = 0
+    requested: float = 0.0
     entered: bool = False
     child: JobProcess | None = None
     end_reason: str = ""
+    end_state: str = "cancelled"
     since: float = 0.0
     terminated: bool = False
     killed: bool = False
@@ -148,7 +156,7 @@ class LiveJobs:
         """Begin without jobs.
 
         Args:
-            lease_factor: how much longer than usual the service waits for a renewal.
+            lease_factor: how much longer than usual the service waits for a renewal, and a motion for its turn.
             now: the leases' clock [s].
             renewed: called with the age of a lease at its renewal [s]; must not wait.
         """
@@ -282,10 +290,10 @@ class LiveJobs:
         with self._lock:
             child.close()
 
-    def ending(self, job: str) -> bool:
-        """Return whether a job is to end; a motion then ends when its arm rests."""
+    def end_reason(self, job: str) -> str:
+        """Return why a job is to end, empty while it is not; a motion then ends when its arm rests."""
         live = self._jobs.get(job)
-        return live is not None and bool(live.end_reason)
+        return "" if live is None else live.end_reason
 
     def unentered(self, job: str) -> tuple[str, int | None]:
         """Return how a job ended whose end cannot be entered yet, and why, with its exit code; else an empty text."""
@@ -348,15 +356,15 @@ class LiveJobs:
             for live in self._jobs.values():
                 self._end(live, why)
 
-    def _end(self, live: LiveJob, why: str) -> None:
-        """Ask a job to end; the first reason counts."""
+    def _end(self, live: LiveJob, why: str, state: str = "cancelled") -> None:
+        """Ask a job to end, in a state if it has not begun; the first reason counts."""
         if not live.end_reason:
-            live.end_reason, live.since = why, self._now()
+            live.end_reason, live.end_state, live.since = why, state, self._now()
         _send_stop(live)
         self.changed.set()
 
     def _keep_leases(self) -> None:
-        """Renew the leases that are the service's own; stop motions whose lease nobody has renewed in time."""
+        """Renew the leases that are the service's own; end motions whose lease or confirmation is too old."""
         while not self._over.wait(TICK):
             with self._lock:
                 for live in self._jobs.values():
@@ -372,6 +380,16 @@ class LiveJobs:
             moved = f"for {live.order.lease:g} s"
             waited = "while it waited; nothing has moved"
             self._end(live, f"its lease was not renewed {waited if live.child is None else moved}")
+        elif live.child is None and self._now() - live.requested > self.lease_factor * CONFIRMED_SECONDS:
+            # The arm, and whoever is near it, may be elsewhere by now.
+            before = self._before(live)
+            waited = f"it waited for {before}" if before else "it waited"
+            self._end(
+                live,
+                f"{waited} until its confirmation was older than {CONFIRMED_SECONDS:g} s; nothing has moved. See that "
+                "nobody is within the arm's reach, then ask for the motion again",
+                "refused",
+            )
 
 
 def _send_stop(live: LiveJob) -> None:
@@ -408,7 +426,7 @@ class Engine:
             computing: how many jobs compute at a time.
             motion_socket: socket of the unit that motions run in; None for processes of our own.
             lease_factor: how much longer than usual the service waits for a renewal before it tells the motion's
-                process to stop, which counts by itself; for tests on machines that stall.
+                process to stop, which counts by itself, and a motion for its turn; for tests on machines that stall.
             now: the leases' clock [s].
             metrics: counters of jobs and leases; figures of its own if None.
         """
@@ -477,7 +495,8 @@ class Engine:
         """
         order = command(self.db, self.state, asked)
         job = new_id(asked.kind)
-        live = LiveJob(job, order, by, own_lease, self._now(), time.monotonic_ns())
+        now = self._now()
+        live = LiveJob(job, order, by, own_lease, now, time.monotonic_ns(), now)
         self.live.add(live, stops)
         try:
             (self.state / JOBS / job).mkdir(parents=True)
@@ -532,7 +551,7 @@ class Engine:
             return None
         typical = rows.typical_seconds(self.db, row["kind"], row["arm"])
         found = progress(process_output(self.state / JOBS / row["id"]).log, time.time() - row["started"], typical)
-        return Progress(found.phase, None, None) if self.live.ending(row["id"]) else found
+        return Progress(found.phase, None, None) if self.live.end_reason(row["id"]) else found
 
     def moving(self) -> list[str]:
         """Return the names of the arms that any process moves."""
@@ -623,7 +642,7 @@ class Engine:
     def _wait(self, live: LiveJob) -> None:
         """Handle a queued job: end it if asked to, begin it if it is its turn."""
         if live.end_reason:
-            self._finish(live, "cancelled", live.end_reason, None)
+            self._finish(live, live.end_state, live.end_reason, None)
         elif self.live.free(live, self._computing):
             self._begin(live)
 
@@ -633,7 +652,7 @@ class Engine:
             self.live.remove(live)
             return
         if live.end_reason:  # cancelled while the registry was written
-            self._finish(live, "cancelled", live.end_reason, None)
+            self._finish(live, live.end_state, live.end_reason, None)
             return
         child: JobProcess
         try:

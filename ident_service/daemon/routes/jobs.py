@@ -186,13 +186,18 @@ def cancel_job(service: Serving, who: Operator, job: Id) -> answers.JobAnswer:
 
 @router.post("/jobs/{job}/lease")
 async def renew_lease(service: Serving, who: LeaseKeeper, job: Id) -> answers.LeaseAnswer:
-    """Renew the lease of a motion; only the caller who asked for the motion can."""
+    """Renew the lease of a motion; only the caller who asked for the motion can.
+
+    From the moment on in which the motion is to end, whoever asked for that, there is none: 409 says why.
+    """
     holder = service.engine.live.lease_holder(job)
     if holder is not None and holder != who.name:
         raise HTTPException(403, "only the requester of a motion renews its lease")
     if (seconds := service.engine.live.renew(job)) is None:
         row = await run_in_threadpool(rows.known_job, service.db, job)
-        raise MotionRefused(f"the job {job} has no lease to renew: {row['state']}")
+        why = service.engine.live.end_reason(job)
+        state = f"it is ending ({why}), which needs none" if why else row["state"]
+        raise MotionRefused(f"the job {job} has no lease to renew: {state}")
     return answers.LeaseAnswer(job=job, seconds=seconds)
 
 

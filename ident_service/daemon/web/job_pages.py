@@ -42,6 +42,7 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
     live = row["state"] in rows.LIVE
     attends = attended and live and bool(row["motion"]) and row["created_by"] == who.name and who.role == "operator"
     attends = attends and row["kind"] != "rehearse"  # its lease is kept by the held button on its own page
+    ending = live and bool(service.engine.live.end_reason(row["id"]))
     entered = row["run"] is not None and service.db.row("SELECT 1 FROM runs WHERE id = ?", row["run"]) is not None
     said = jobs.get_result(service, _NOBODY, row["id"])
     answer = {} if live else said.answer
@@ -50,7 +51,8 @@ def show_job(service: Serving, who: Viewer, job: Id, attended: bool = False) -> 
         who,
         job=jobs.job_answer_document(service, row),
         live=live,
-        lease="keep" if attends else "",
+        lease="keep" if attends and not ending else "",
+        ending=ending,
         recorded=row["kind"] in RECORDED,
         read=row["kind"] == READ,
         log=log_of(service, row),

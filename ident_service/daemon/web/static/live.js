@@ -10,12 +10,22 @@ const byId = (name) => document.getElementById(name);
 
 // --- the lease: while this page is there, or while a key is held
 
+const keeps = job.dataset.lease === "keep" || byId("hold");
 let pending = 0;
+let over = false; // the motion is to end: there is no lease any more
+
+function endLease() {
+  if (!keeps || !id) return;
+  over = true;
+  if (byId("lease-note")) byId("lease-note").hidden = true;
+  if (byId("lease-over")) byId("lease-over").hidden = false;
+}
 
 function renew() {
-  if (!id || pending > 1) return; // a service that stalls is not asked more and more often
+  if (!id || over || pending > 1) return; // a service that stalls is not asked more and more often
   pending += 1;
   fetch(`/api/v1/jobs/${id}/lease`, { method: "POST" })
+    .then((answer) => answer.status === 409 && endLease())
     .catch(() => null)
     .finally(() => (pending -= 1));
 }
@@ -109,6 +119,8 @@ function showJob(text) {
   byId("remaining").textContent =
     progress && progress.remaining !== null ? `about ${Math.ceil(progress.remaining)} s left` : "";
   byId("phase").textContent = progress ? progress.phase : "";
+  if (byId("support")) byId("support").hidden = !now.held;
+  if (byId("steer")) byId("steer").hidden = now.held;
   const pre = byId("log");
   if (pre.textContent !== log) {
     pre.closest("section").hidden = false;
@@ -286,7 +298,10 @@ document.addEventListener("visibilitychange", () => {
   if (document.hidden) closeStreams();
   else listen();
 });
-document.addEventListener("stop-asked", listen);
+document.addEventListener("stop-asked", () => {
+  endLease();
+  listen();
+});
 byId("zoomed")?.addEventListener("change", () => plots.forEach(({ plot }) => plot.redraw()));
 listen();
 if (byId("live")) requestAnimationFrame(frame);

@@ -75,6 +75,22 @@ const Plots = (() => {
     };
   }
 
+  const FONT = "11px system-ui, sans-serif";
+  const ruler = document.createElement("canvas").getContext("2d");
+  ruler.font = FONT;
+
+  // Labels stand centred below their ticks, the last of which may be at the very right. So there is room for half a
+  // label, which only grows: a plot that moves keeps its width.
+  function labelled(options) {
+    let room = options.time ? 26 : 8; // dates are uPlot's own, of eight letters at most
+    const values = (u, ticks) => {
+      const labels = ticks.map((value) => `${+value.toFixed(2)} s`);
+      for (const label of labels) room = Math.max(room, Math.ceil(ruler.measureText(label).width / 2) + 1);
+      return labels;
+    };
+    return { room: () => room, axis: options.time ? {} : { values } };
+  }
+
   class Plot {
     // `options`: title, unit, lines [{label, colour, dash}], limits, events, window (x shown), sync, zoomed, time, bars
     constructor(parent, options) {
@@ -115,19 +131,19 @@ const Plots = (() => {
 
     make() {
       const { options } = this;
-      const axis = { stroke: () => colour("--soft"), grid: { stroke: () => colour("--stripe"), width: 1 }, ticks: { show: false }, font: "11px system-ui, sans-serif" };
+      const axis = { stroke: () => colour("--soft"), grid: { stroke: () => colour("--stripe"), width: 1 }, ticks: { show: false }, font: FONT };
       const x = { time: Boolean(options.time) };
       if (options.window) x.range = () => options.window();
-      const seconds = (u, values) => values.map((value) => `${+value.toFixed(2)} s`);
+      const below = labelled(options);
       this.chart = new uPlot(
         {
           width: Math.max(160, this.box.clientWidth),
           height: options.height || 150,
-          padding: [6, 8, 0, 0],
+          padding: [6, below.room, 0, 0],
           cursor: { sync: options.sync ? { key: options.sync } : {}, drag: { x: !options.window, y: false }, points: { size: 5 } },
           scales: { x, y: { range: range(options) } },
           axes: [
-            { ...axis, size: 24, space: 60, ...(options.time ? {} : { values: seconds }) },
+            { ...axis, size: 24, space: 60, ...below.axis },
             { ...axis, size: 58, space: 26, values: (u, values) => values.map((value) => String(+value.toPrecision(4)).replace("-", "−")) },
           ],
           series: [
